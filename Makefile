@@ -1,0 +1,36 @@
+# The commands a person runs are the ones CI runs. PYTHON is any Python from 3.11.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.PHONY: run test lint models clean
+
+run: $(VENV)/.runtime  ## environment, runtime alone, demo
+	$(BIN)/edge-sr --source demo
+
+test: $(VENV)/.dev  ## everything else, all tests
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.dev  ## format, lint, types, import rules
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+models: $(VENV)/.dev  ## retrain and re-export the bundled models: 20 minutes on two cores
+	$(BIN)/python -m train.frozen edge/models
+	$(BIN)/python -m train.fit checkpoints
+	$(BIN)/python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt --out edge/models
+
+$(VENV)/.runtime: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) --editable .
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.runtime
+	$(PIP) --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis
