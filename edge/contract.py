@@ -1,0 +1,148 @@
+"""The one agreement between a trained model and the runtime, kept in the ONNX metadata."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import ModelError
+from firmware_bridge.geometry import SensorGeometry
+
+CONTRACT_VERSION: Final = 1
+TAP_ORDER: Final = "newest first"
+INPUT_NAME: Final = "window"
+OUTPUT_NAME: Final = "pattern"
+KEY_PREFIX: Final = "tactile."
+
+
+@dataclass(frozen=True, slots=True)
+class Contract:
+    """What a model expects and gives.
+
+    Attributes:
+        version: of this agreement.
+        taps: K, the number of taps in the window.
+        scale: pattern pixels per taxel pitch.
+        tap_order: order of the taps in the window.
+        angle_step_deg: rotation between neighbouring taps, in [deg].
+        counts_per_unit: counts that make one unit of network input, for x, y, z.
+        output_unit: unit of the pattern.
+        output_full_scale: the pattern's declared full scale, in output_unit.
+        contact_level: share of a pattern's maximum from which a pixel counts as touched.
+        sensor: name of the sensor model.
+        rows: taxel rows.
+        cols: taxel columns.
+        pitch_mm: taxel pitch, in [mm].
+        training_sha256: of the training configuration.
+        test_set_sha256: of the frozen test set that `test_error` was measured on.
+        test_error: number of taps given -> metric name -> value.
+    """
+
+    version: int
+    taps: int
+    scale: int
+    tap_order: str
+    angle_step_deg: float
+    counts_per_unit: tuple[float, float, float]
+    output_unit: str
+    output_full_scale: float
+    contact_level: float
+    sensor: str
+    rows: int
+    cols: int
+    pitch_mm: float
+    training_sha256: str
+    test_set_sha256: str
+    test_error: dict[str, dict[str, float]]
+
+    @property
+    def window_shape(self) -> tuple[int, int, int, int]:
+        """Shape of the network's input: (1, 3 taps, rows, cols), a tap's x, y, z side by side."""
+        return (1, 3 * self.taps, self.rows, self.cols)
+
+    @property
+    def pattern_shape(self) -> tuple[int, int]:
+        """Shape (H, W) of the pattern."""
+        return (self.rows * self.scale, self.cols * self.scale)
+
+    def to_metadata(self) -> dict[str, str]:
+        """The contract as the string map that ONNX metadata holds."""
+        return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items()}
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, str]) -> "Contract":
+        """Read and check a contract.
+
+        Raises:
+            ModelError: a key is missing, unreadable or out of range; the key is named.
+        """
+        values: dict[str, Any] = {}
+        for field in fields(cls):
+            text = metadata.get(KEY_PREFIX + field.name)
+            if text is None:
+                raise ModelError(f"contract key '{field.name}' is missing: not a model made by export, or an old one")
+            try:
+                values[field.name] = json.loads(text)
+            except json.JSONDecodeError as error:
+                raise ModelError(f"contract key '{field.name}' is {text!r}, expected JSON") from error
+        _check(values)
+        values["counts_per_unit"] = tuple(values["counts_per_unit"])
+        return cls(**values)
+
+    def check_sensor(self, geometry: SensorGeometry) -> None:
+        """Refuse a sensor that the model was not trained for.
+
+        Raises:
+            ModelError: a key of the contract differs from the sensor's; the key is named.
+        """
+        for key, got in (
+            ("sensor", geometry.name),
+            ("rows", geometry.rows),
+            ("cols", geometry.cols),
+            ("pitch_mm", geometry.pitch_mm),
+        ):
+            expected = getattr(self, key)
+            if got != expected:
+                raise ModelError(f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}")
+
+    def scale_window(self, deformation_counts: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Zeroed counts (taps, 3, rows, cols) to network input units, same shape."""
+        divisor = np.asarray(self.counts_per_unit, dtype=np.float32)[None, :, None, None]
+        return deformation_counts / divisor
+
+
+def _check(values: Mapping[str, Any]) -> None:
+    def refuse(key: str, expected: str) -> None:
+        raise ModelError(f"contract key '{key}' is {values[key]!r}, expected {expected}")
+
+    if values["version"] != CONTRACT_VERSION:
+        refuse("version", f"{CONTRACT_VERSION}: export the model again with this release")
+    for key in ("taps", "scale", "rows", "cols"):
+        if type(values[key]) is not int or values[key] < 1:
+            refuse(key, "a whole number from 1")
+    if values["tap_order"] != TAP_ORDER:
+        refuse("tap_order", repr(TAP_ORDER))
+    for key in ("output_full_scale", "pitch_mm", "contact_level"):
+        if not _is_number(values[key]) or values[key] <= 0:
+            refuse(key, "a positive number")
+    if values["contact_level"] >= 1:
+        refuse("contact_level", "a number below 1")
+    if not _is_number(values["angle_step_deg"]):
+        refuse("angle_step_deg", "a number")
+    scaling = values["counts_per_unit"]
+    if not isinstance(scaling, list) or len(scaling) != 3 or not all(_is_number(v) and v > 0 for v in scaling):
+        refuse("counts_per_unit", "three positive numbers, for x, y, z")
+    for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
+        if not isinstance(values[key], str) or not values[key]:
+            refuse(key, "a text")
+    error = values["test_error"]
+    if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
+        refuse("test_error", "a map from taps to metrics")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

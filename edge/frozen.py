@@ -1,0 +1,96 @@
+"""The frozen test set: what every model and every classical method is judged on, here and in training."""
+
+import hashlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import EdgeError
+
+
+class FrozenSetError(EdgeError, ValueError):
+    """A file that is no frozen set."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenSet:
+    """Frames of taps with their truth.
+
+    A frame's window is its own reading and the ends of the earlier taps, newest first. Contacts are flat, so a tap's
+    truth is one map times the frame's indentation.
+
+    Attributes:
+        newest: (n, 3, rows, cols) int16, zeroed counts of the frame.
+        earlier: (taps, K-1, 3, rows, cols) int16, zeroed counts at the end of the taps before.
+        tap: (n,) index of the frame's tap; frames of a tap are not independent.
+        indentation_mm: (n,) float32, in [mm].
+        force_n: (n,) float32, in [N].
+        unit_patterns: (taps, H, W) float16, deformation per indentation; 1 where the surface touches.
+        surface: (taps,) name of the surface.
+        angle_deg: (taps,) turn of the pad, in [deg].
+        full_scale_mm: the patterns' declared full scale, in [mm].
+    """
+
+    newest: NDArray[np.int16]
+    earlier: NDArray[np.int16]
+    tap: NDArray[np.int16]
+    indentation_mm: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    unit_patterns: NDArray[np.float16]
+    surface: NDArray[np.str_]
+    angle_deg: NDArray[np.float32]
+    full_scale_mm: float
+
+    def __len__(self) -> int:
+        return len(self.newest)
+
+    @property
+    def scale(self) -> int:
+        """Pattern pixels per taxel pitch."""
+        return self.unit_patterns.shape[-1] // self.newest.shape[-1]
+
+    def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
+        """Windows (n, taps, 3, rows, cols) in zeroed counts; only the newest `given` taps are there, the rest zero."""
+        windows = np.concatenate([self.newest[:, None], self.earlier[self.tap]], axis=1)[:, :taps].astype(np.float32)
+        windows[:, given if given is not None else taps :] = 0
+        return windows
+
+    def patterns(self) -> NDArray[np.float32]:
+        """Truth, (n, H, W) in [mm]."""
+        return self.unit_patterns[self.tap].astype(np.float32) * self.indentation_mm[:, None, None]
+
+    def touching(self) -> NDArray[np.bool_]:
+        """Pixels that the surface touches, (n, H, W)."""
+        return (self.unit_patterns == 1)[self.tap]
+
+    def sha256(self) -> str:
+        """Hash over all arrays, whatever file they lie in."""
+        digest = hashlib.sha256()
+        for field in fields(self):
+            digest.update(field.name.encode())
+            digest.update(np.ascontiguousarray(getattr(self, field.name)).tobytes())
+        return digest.hexdigest()
+
+    def save(self, path: Path) -> None:
+        """Write as a compressed npz."""
+        np.savez_compressed(path, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+
+def load_frozen_set(path: Path) -> FrozenSet:
+    """Read a frozen set.
+
+    Raises:
+        FrozenSetError: no such file, or an array is missing; it is named.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(FrozenSet)}
+            values["full_scale_mm"] = float(values["full_scale_mm"])
+            return FrozenSet(**values)
+    except (OSError, ValueError, KeyError) as error:
+        raise FrozenSetError(
+            f"{path} is no frozen test set ({error}): make it with 'python -m train.freeze'"
+        ) from error

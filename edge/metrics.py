@@ -1,0 +1,115 @@
+"""Errors of a pattern against its truth; numpy only, used by training and runtime alike.
+
+All take (..., H, W) arrays of one shape and the declared full scale L in the same unit, and give one
+value per pattern, shape (...). Equal maps give an infinite PSNR, an SSIM of 1 and an RMSE of 0, also
+where both are constant or zero.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_K1: Final = 0.01
+_K2: Final = 0.03
+_WINDOW_SIGMA_PX: Final = 1.5
+_WINDOW_RADIUS_PX: Final = 5
+
+
+def psnr_db(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
+    """Peak signal-to-noise ratio, 10 log10(L^2 / mean squared error), in [dB].
+
+    Source: Wu and Liu 2024, Eq. 11, with the square and the 1/N that the equation lacks.
+    """
+    a, b = _pair(pattern, truth, full_scale)
+    mse = np.mean((a - b) ** 2, axis=(-2, -1))
+    with np.errstate(divide="ignore"):
+        return 10.0 * np.log10(full_scale**2 / mse)
+
+
+def rmse_percent(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
+    """Root mean squared error in [% of full scale]."""
+    a, b = _pair(pattern, truth, full_scale)
+    return 100.0 * np.sqrt(np.mean((a - b) ** 2, axis=(-2, -1))) / full_scale
+
+
+def ssim_global(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
+    """Structural similarity over one window as large as the pattern.
+
+    Source: Wu and Liu 2024, Eq. 12-13, with C = (0.01 L)^2 and (0.03 L)^2.
+    """
+    a, b = _pair(pattern, truth, full_scale)
+    mean_a, mean_b = a.mean(axis=(-2, -1)), b.mean(axis=(-2, -1))
+    count = a.shape[-2] * a.shape[-1]
+    centred_a = a - mean_a[..., None, None]
+    centred_b = b - mean_b[..., None, None]
+    var_a = np.sum(centred_a**2, axis=(-2, -1)) / (count - 1)
+    var_b = np.sum(centred_b**2, axis=(-2, -1)) / (count - 1)
+    covariance = np.sum(centred_a * centred_b, axis=(-2, -1)) / (count - 1)
+    return _similarity(mean_a, mean_b, var_a, var_b, covariance, full_scale)
+
+
+def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
+    """Structural similarity, mean over 11 x 11 Gaussian windows that lie inside the pattern.
+
+    Source: Wang et al. 2004; the same figure as scikit-image with gaussian_weights, sigma 1.5,
+    use_sample_covariance=False and data_range=L.
+    """
+    a, b = _pair(pattern, truth, full_scale)
+    if min(a.shape[-2:]) <= 2 * _WINDOW_RADIUS_PX:
+        raise ValueError(f"pattern of shape {a.shape[-2:]} is smaller than the 11 x 11 window of ssim")
+    mean_a, mean_b = _blur(a), _blur(b)
+    var_a = _blur(a * a) - mean_a**2
+    var_b = _blur(b * b) - mean_b**2
+    covariance = _blur(a * b) - mean_a * mean_b
+    return _similarity(mean_a, mean_b, var_a, var_b, covariance, full_scale).mean(axis=(-2, -1))
+
+
+def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -> NDArray[np.float64]:
+    """Overlap over union of the pixels that `touched` finds and those that truly touch, (..., H, W) bool.
+
+    Where both are empty they agree: 1.
+    """
+    found = touched(np.asarray(pattern), level)
+    if found.shape != touching.shape:
+        raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
+    union = np.sum(found | touching, axis=(-2, -1))
+    overlap = np.sum(found & touching, axis=(-2, -1))
+    return np.where(union > 0, overlap / np.maximum(union, 1), 1.0)
+
+
+def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
+    """Pixels that reach `level` of the pattern's maximum, (..., H, W) bool; none where it is not above zero."""
+    peak = pattern.max(axis=(-2, -1), keepdims=True)
+    return (pattern >= level * peak) & (peak > 0)
+
+
+def _pair(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    a, b = np.asarray(pattern, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    if a.shape != b.shape or a.ndim < 2:
+        raise ValueError(f"pattern of shape {a.shape} against truth of shape {b.shape}, expected equal (..., H, W)")
+    if not full_scale > 0:
+        raise ValueError(f"full scale is {full_scale}, expected a positive number")
+    return a, b
+
+
+def _similarity(
+    mean_a: NDArray[np.float64],
+    mean_b: NDArray[np.float64],
+    var_a: NDArray[np.float64],
+    var_b: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    full_scale: float,
+) -> NDArray[np.float64]:
+    c1, c2 = (_K1 * full_scale) ** 2, (_K2 * full_scale) ** 2
+    return ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+
+
+def _blur(maps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaussian means over the windows that lie inside the map."""
+    offsets_px = np.arange(-_WINDOW_RADIUS_PX, _WINDOW_RADIUS_PX + 1)
+    weights = np.exp(-0.5 * (offsets_px / _WINDOW_SIGMA_PX) ** 2)
+    weights /= weights.sum()
+    windows = np.lib.stride_tricks.sliding_window_view
+    rows = windows(maps, weights.size, axis=-2) @ weights
+    return windows(rows, weights.size, axis=-1) @ weights

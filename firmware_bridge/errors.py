@@ -1,0 +1,40 @@
+"""Errors of the bridge.
+
+BridgeError
++-- DeviceError (OSError)
+|   +-- NoDeviceError          no adapter, or several, and none was named
+|   +-- LinkLostError          the link was there and is gone
++-- BaselineRefusedError (ValueError)  the pad moved or was loaded while zeroing
++-- RecordingError (ValueError)        a recording or baseline file that cannot be used
++-- SourceError (ValueError)           a text that names no source
+
+Bad frames, skipped bytes and torn scans are counted, never raised.
+"""
+
+
+class BridgeError(Exception):
+    """Root of all errors of the bridge."""
+
+
+class DeviceError(BridgeError, OSError):
+    """A device or port that cannot be used."""
+
+
+class NoDeviceError(DeviceError):
+    """No sensor adapter, or several, and none was named."""
+
+
+class LinkLostError(DeviceError, ConnectionError):
+    """The link to the sensor was there and is gone."""
+
+
+class BaselineRefusedError(BridgeError, ValueError):
+    """The scans given cannot serve as a baseline."""
+
+
+class RecordingError(BridgeError, ValueError):
+    """A recording or baseline file that cannot be used."""
+
+
+class SourceError(BridgeError, ValueError):
+    """A text that names no source."""

@@ -1,0 +1,49 @@
+"""Where the taxels of a sensor sit. Row-major from the top left; x to the right, y down."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+AXES: Final = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True)
+class SensorGeometry:
+    """Grid of taxels of one sensor model; lengths in [mm]."""
+
+    name: str
+    rows: int
+    cols: int
+    pitch_mm: float
+    width_mm: float
+    height_mm: float
+
+    @property
+    def taxel_count(self) -> int:
+        """Number of taxels."""
+        return self.rows * self.cols
+
+    @property
+    def scan_shape(self) -> tuple[int, int, int]:
+        """Shape of a scan: (axes, rows, cols)."""
+        return (len(AXES), self.rows, self.cols)
+
+    def taxel_centres_mm(self) -> NDArray[np.float64]:
+        """Centres of the taxels, (taxel_count, 2), x then y in [mm] from the sensor's centre."""
+        x_mm = (np.arange(self.cols) - (self.cols - 1) / 2) * self.pitch_mm
+        y_mm = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch_mm
+        grid_x_mm, grid_y_mm = np.meshgrid(x_mm, y_mm)
+        return np.stack([grid_x_mm.ravel(), grid_y_mm.ravel()], axis=1)
+
+    def pixel_pitch_mm(self, scale: int) -> float:
+        """Distance of neighbouring pixels of a pattern at x`scale`, in [mm]."""
+        return self.pitch_mm / scale
+
+    def pattern_shape(self, scale: int) -> tuple[int, int]:
+        """Shape (H, W) of a pattern at x`scale`."""
+        return (self.rows * scale, self.cols * scale)
+
+
+USPA44: Final = SensorGeometry("uSPa44", rows=4, cols=4, pitch_mm=4.7, width_mm=20.0, height_mm=20.0)
