@@ -88,10 +88,10 @@ class TrainingConfig:
     layer: Layer = field(default_factory=Layer)
     nuisances: Nuisances = field(default_factory=Nuisances)
     chains: tuple[tuple[Stage, ...], ...] = (
-        (Stage(taps=4, steps=10000, learning_rate=2e-3, given=(0.25, 0.15, 0.1, 0.5)),),
+        (Stage(taps=4, steps=9000, learning_rate=2e-3, given=(0.25, 0.15, 0.1, 0.5)),),
         (
-            Stage(taps=2, steps=6500, learning_rate=2e-3, given=(0.4, 0.6)),
-            Stage(taps=1, steps=3500, learning_rate=1e-3, given=(1.0,)),
+            Stage(taps=2, steps=6000, learning_rate=2e-3, given=(0.4, 0.6)),
+            Stage(taps=1, steps=3000, learning_rate=1e-3, given=(1.0,)),
         ),
     )
 
