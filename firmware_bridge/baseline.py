@@ -1,0 +1,305 @@
+"""Zeroing: what a free pad reads, and how far a scan is from it. Counts live on a circle of 2^16."""
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, NoReturn, Self, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.errors import BaselineRefusedError, RecordingError
+from firmware_bridge.geometry import AXES
+from firmware_bridge.scan import ABSENT, Scan
+
+COUNTS_ON_CIRCLE: Final = 0x10000
+FEWEST_SCANS: Final = 100
+
+# Limits for 100 scans. A still, free pad shows noise of sigma 1.1..2.8 counts on x and y, 2..4.7 on z,
+# so its 5th to 95th percentile spans up to 12 and 20 counts, and the medians of its first and last third
+# differ by up to 6. A gripper that holds an object as still as it can spans at least 38 on z.
+SPREAD_LIMIT_COUNTS: Final = (15.0, 15.0, 25.0)
+CREEP_LIMIT_COUNTS: Final = 10.0
+# Between the 120 counts that warming up adds to a free pad and the 350 that 0.3 N on one taxel add.
+LOAD_LIMIT_COUNTS: Final = 200.0
+
+FILE_FORMAT: Final = "tactile-baseline"
+FILE_VERSION: Final = 1
+_FILE_REMEDY: Final = "zero again and save a new file"
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """The counts of a sensor's free pad.
+
+    Attributes:
+        sensor: name of the sensor.
+        counts: (3, rows, cols) float32 in 0..65536, read-only.
+        created_unix_s: when it was taken, in [s] since 1970.
+        scans: how many scans it is the median of.
+        origin: taken at this start-up, or loaded from a file.
+        id: short text that stands for sensor, counts and time.
+    """
+
+    sensor: str
+    counts: NDArray[np.float32]
+    created_unix_s: float
+    scans: int
+    origin: Literal["start-up", "file"]
+    id: str
+
+    @classmethod
+    def from_counts(cls, sensor: str, counts: NDArray[np.integer], created_unix_s: float) -> Self:
+        """The median of whole scans, with no question whether the pad was free and still.
+
+        Args:
+            sensor: name of the sensor.
+            counts: (n, 3, rows, cols) raw counts of complete scans, n > 0.
+            created_unix_s: when they were taken, in [s] since 1970.
+
+        Raises:
+            ValueError: no scan, or a taxel is absent.
+        """
+        if len(counts) == 0 or (counts == ABSENT).any():
+            raise ValueError(f"a baseline needs whole scans, got {len(counts)} with {(counts == ABSENT).sum()} gaps")
+        median = counts[0] + np.median(_unwrapped(counts), axis=0)
+        return cls.of(sensor, median % COUNTS_ON_CIRCLE, created_unix_s, len(counts), "start-up")
+
+    @classmethod
+    def of(
+        cls,
+        sensor: str,
+        counts: NDArray[np.floating],
+        created_unix_s: float,
+        scans: int,
+        origin: Literal["start-up", "file"],
+    ) -> Self:
+        """A baseline of known counts (3, rows, cols), with its id."""
+        own = np.array(counts, dtype=np.float32)
+        own.setflags(write=False)
+        digest = hashlib.sha256(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
+        return cls(sensor, own, created_unix_s, scans, origin, digest.hexdigest()[:8])
+
+    def age_s(self, now_unix_s: float) -> float:
+        """How old it is at `now_unix_s`, in [s]."""
+        return now_unix_s - self.created_unix_s
+
+
+def deformation(scan_counts: NDArray[np.integer], baseline: Baseline) -> NDArray[np.float32]:
+    """How far a scan is from the free pad, the short way round the circle.
+
+    Args:
+        scan_counts: (3, rows, cols) raw counts.
+        baseline: of the same sensor.
+
+    Returns:
+        (3, rows, cols) signed counts in -32768..32768; NaN where a taxel is absent.
+    """
+    half = COUNTS_ON_CIRCLE // 2
+    # float32 holds halves exactly up to 2^23, so nothing is rounded here.
+    signed = (scan_counts.astype(np.float32) - baseline.counts + half) % COUNTS_ON_CIRCLE - half
+    return np.where(scan_counts == ABSENT, np.float32(np.nan), signed)
+
+
+class BaselineEstimator:
+    """Takes the baseline of one sensor from its scans, or says why it cannot.
+
+    It refuses a pad that moves while zeroing, and one that is loaded if a reference tells how it
+    reads when free. A load that lies on the pad from the first scan to the last, with no reference, cannot
+    be told from a free pad: then it is zeroed away. A load that leaves every taxel within
+    LOAD_LIMIT_COUNTS of the reference passes as drift.
+    """
+
+    def __init__(
+        self,
+        min_scans: int = FEWEST_SCANS,
+        reference: Baseline | None = None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        """Start with no scan.
+
+        Args:
+            min_scans: complete scans with something new in them that a baseline takes, at least 3.
+            reference: an earlier baseline of this sensor.
+            clock: gives the time in [s] since 1970.
+        """
+        if min_scans < 3:
+            raise ValueError(f"min_scans is {min_scans}, expected at least 3")
+        self._min_scans = min_scans
+        self._reference = reference
+        self._clock = clock
+        self._taken: list[NDArray[np.int32]] = []
+
+    @property
+    def scans(self) -> int:
+        """How many scans it has so far."""
+        return len(self._taken)
+
+    def push(self, scan: Scan) -> Baseline | None:
+        """Take one more scan; the baseline once there are enough.
+
+        Raises:
+            BaselineRefusedError: the pad moved or was loaded. The estimator has begun again.
+        """
+        # A scan sent again is no second sample, and would hide a spread.
+        if not scan.complete or scan.repeated:
+            return None
+        self._taken.append(scan.counts)
+        if len(self._taken) < self._min_scans:
+            return None
+        counts = np.stack(self._taken)
+        self._taken.clear()
+        _refuse_motion(counts)
+        baseline = Baseline.from_counts(scan.sensor, counts, self._clock())
+        if self._reference is not None:
+            _refuse_load(baseline, self._reference)
+        return baseline
+
+
+def save_baselines(path: str | Path, baselines: Iterable[Baseline]) -> None:
+    """Write baselines, one per sensor, as one JSON file. A file that is there is replaced whole or not at all.
+
+    Raises:
+        ValueError: two baselines of one sensor.
+        RecordingError: the file cannot be written.
+    """
+    path = Path(path)
+    entries = [
+        {
+            "id": baseline.id,
+            "sensor": baseline.sensor,
+            "created_unix_s": baseline.created_unix_s,
+            "scans": baseline.scans,
+            "counts": baseline.counts.tolist(),
+        }
+        for baseline in baselines
+    ]
+    sensors = [entry["sensor"] for entry in entries]
+    if len(set(sensors)) < len(sensors):
+        raise ValueError(f"baselines of sensors {', '.join(sensors)}: expected each sensor once")
+    text = json.dumps({"format": FILE_FORMAT, "version": FILE_VERSION, "baselines": entries}, indent=1, allow_nan=False)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text + "\n", encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def load_baselines(path: str | Path) -> dict[str, Baseline]:
+    """Read baselines, by sensor.
+
+    Raises:
+        RecordingError: the file cannot be read, or is no baseline file, or was changed by hand.
+    """
+    path = Path(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{path}: not JSON ({error}): {_FILE_REMEDY}") from error
+    if not isinstance(document, dict) or document.get("format") != FILE_FORMAT:
+        _refuse_file(
+            path, "format", document.get("format") if isinstance(document, dict) else document, f"'{FILE_FORMAT}'"
+        )
+    if document.get("version") != FILE_VERSION:
+        _refuse_file(path, "version", document.get("version"), str(FILE_VERSION))
+    entries = document.get("baselines")
+    if not isinstance(entries, list) or not entries:
+        _refuse_file(path, "baselines", entries, "a list of at least one")
+    baselines: dict[str, Baseline] = {}
+    for entry in entries:
+        baseline = _read_entry(path, entry)
+        if baseline.sensor in baselines:
+            _refuse_file(path, "sensor", baseline.sensor, "each sensor once")
+        baselines[baseline.sensor] = baseline
+    return baselines
+
+
+def _unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
+    half = COUNTS_ON_CIRCLE // 2
+    return (counts.astype(np.int32) - counts[0].astype(np.int32) + half) % COUNTS_ON_CIRCLE - half
+
+
+def _refuse_motion(counts: NDArray[np.int32]) -> None:
+    moved = _unwrapped(counts)
+    # Percentiles, not the range: a single reading far off is a known quirk of the sensor, not a motion.
+    spread = np.percentile(moved, 95, axis=0) - np.percentile(moved, 5, axis=0)
+    limits = np.asarray(SPREAD_LIMIT_COUNTS)[:, None, None]
+    worst = _worst(spread / limits)
+    if spread[worst] > limits[worst[0], 0, 0]:
+        _refuse(worst, f"moved by {spread[worst]:.0f} counts", limits[worst[0], 0, 0], "keep the pad still and free")
+    third = len(moved) // 3
+    creep = np.abs(np.median(moved[-third:], axis=0) - np.median(moved[:third], axis=0))
+    worst = _worst(creep)
+    if creep[worst] > CREEP_LIMIT_COUNTS:
+        remedy = "keep the pad still and free, and let it rest after a load"
+        _refuse(worst, f"crept by {creep[worst]:.0f} counts", CREEP_LIMIT_COUNTS, remedy)
+
+
+def _refuse_load(baseline: Baseline, reference: Baseline) -> None:
+    z = len(AXES) - 1
+    load = deformation(np.rint(baseline.counts).astype(np.int32) % COUNTS_ON_CIRCLE, reference)
+    row, col = _worst(load[z])
+    if load[z, row, col] > LOAD_LIMIT_COUNTS:
+        what = f"is {load[z, row, col]:.0f} counts above the baseline {reference.id}"
+        _refuse((z, row, col), what, LOAD_LIMIT_COUNTS, "free the pad, or zero without that baseline")
+
+
+def _worst(values: NDArray[np.floating]) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.unravel_index(int(values.argmax()), values.shape))
+
+
+def _refuse(where: tuple[int, ...], what: str, limit: float, remedy: str) -> None:
+    axis, row, col = where
+    raise BaselineRefusedError(
+        f"taxel ({row}, {col}) {AXES[axis]} {what} while zeroing, at most {limit:.0f} allowed: {remedy}"
+    )
+
+
+def _read_entry(path: Path, entry: Any) -> Baseline:
+    if not isinstance(entry, dict):
+        _refuse_file(path, "baselines", entry, "objects")
+    sensor, created_unix_s, scans = entry.get("sensor"), entry.get("created_unix_s"), entry.get("scans")
+    if not isinstance(sensor, str) or not sensor:
+        _refuse_file(path, "sensor", sensor, "a name")
+    if not _is_number(created_unix_s) or created_unix_s <= 0:
+        _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970")
+    if type(scans) is not int or scans < 1:
+        _refuse_file(path, "scans", scans, "a whole number from 1")
+    baseline = Baseline.of(sensor, _read_counts(path, entry.get("counts")), created_unix_s, scans, "file")
+    if entry.get("id") != baseline.id:
+        _refuse_file(path, "id", entry.get("id"), f"'{baseline.id}', which the counts give: the file was changed")
+    return baseline
+
+
+def _read_counts(path: Path, counts: Any) -> NDArray[np.float64]:
+    expected = f"numbers 0..{COUNTS_ON_CIRCLE}, as {len(AXES)} axes of rows of equal length"
+    planes = counts if isinstance(counts, list) else []
+    rows = [row for plane in planes if isinstance(plane, list) for row in plane]
+    cells = [cell for row in rows if isinstance(row, list) for cell in row]
+    if not cells or not all(_is_number(cell) and 0 <= cell < COUNTS_ON_CIRCLE for cell in cells):
+        _refuse_file(path, "counts", counts, expected)
+    try:
+        array = np.array(counts, dtype=np.float64)
+    except ValueError:
+        _refuse_file(path, "counts", counts, expected)
+    if array.ndim != 3 or len(array) != len(AXES):
+        _refuse_file(path, "counts", f"shape {array.shape}", expected)
+    return array
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < math.inf
+
+
+def _refuse_file(path: Path, key: str, got: object, expected: str) -> NoReturn:
+    text = repr(got)
+    raise RecordingError(f"{path}, '{key}': {text[:60]}{'...' * (len(text) > 60)}, expected {expected}: {_FILE_REMEDY}")

@@ -1,0 +1,129 @@
+"""A pretended XELA controller and the slcan adapter before it: what they say, and when. No I/O, no clock."""
+
+import heapq
+import random
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.recording import Track
+from firmware_bridge.scan import ABSENT
+from firmware_bridge.slcan import LAST_TIMESTAMP_MS, CanFrame, encode_frame
+from firmware_bridge.xela import USPA44_MAP
+
+FRAME_S: Final = 0.000_13
+"""A frame of eight bytes on a 1 Mbit/s bus, with stuffed bits."""
+
+CR: Final = b"\r"
+BEL: Final = b"\a"
+_LONGEST_COMMAND: Final = 32
+_RIGHT_BITRATE: Final = 8
+
+
+def scan_frames(counts: NDArray[np.int32], controller: int, noise: random.Random) -> list[CanFrame]:
+    """One scan (3, 4, 4) as a controller sends it: a frame per taxel, by SDA, then by taxel on it.
+
+    Absent taxels send nothing. The bytes that carry no reading are filled from `noise`, never zero.
+    """
+    frames: list[CanFrame] = []
+    by_taxel = counts.reshape(3, -1).T.tolist()
+    for can_id, taxel in USPA44_MAP.wire_order(str(controller)):
+        x, y, z = by_taxel[taxel]
+        if x != ABSENT:
+            words = b"".join(value.to_bytes(2, "big") for value in (x, y, z))
+            frames.append(CanFrame(can_id, bytes([noise.randint(1, 255)]) + words + bytes([noise.randint(1, 255)])))
+    return frames
+
+
+class Controller(NamedTuple):
+    """One sensor on the bus: what it plays, under which id 0..15, and how many scans a second."""
+
+    track: Track
+    can_id: int
+    rate_hz: float
+
+
+def bus_timeline(
+    controllers: Sequence[Controller], *, jitter_s: float, seed: int, loop: bool
+) -> Iterator[tuple[float, CanFrame]]:
+    """All frames on the bus in their order, each with its time in [s] from the first scan."""
+    lanes = [_lane(controller, jitter_s, seed, loop) for controller in controllers]
+    return heapq.merge(*lanes, key=lambda timed: timed[0])
+
+
+def _lane(controller: Controller, jitter_s: float, seed: int, loop: bool) -> Iterator[tuple[float, CanFrame]]:
+    noise = random.Random(f"{seed} {controller.can_id}")
+    number, free_s = 0, 0.0
+    while True:
+        for counts in controller.track.counts:
+            # The grid stays where it is however much single scans jitter; a scan waits for the one before.
+            time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
+            for frame in scan_frames(counts, controller.can_id, noise):
+                yield time_s, frame
+                time_s += FRAME_S
+            number, free_s = number + 1, time_s
+        if not loop:
+            return
+
+
+class SlcanAdapter:
+    """Obeys slcan commands as a strict adapter does.
+
+    Attributes:
+        channel_open: it passes on what is on the bus.
+        acknowledges: it answers commands (Lawicel's way); some firmwares never do.
+        refused: commands it did not obey.
+        sent: frames that it was given to put on the bus.
+    """
+
+    def __init__(self, *, acknowledges: bool = True, left_open: bool = False) -> None:
+        """Switch it on; `left_open` as a client leaves it that died without closing."""
+        self.acknowledges = acknowledges
+        self.channel_open = left_open
+        self.refused = 0
+        self.sent: list[bytes] = []
+        self._bitrate = _RIGHT_BITRATE if left_open else None
+        self._timestamps = False
+        self._pending = b""
+
+    @property
+    def hears_the_bus(self) -> bool:
+        """Open at the bitrate that the sensor uses."""
+        return self.channel_open and self._bitrate == _RIGHT_BITRATE
+
+    def feed(self, data: bytes) -> bytes:
+        """Take bytes from the client; the bytes to answer with."""
+        *commands, pending = (self._pending + data).split(CR)
+        self._pending = pending[-_LONGEST_COMMAND:]
+        answers = [self._obey(command) for command in commands]
+        self.refused += answers.count(BEL)
+        return b"".join(answers) if self.acknowledges else b""
+
+    def encode(self, frame: CanFrame, time_s: float) -> bytes:
+        """A frame from the bus as the client gets it."""
+        if self._timestamps:
+            frame = frame._replace(timestamp_ms=int(time_s * 1000) % (LAST_TIMESTAMP_MS + 1))
+        return encode_frame(frame)
+
+    def _obey(self, command: bytes) -> bytes:
+        name, value = command[:1], command[1:]
+        if name == b"t" and self.channel_open:
+            self.sent = [*self.sent[-15:], command]
+            return b"z" + CR
+        if name == b"V" and not value:
+            return b"V1013" + CR
+        if self.channel_open:
+            if command != b"C":
+                return BEL
+            self.channel_open = False
+        elif name == b"S" and value in (b"0", b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"8"):
+            self._bitrate = int(value)
+        elif command == b"O" and self._bitrate is not None:
+            self.channel_open = True
+        elif command in (b"Z0", b"Z1"):
+            self._timestamps = command == b"Z1"
+        else:
+            return BEL
+        return CR

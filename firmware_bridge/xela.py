@@ -1,0 +1,104 @@
+"""CAN frames to taxel readings of XELA uSkin 4x4 sensors. No I/O.
+
+One taxel per frame, eight bytes: byte 0 unused, X, Y, Z as unsigned big-endian 16 bit, byte 7
+unused. The unused bytes are not zero. Which id is which taxel depends on the controller's age:
+
+    layout C (current)     id = SDA << 8 | taxel << 4 | controller
+    layout A (2018-2019)   id = 0x700 | board << 4 | taxel         speaks only after a trigger
+    layout B (early 2020)  id = board << 8 | n, n = 0..31          two sensors a board; trigger
+
+A sensor's label does not say which map is its own; with the wrong one, half of the taxels stay silent.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.slcan import CanFrame
+
+PAYLOAD_BYTES: Final = 8
+_unpack_xyz = struct.Struct(">HHH").unpack_from
+
+
+class Reading(NamedTuple):
+    """One taxel's raw counts; `taxel` counts row-major from the top left."""
+
+    sensor: str
+    taxel: int
+    x: int
+    y: int
+    z: int
+
+
+@dataclass(frozen=True, slots=True)
+class ModelMap:
+    """Which CAN id is which taxel of which sensor.
+
+    Attributes:
+        name: of the sensor model or layout.
+        geometry: of each sensor.
+        taxels: CAN id -> (sensor, taxel).
+        triggered: the controller stays silent until it gets its `trigger_frame`.
+    """
+
+    name: str
+    geometry: SensorGeometry
+    taxels: Mapping[int, tuple[str, int]]
+    triggered: bool = False
+
+    def wire_order(self, sensor: str) -> list[tuple[int, int]]:
+        """(CAN id, taxel) of one sensor in ascending id, which is the order of SDA, then taxel."""
+        return sorted((can_id, taxel) for can_id, (name, taxel) in self.taxels.items() if name == sensor)
+
+
+def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
+    """The reading in a frame, or None if the frame is not one of this model's."""
+    place = model.taxels.get(frame.can_id)
+    if place is None or frame.extended or frame.remote or len(frame.data) != PAYLOAD_BYTES:
+        return None
+    return Reading(*place, *_unpack_xyz(frame.data, 1))
+
+
+def trigger_frame(board: int) -> CanFrame:
+    """The frame that starts a controller of layout A or B; `board` is 1..7."""
+    if not 1 <= board <= 7:
+        raise ValueError(f"board is {board}, expected 1..7")
+    return CanFrame(0x200 | board, bytes((0x07, 0x00)))
+
+
+def _layout_c_uspa44() -> dict[int, tuple[str, int]]:
+    # An SDA is a row; its taxels are numbered from right to left.
+    return {
+        sda << 8 | taxel << 4 | controller: (str(controller), sda * 4 + (3 - taxel))
+        for controller in range(16)
+        for sda in range(4)
+        for taxel in range(4)
+    }
+
+
+def _layout_c_xr1944() -> dict[int, tuple[str, int]]:
+    # Two SDAs of two rows each. That its columns run from right to left too is inferred from
+    # uSPa44, the same board; nothing we know says so.
+    return {
+        sda << 8 | taxel << 4 | controller: (str(controller), (sda * 2 + taxel // 4) * 4 + (3 - taxel % 4))
+        for controller in range(16)
+        for sda in range(2)
+        for taxel in range(8)
+    }
+
+
+def _layout_a() -> dict[int, tuple[str, int]]:
+    return {0x700 | board << 4 | taxel: (str(board), taxel) for board in range(1, 8) for taxel in range(16)}
+
+
+def _layout_b() -> dict[int, tuple[str, int]]:
+    return {board << 8 | n: (f"{board}{'ab'[n // 16]}", n % 16) for board in range(1, 8) for n in range(32)}
+
+
+USPA44_MAP: Final = ModelMap("uSPa44", USPA44, MappingProxyType(_layout_c_uspa44()))
+XR1944_MAP: Final = ModelMap("XR1944", USPA44, MappingProxyType(_layout_c_xr1944()))
+LAYOUT_A_MAP: Final = ModelMap("layout A", USPA44, MappingProxyType(_layout_a()), triggered=True)
+LAYOUT_B_MAP: Final = ModelMap("layout B", USPA44, MappingProxyType(_layout_b()), triggered=True)

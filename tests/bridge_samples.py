@@ -1,0 +1,67 @@
+"""What the tests of the bridge share: recordings, and reading a link to its end."""
+
+import csv
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from firmware_bridge.errors import LinkLostError
+from firmware_bridge.links.base import Link
+from firmware_bridge.recording import CSV_HEADER, Recording, Track
+from firmware_bridge.scan import Scan
+
+REAL_RECORDINGS = Path(
+    os.environ.get("TACTILE_RECORDINGS", Path(__file__).parents[2] / "shared" / "recordings" / "imanlab")
+)
+REST_COUNTS = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
+
+
+def make_counts(scans: int, seed: int = 0) -> np.ndarray:
+    """Scans that all differ in every taxel, (scans, 3, 4, 4)."""
+    noise = np.random.default_rng(seed).integers(0, 30, (scans, 3, 4, 4))
+    return (REST_COUNTS + noise + 40 * (np.arange(scans) % 2)[:, None, None, None]).astype(np.int32)
+
+
+def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recording:
+    return Recording(Path("made.csv"), (Track("4", make_counts(scans, seed), None),), rate_hz)
+
+
+def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None) -> Path:
+    """A recording as a CSV file, its rate beside it."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(CSV_HEADER)
+        writer.writerows([f"{value}.0" for value in scan.reshape(3, 16).T.ravel()] for scan in counts)
+    if rate_hz is not None:
+        path.with_name("meta_data.csv").write_text(f"frequency_hz\n{rate_hz}\n")
+    return path
+
+
+def read_until_lost(link: Link, timeout_s: float = 20.0) -> list[Scan]:
+    """All scans until the link is lost or ends."""
+    scans: list[Scan] = []
+    end_s = time.monotonic() + timeout_s
+    while not link.ended:
+        assert time.monotonic() < end_s, f"still going after {len(scans)} scans: {link.counters()}"
+        try:
+            scans += link.read(0.05)
+        except LinkLostError:
+            break
+    return scans
+
+
+def read_scans(link: Link, count: int, timeout_s: float = 20.0) -> list[Scan]:
+    """The first scans, at least `count`."""
+    scans: list[Scan] = []
+    end_s = time.monotonic() + timeout_s
+    while len(scans) < count:
+        assert time.monotonic() < end_s, f"{len(scans)} scans of {count}: {link.counters()}"
+        scans += link.read(0.05)
+    return scans
+
+
+def stacked(scans: list[Scan], sensor: str = "4") -> np.ndarray:
+    """The counts of one sensor's scans, (n, 3, 4, 4)."""
+    return np.stack([scan.counts for scan in scans if scan.sensor == sensor])

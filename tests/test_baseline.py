@@ -1,0 +1,327 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_bridge.baseline import (
+    LOAD_LIMIT_COUNTS,
+    Baseline,
+    BaselineEstimator,
+    deformation,
+    load_baselines,
+    save_baselines,
+)
+from firmware_bridge.errors import BaselineRefusedError, RecordingError
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.scan import ABSENT, Scan, ScanSeries
+
+REST = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
+NOISE_COUNTS = np.array([2.6, 2.6, 3.9])[:, None, None]
+
+
+def still(count: int, seed: int = 0, rest: np.ndarray = REST) -> np.ndarray:
+    """Scans of a pad that nothing moves: (count, 3, 4, 4)."""
+    noise = np.random.default_rng(seed).normal(0, 1, (count, 3, 4, 4)) * NOISE_COUNTS
+    return np.rint(rest + noise).astype(np.int32) % 65536
+
+
+def scans_of(counts: np.ndarray, sensor: str = "4") -> list[Scan]:
+    series = ScanSeries(sensor, USPA44)
+    return [series.close(np.array(one, dtype=np.int32), n) for n, one in enumerate(counts)]
+
+
+def push_all(estimator: BaselineEstimator, counts: np.ndarray) -> list[Baseline | None]:
+    return [estimator.push(scan) for scan in scans_of(counts)]
+
+
+def made(counts: np.ndarray = REST, sensor: str = "4", created_unix_s: float = 1_000.0) -> Baseline:
+    return Baseline.of(sensor, counts, created_unix_s, scans=100, origin="start-up")
+
+
+def test_a_still_pad_gives_its_median():
+    estimator = BaselineEstimator(clock=lambda: 1234.5)
+    counts = still(100)
+    *before, baseline = push_all(estimator, counts)
+    assert before == [None] * 99 and baseline is not None
+    assert (baseline.counts == np.median(counts, axis=0)).all()
+    assert baseline.counts.dtype == np.float32 and not baseline.counts.flags.writeable
+    assert (baseline.sensor, baseline.scans, baseline.origin, baseline.created_unix_s) == ("4", 100, "start-up", 1234.5)
+    assert baseline.age_s(1300.0) == 65.5
+    assert estimator.scans == 0
+
+
+def test_the_median_is_not_a_hundredth_too_high():
+    """A loop that sums 101 scans and divides by 100 puts z 370 counts too high."""
+    baseline = push_all(BaselineEstimator(), still(100))[-1]
+    assert baseline is not None
+    assert abs(baseline.counts - REST).max() < 2.5
+
+
+def test_noise_of_any_known_pad_is_accepted():
+    for seed in range(40):
+        assert push_all(BaselineEstimator(), still(100, seed))[-1] is not None, seed
+    loudest = np.rint(REST + np.random.default_rng(5).normal(0, 1, (100, 3, 4, 4)) * [[[2.8]], [[2.8]], [[4.7]]])
+    assert push_all(BaselineEstimator(), loudest)[-1] is not None
+
+
+def test_single_readings_far_off_are_no_motion():
+    counts = still(100)
+    counts[40:42, :, 3, 3] -= [0, 117, 290]
+    baseline = push_all(BaselineEstimator(), counts)[-1]
+    assert baseline is not None and abs(baseline.counts - REST).max() < 2.5
+
+
+def test_a_press_while_zeroing_is_refused_and_zeroing_starts_over():
+    estimator = BaselineEstimator()
+    counts = still(100)
+    counts[70:, 2, 1, 2] += 40
+    with pytest.raises(
+        BaselineRefusedError, match=r"taxel \(1, 2\) z moved by \d+ counts .* at most 25 .* still and free"
+    ):
+        push_all(estimator, counts)
+    assert estimator.scans == 0
+    assert push_all(estimator, still(100, 1))[-1] is not None
+
+
+@pytest.mark.parametrize(("axis", "name", "limit"), [(0, "x", 15), (1, "y", 15), (2, "z", 25)])
+def test_shear_has_a_limit_of_its_own(axis, name, limit):
+    quiet = np.broadcast_to(REST, (100, 3, 4, 4)).copy()
+    quiet[:, 0, 0, 0] += np.arange(100) % 2  # so that no scan is sent again
+    wobble = np.where(np.arange(100) % 10 == 0, limit, 0)
+    quiet[:, axis, 3, 1] += wobble
+    assert push_all(BaselineEstimator(), quiet)[-1] is not None
+    quiet[:, axis, 3, 1] += wobble // limit
+    with pytest.raises(BaselineRefusedError, match=rf"taxel \(3, 1\) {name} moved by {limit + 1} counts"):
+        push_all(BaselineEstimator(), quiet)
+
+
+def test_slow_creep_is_refused():
+    counts = still(100)
+    counts[:, 2, 0, 3] += np.linspace(0, 22, 100).astype(np.int32)
+    with pytest.raises(BaselineRefusedError, match=r"taxel \(0, 3\) z crept by 1\d counts .* at most 10"):
+        push_all(BaselineEstimator(), counts)
+    counts = still(100)
+    counts[:, 2, 0, 3] -= np.linspace(0, 22, 100).astype(np.int32)
+    with pytest.raises(BaselineRefusedError, match="crept"):
+        push_all(BaselineEstimator(), counts)
+
+
+def test_creep_is_told_of_the_taxel_that_creeps():
+    counts = np.broadcast_to(REST, (100, 3, 4, 4)).copy()
+    counts[:, 2, 0, 3] += np.linspace(0, 18, 100).astype(np.int64)
+    counts[:, 0, 3, 3] += 12 * (np.arange(100) % 5 == 0)  # the widest spread for its axis, but no creep
+    with pytest.raises(BaselineRefusedError, match=r"taxel \(0, 3\) z crept"):
+        push_all(BaselineEstimator(), counts)
+
+
+def test_a_load_is_seen_against_a_reference():
+    reference = made()
+    warm = still(100, rest=REST + np.array([0, 0, 120])[:, None, None])
+    assert push_all(BaselineEstimator(reference=reference), warm)[-1] is not None
+    pressed = still(100)
+    pressed[:, 2, 2, 1] += 350
+    with pytest.raises(BaselineRefusedError, match=rf"\(2, 1\) z is 35\d counts above the baseline {reference.id}"):
+        push_all(BaselineEstimator(reference=reference), pressed)
+    # The known limit: without a reference such a load is zeroed away.
+    assert push_all(BaselineEstimator(), pressed)[-1] is not None
+
+
+def test_the_load_limit_is_for_z_above_the_reference():
+    def zeroed(axis: int, offset: float) -> Baseline | None:
+        counts = np.broadcast_to(REST, (100, 3, 4, 4)).astype(np.int32)
+        counts[:, 0, 0, 0] += np.arange(100) % 2
+        counts[:, axis, 1, 1] += int(offset)
+        return push_all(BaselineEstimator(reference=made()), counts)[-1]
+
+    assert zeroed(2, LOAD_LIMIT_COUNTS) is not None
+    assert zeroed(2, -3 * LOAD_LIMIT_COUNTS) is not None
+    assert zeroed(0, 3 * LOAD_LIMIT_COUNTS) is not None
+    with pytest.raises(BaselineRefusedError):
+        zeroed(2, LOAD_LIMIT_COUNTS + 1)
+
+
+def test_torn_and_repeated_scans_are_no_samples():
+    estimator = BaselineEstimator(min_scans=3)
+    counts = np.stack([REST, REST + 1, REST + 2])
+    gap = counts[1].copy()
+    gap[:, 0, 0] = ABSENT
+    scans = scans_of(np.stack([counts[0], gap, counts[1], counts[1], counts[1], counts[2]]))
+    assert [estimator.push(scan) is not None for scan in scans] == [False] * 5 + [True]
+
+
+def test_a_scan_that_is_renewed_in_part_is_a_sample():
+    counts = np.stack([REST, REST, REST])
+    counts[1, 0, 0, 0] += 1
+    counts[2, 0, 0, 0] += 2
+    assert push_all(BaselineEstimator(min_scans=3), counts)[-1] is not None
+
+
+@pytest.mark.parametrize("rest", [0, 443, 65_535, 32_768])
+def test_zeroing_and_deformation_go_round_the_circle(rest):
+    level = np.full((3, 4, 4), rest)
+    baseline = push_all(BaselineEstimator(), still(100, rest=level))[-1]
+    assert baseline is not None
+    off = (baseline.counts - rest + 32_768) % 65_536 - 32_768
+    assert abs(off).max() < 2.5
+    assert baseline.counts.min() >= 0 and baseline.counts.max() < 65_536
+    for pressed in (-500, -1, 0, 1, 500, 13_460):
+        seen = deformation((level + pressed) % 65_536, baseline)
+        assert seen.dtype == np.float32
+        assert abs(seen - pressed).max() < 2.5, pressed
+
+
+@given(st.integers(0, 65_535), st.integers(-32_767, 32_767))
+@settings(deadline=None)
+def test_deformation_is_the_short_way_round(rest, pressed):
+    scan = np.full((3, 4, 4), (rest + pressed) % 65_536, dtype=np.int32)
+    assert (deformation(scan, made(np.full((3, 4, 4), rest))) == pressed).all()
+
+
+def test_deformation_keeps_halves_and_leaves_gaps_open():
+    scan = REST.astype(np.int32)
+    scan[:, 1, 3] = ABSENT
+    seen = deformation(scan, made(REST - 0.5))
+    assert np.isnan(seen[:, 1, 3]).all()
+    seen[:, 1, 3] = 0.5
+    assert (seen == 0.5).all()
+
+
+def test_from_counts_takes_what_it_is_given():
+    counts = still(20)
+    counts[15:, 2] += 4000
+    baseline = Baseline.from_counts("6", counts, 99.0)
+    assert (baseline.counts == np.median(counts, axis=0)).all()
+    assert (baseline.sensor, baseline.scans, baseline.created_unix_s) == ("6", 20, 99.0)
+    for bad in (counts[:0], np.where(counts == counts[0, 0, 0, 0], ABSENT, counts)):
+        with pytest.raises(ValueError, match="whole scans"):
+            Baseline.from_counts("6", bad, 99.0)
+
+
+def test_too_few_scans_for_a_third_are_refused():
+    with pytest.raises(ValueError, match="at least 3"):
+        BaselineEstimator(min_scans=2)
+
+
+def test_the_id_stands_for_sensor_counts_and_time():
+    one = made()
+    assert len(one.id) == 8 and one.id == made().id
+    others = [made(sensor="6"), made(REST + 1), made(created_unix_s=1_001.0)]
+    assert len({one.id, *(other.id for other in others)}) == 4
+
+
+def test_saved_baselines_come_back(tmp_path):
+    path = tmp_path / "zero.json"
+    saved = [made(), made(REST + 0.5, "6", 123.456)]
+    path.write_text("old")
+    save_baselines(str(path), saved)
+    loaded = load_baselines(str(path))
+    assert list(loaded) == ["4", "6"]
+    for baseline, sensor in zip(saved, ("4", "6"), strict=True):
+        got = loaded[sensor]
+        assert (got.counts == baseline.counts).all() and got.counts.shape == (3, 4, 4)
+        assert (got.id, got.created_unix_s, got.scans) == (baseline.id, baseline.created_unix_s, 100)
+        assert got.origin == "file"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["zero.json"]
+
+
+def test_saving_each_sensor_once(tmp_path):
+    with pytest.raises(ValueError, match="each sensor once"):
+        save_baselines(tmp_path / "zero.json", [made(), made()])
+
+
+def test_saving_where_nothing_can_be_written(tmp_path):
+    with pytest.raises(RecordingError, match=r"zero\.json: cannot be written: No such file"):
+        save_baselines(tmp_path / "no" / "zero.json", [made()])
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(RecordingError, match="cannot be written"):
+        save_baselines(tmp_path / "folder", [made()])
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+def document(tmp_path: Path) -> dict:
+    save_baselines(tmp_path / "zero.json", [made()])
+    return json.loads((tmp_path / "zero.json").read_text())
+
+
+def refused(tmp_path: Path, changed: object, match: str) -> None:
+    path = tmp_path / "zero.json"
+    path.write_text(json.dumps(changed))
+    with pytest.raises(RecordingError, match=rf"zero\.json.*{match}.*zero again"):
+        load_baselines(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"format": "other"}, "'format': 'other', expected 'tactile-baseline'"),
+        ({"version": 2}, "'version': 2, expected 1"),
+        ({"baselines": []}, "'baselines'"),
+        ({"baselines": {}}, "'baselines'"),
+        ({"baselines": [1]}, "'baselines': 1, expected objects"),
+    ],
+)
+def test_files_that_are_none(tmp_path, changes, match):
+    refused(tmp_path, document(tmp_path) | changes, match)
+
+
+def with_cell(cell: object) -> list:
+    counts = REST.tolist()
+    counts[1][2][3] = cell
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"sensor": ""}, "'sensor'"),
+        ({"sensor": 4}, "'sensor'"),
+        ({"created_unix_s": 0}, "'created_unix_s'"),
+        ({"created_unix_s": True}, "'created_unix_s'"),
+        ({"created_unix_s": None}, "'created_unix_s'"),
+        ({"created_unix_s": float("inf")}, "'created_unix_s'"),
+        ({"scans": 0}, "'scans'"),
+        ({"scans": 1.0}, "'scans'"),
+        ({"counts": None}, "'counts': None"),
+        ({"counts": []}, "'counts'"),
+        ({"counts": [[[]], [[]], [[]]]}, "'counts'"),
+        ({"counts": REST.tolist()[:2]}, r"'counts': 'shape \(2, 4, 4\)'"),
+        ({"counts": REST.ravel().tolist()}, "'counts'"),
+        ({"counts": [REST.tolist()] * 3}, "'counts'"),
+        ({"counts": [[[1, 2], [3]], [[4]], [[5]]]}, "'counts'"),
+        ({"counts": with_cell(65_536)}, "'counts'"),
+        ({"counts": with_cell(-1)}, "'counts'"),
+        ({"counts": with_cell(10**400)}, "'counts'"),
+        ({"counts": with_cell(float("nan"))}, "'counts'"),
+        ({"counts": with_cell("1")}, "'counts'"),
+        ({"counts": with_cell(False)}, "'counts'"),
+        ({"counts": with_cell(16_000)}, "'id': .*the file was changed"),
+        ({"id": "00000000"}, "'id': '00000000'"),
+        ({"id": None}, "'id': None"),
+    ],
+)
+def test_entries_that_are_none(tmp_path, changes, match):
+    changed = document(tmp_path)
+    changed["baselines"][0] |= changes
+    refused(tmp_path, changed, match)
+
+
+def test_a_sensor_twice(tmp_path):
+    changed = document(tmp_path)
+    changed["baselines"] *= 2
+    refused(tmp_path, changed, "'sensor': '4', expected each sensor once")
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b"null", b'"x"', b"\xff", b"[" * 100_000])
+def test_files_that_are_no_json(tmp_path, text):
+    path = tmp_path / "zero.json"
+    path.write_bytes(text)
+    with pytest.raises(RecordingError, match=r"zero\.json"):
+        load_baselines(path)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(RecordingError, match="cannot be read: No such file"):
+        load_baselines(tmp_path / "zero.json")

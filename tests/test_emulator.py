@@ -1,0 +1,385 @@
+import contextlib
+import os
+import random
+import select
+import subprocess
+import sys
+import termios
+import time
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
+
+from firmware_bridge.assembler import SlcanScans
+from firmware_bridge.controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
+from firmware_bridge.emulator import Emulator, main
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.recording import Track
+from firmware_bridge.scan import ABSENT
+from firmware_bridge.slcan import CanFrame
+from firmware_bridge.xela import USPA44_MAP, decode
+
+# What the controller says.
+
+
+def test_a_scan_is_sixteen_frames_in_the_order_of_sda_and_taxel():
+    counts = make_counts(1)[0]
+    frames = scan_frames(counts, 4, random.Random(0))
+    seen = "004 014 024 034 104 114 124 134 204 214 224 234 304 314 324 334"
+    assert [f"{frame.can_id:03X}" for frame in frames] == seen.split()
+    # Columns run backwards: the first frame is the right end of the top row.
+    assert decode(frames[0], USPA44_MAP) == ("4", 3, *counts[:, 0, 3])
+    for frame in frames:
+        reading = decode(frame, USPA44_MAP)
+        assert reading is not None
+        assert reading[2:] == tuple(counts[:, reading.taxel // 4, reading.taxel % 4])
+        assert frame.data[0] != 0 and frame.data[7] != 0
+    assert len({frame.data[0] for frame in frames}) > 4 and len({frame.data[7] for frame in frames}) > 4
+
+
+def test_the_ends_of_the_range_and_absent_taxels():
+    counts = make_counts(1)[0]
+    counts[:, 0, 3] = [0, 65_535, 256]
+    counts[:, 1, 1] = ABSENT
+    frames = scan_frames(counts, 15, random.Random(0))
+    assert frames[0].data[1:7] == bytes.fromhex("0000 FFFF 0100")
+    assert len(frames) == 15 and 0x12F not in {frame.can_id for frame in frames}
+
+
+def timeline(tracks: int = 1, scans: int = 50, rate_hz: float = 100.0, **options):
+    controllers = [Controller(Track("x", make_counts(scans, n), None), 4 + 2 * n, rate_hz) for n in range(tracks)]
+    return list(islice(bus_timeline(controllers, **({"jitter_s": 0.0, "seed": 0, "loop": False} | options)), 5000))
+
+
+def test_scans_lie_on_the_grid_and_jitter_does_not_add_up():
+    starts = [time_s for time_s, _ in timeline()[::16]]
+    assert starts == pytest.approx([n / 100 for n in range(50)])
+    times = [time_s for time_s, _ in timeline(jitter_s=0.003)]
+    assert times == sorted(times)
+    off = np.array(times[::16]) - np.arange(50) / 100
+    assert abs(off).max() <= 0.003 and abs(off[1:]).max() > 0.002 and off.min() < 0 < off.max()
+    gaps = np.diff(times).reshape(-1)[:15]
+    assert gaps == pytest.approx([FRAME_S] * 15)
+
+
+def test_a_controller_sends_one_frame_at_a_time_even_when_it_falls_behind():
+    times = [time_s for time_s, _ in timeline(rate_hz=1000.0)]
+    assert np.diff(times) == pytest.approx([FRAME_S] * (len(times) - 1))
+
+
+def test_two_controllers_share_the_bus():
+    frames = timeline(tracks=2, scans=3)
+    assert len(frames) == 96
+    assert [frame.can_id & 0xF for _, frame in frames[:6]] == [4, 6] * 3
+    assert [time_s for time_s, _ in frames] == sorted(time_s for time_s, _ in frames)
+
+
+def test_the_seed_decides_everything():
+    options = {"jitter_s": 0.002}
+    assert timeline(seed=1, **options) == timeline(seed=1, **options)
+    assert timeline(seed=1, **options) != timeline(seed=2, **options)
+
+
+def test_looping_goes_on_in_time():
+    frames = timeline(scans=2, loop=True)
+    assert len(frames) == 5000
+    assert frames[5 * 16][0] == pytest.approx(0.05)
+    assert decode(frames[32][1], USPA44_MAP) == decode(frames[0][1], USPA44_MAP)
+
+
+# What the adapter says.
+
+FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
+
+
+def test_an_adapter_opens_after_bitrate_and_open_only():
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"O\r") == b"\a" and not adapter.channel_open
+    assert adapter.feed(b"S8\r") == b"\r" and not adapter.hears_the_bus
+    assert adapter.feed(b"O\r") == b"\r" and adapter.hears_the_bus
+    assert adapter.feed(b"O\r") == b"\a" and adapter.hears_the_bus
+    assert adapter.feed(b"S8\r") == b"\a" and adapter.feed(b"Z1\r") == b"\a"
+    assert adapter.feed(b"C\r") == b"\r" and not adapter.hears_the_bus
+    assert adapter.feed(b"O\r") == b"\r" and adapter.hears_the_bus
+    assert adapter.refused == 4
+
+
+def test_an_adapter_at_another_bitrate_hears_nothing():
+    adapter = SlcanAdapter()
+    adapter.feed(b"S6\rO\r")
+    assert adapter.channel_open and not adapter.hears_the_bus
+
+
+@pytest.mark.parametrize("command", [b"\r", b"C\r", b"S9\r", b"S\r", b"S88\r", b"OO\r", b"x\r", b"t0010\r", b"V1\r"])
+def test_an_adapter_refuses_nonsense(command):
+    adapter = SlcanAdapter()
+    assert adapter.feed(command) == b"\a" and adapter.refused == 1
+
+
+def test_an_adapter_takes_commands_in_pieces_and_forgets_overlong_ones():
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"S") == b"" and adapter.feed(b"8\rO") == b"\r" and adapter.feed(b"\r") == b"\r"
+    assert adapter.hears_the_bus
+    adapter.feed(b"x" * 100_000)
+    assert adapter.feed(b"\rC\r") == b"\a\r"
+
+
+def test_an_adapter_that_acknowledges_nothing():
+    adapter = SlcanAdapter(acknowledges=False)
+    assert adapter.feed(b"O\rS8\rO\rO\rV\r") == b"" and adapter.hears_the_bus and adapter.refused == 2
+
+
+def test_an_adapter_tells_its_version_and_sends_frames():
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"V\r") == b"V1013\r"
+    assert adapter.feed(b"S8\rO\rt20120700\r") == b"\r\rz\r"
+    assert adapter.sent == [b"t20120700"]
+
+
+def test_time_stamps_are_on_request_and_wrap_each_minute():
+    adapter = SlcanAdapter()
+    assert adapter.encode(FRAME, 59.9999) == b"t0048937E317E1593120F\r"
+    adapter.feed(b"Z1\r")
+    assert adapter.encode(FRAME, 59.9999) == b"t0048937E317E1593120FEA5F\r"
+    assert adapter.encode(FRAME, 60.0) == b"t0048937E317E1593120F0000\r"
+    adapter.feed(b"Z0\r")
+    assert adapter.encode(FRAME, 60.0) == b"t0048937E317E1593120F\r"
+
+
+def test_an_adapter_left_open():
+    assert SlcanAdapter(left_open=True).hears_the_bus
+
+
+# The pseudo-terminal.
+
+
+def open_raw(port: str, baudrate: int = 3_000_000) -> serial.Serial:
+    return serial.Serial(port, baudrate, rtscts=True, timeout=0.2)
+
+
+def read_to_the_end(port: serial.Serial) -> bytes:
+    """All until the emulator hangs up, or falls silent."""
+    data = b""
+    with contextlib.suppress(serial.SerialException):
+        while more := port.read(port.in_waiting or 1):
+            data += more
+    return data
+
+
+def test_silence_before_bitrate_and_open():
+    with Emulator([make_recording(5)]) as emulator, open_raw(emulator.port) as port:
+        assert port.read(100) == b""
+        port.write(b"O\r")
+        assert port.read(100) == b"\a"
+        port.write(b"S8\r")
+        assert port.read(100) == b"\r"
+        port.write(b"O\r")
+        assert port.read(23).startswith(b"\rt0048")
+    assert emulator.adapter.refused == 1
+
+
+def test_close_stops_the_stream():
+    with Emulator([make_recording(50)], loop=True) as emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        assert len(port.read(1000)) == 1000
+        port.write(b"C\r")
+        while port.read(1000):
+            pass
+        assert not emulator.adapter.channel_open
+        port.write(b"O\r")
+        assert len(port.read(1000)) == 1000
+
+
+@pytest.mark.parametrize("left_open", [False, True])
+def test_the_wrong_line_speed_is_noise(left_open):
+    recording = make_recording(30)
+    with Emulator([recording], left_open=left_open) as emulator, open_raw(emulator.port, 115_200) as port:
+        port.write(b"S8\rO\r" * 20)
+        scans = SlcanScans()
+        data = read_to_the_end(port)
+        assert scans.feed(data, 0) == []
+        assert emulator.adapter.hears_the_bus == left_open
+        assert scans.counters()["frames"] == 0
+        if left_open:
+            # Noise, and less of it: bytes run into each other.
+            assert 0 < len(data) < 30 * 16 * 22 / 10
+
+
+def test_usb_adapters_ignore_the_line_speed():
+    with Emulator([make_recording(3)], ignores_line_speed=True) as emulator, open_raw(emulator.port, 115_200) as port:
+        port.write(b"S8\rO\r")
+        assert len(port.read(3 * 16 * 22)) == 3 * 16 * 22
+
+
+def test_a_slow_reader_loses_frames_and_stops_nobody():
+    """The kernel keeps some twenty thousand bytes for a reader; the device keeps none beyond."""
+    with Emulator([make_recording(400, rate_hz=480.0)]) as emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        end_s = time.monotonic() + 20
+        while emulator.lost_frames < 100:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        decoder = SlcanScans()
+        while emulator.sent_frames + emulator.lost_frames < 400 * 16:
+            decoder.feed(port.read(port.in_waiting or 1), 0)
+        decoder.feed(read_to_the_end(port), 0)
+        told = decoder.counters()
+        # A frame of which a part found room is lost as well: its head is skipped before the next.
+        assert told["frames"] == emulator.sent_frames
+        assert told["frames"] + emulator.lost_frames == 400 * 16
+
+
+def test_it_hangs_up_when_all_is_played_and_fetched():
+    recording = make_recording(20)
+    with Emulator([recording]) as emulator, SlcanSerialLink(emulator.port) as link:
+        time.sleep(0.4)  # all is played, nothing is fetched
+        assert not emulator.wait(0)
+        scans = read_until_lost(link)
+        assert emulator.wait(5)
+    assert (stacked(scans) == recording.tracks[0].counts).all()
+
+
+def test_the_cable_out():
+    with Emulator([make_recording(50)], loop=True) as emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        port.read(500)
+        emulator.hang_up()
+        assert emulator.wait(0)
+        with pytest.raises(serial.SerialException):
+            for _ in range(100):
+                port.read(1000)
+        emulator.hang_up()
+
+
+def test_nothing_stays_open():
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    with Emulator([make_recording(1)]) as emulator:
+        assert len(list(Path("/proc/self/fd").iterdir())) == before + 2
+    assert emulator.wait(0)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize(("latency_s", "fewest", "most"), [(0.001, 20, 10_000), (0.05, 2, 14)])
+def test_latency_bunches_what_arrives(latency_s, fewest, most):
+    emulator = Emulator([make_recording(40)], latency_s=latency_s, loop=True)
+    with emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        port.timeout = 0.003
+        chunks, received = 0, 0
+        while received < 40 * 16 * 22:
+            data = port.read(1_000_000)
+            chunks, received = chunks + bool(data), received + len(data)
+    assert fewest <= chunks <= most
+
+
+def test_several_recordings_are_several_controllers():
+    recordings = [make_recording(10, seed=1), make_recording(10, seed=2)]
+    with Emulator(recordings, controllers=(9, 2)) as emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+    for sensor, recording in zip(("9", "2"), recordings, strict=True):
+        assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
+
+
+def test_a_loop_does_not_end():
+    with Emulator([make_recording(3, rate_hz=200)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_scans(link, 10)
+    assert (scans[3].counts == scans[0].counts).all()
+
+
+@pytest.mark.parametrize(
+    "options", [{"controllers": [4, 6]}, {"controllers": [16]}, {"controllers": [-1]}, {"jitter_s": -1}]
+)
+def test_options_out_of_range(options):
+    with pytest.raises(ValueError, match="expected"):
+        Emulator([make_recording(1)], **options)
+
+
+def test_the_same_controller_twice():
+    with pytest.raises(ValueError, match="2 different ones"):
+        Emulator([make_recording(1)] * 2, controllers=[4, 4])
+
+
+def test_more_options_out_of_range():
+    for options in (
+        {"latency_s": float("nan")},
+        {"latency_s": float("inf")},
+        {"rate_hz": 0.0},
+        {"rate_hz": float("nan")},
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            Emulator([make_recording(1)], **options)
+
+
+def test_recordings_that_no_such_sensor_made(tmp_path):
+    other = make_recording(1)
+    wide = Track("4", np.zeros((1, 3, 4, 6), dtype=np.int32), None)
+    with pytest.raises(RecordingError, match=r"\(3, 4, 6\)"):
+        Emulator([type(other)(other.path, (wide,), 100.0)])
+    with pytest.raises(RecordingError, match="--rate-hz"):
+        Emulator([type(other)(other.path, other.tracks, None)])
+
+
+def test_the_rate_may_come_from_the_recorded_times():
+    made = make_recording(5)
+    times = np.arange(5, dtype=np.int64) * 5_000_000
+    timed = type(made)(made.path, (Track("4", made.tracks[0].counts, times),), None)
+    with Emulator([timed]) as emulator, SlcanSerialLink(emulator.port) as link:
+        assert len(read_until_lost(link)) == 5
+
+
+# The command.
+
+
+def start(*arguments: object) -> subprocess.Popen:
+    command = [sys.executable, "-m", "firmware_bridge.emulator", *map(str, arguments)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_the_command_plays_and_ends(tmp_path):
+    path = write_recording(tmp_path / "a.csv", make_counts(8))
+    with start(path, path, "--controller", "3,5", "--rate-hz", 200, "--no-acks", "--seed", 4) as process:
+        with SlcanSerialLink(process.stdout.readline().strip()) as link:
+            scans = read_until_lost(link)
+        assert {scan.sensor for scan in scans} == {"3", "5"} and len(scans) == 16
+        assert link.counters()["replies"] == 0
+        assert process.wait(10) == 0
+
+
+def test_the_command_ends_with_who_started_it(tmp_path):
+    path = write_recording(tmp_path / "a.csv", make_counts(8))
+    with start(path, "--rate-hz", 100, "--loop", "--until-stdin-closes") as process:
+        assert process.stdout.readline().startswith("/dev/pts/")
+        assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(10) == 0
+
+
+def test_the_command_says_what_is_wrong(tmp_path, capsys):
+    path = write_recording(tmp_path / "a.csv", make_counts(1))
+    for arguments, words in (
+        ([str(tmp_path / "gone.csv")], "cannot be read"),
+        ([str(path)], "--rate-hz"),
+        ([str(path), "--controller", "x"], "invalid literal"),
+        ([str(path), "--rate-hz", "0"], "positive"),
+        ([str(path), "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 2
+        assert words in capsys.readouterr().err
+
+
+def test_the_terminal_is_left_for_the_client_to_set_up():
+    """A serial port comes up cooked and slow; a client that relies on more would fail on a real one."""
+    with Emulator([make_recording(1)]) as emulator:
+        client = os.open(emulator.port, os.O_RDWR | os.O_NOCTTY)
+        flags = termios.tcgetattr(client)
+        assert flags[3] & termios.ICANON and flags[5] != termios.B3000000
+        os.write(client, b"S8\nO\n")
+        assert select.select([client], [], [], 0.2)[0] == []
+        os.close(client)

@@ -1,0 +1,344 @@
+import contextlib
+import errno
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
+
+from firmware_bridge.emulator import Emulator
+from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
+from firmware_bridge.links import slcan_serial
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.recording import Recording, Track
+from firmware_bridge.scan import Scan
+from firmware_bridge.xela import LAYOUT_A_MAP, trigger_frame
+
+
+@pytest.mark.parametrize("acknowledges", [True, False])
+@pytest.mark.parametrize("latency_s", [0.001, 0.016])
+def test_every_scan_comes_once_and_in_order(acknowledges, latency_s):
+    recordings = [make_recording(60, seed=1), make_recording(60, seed=2)]
+    with (
+        Emulator(recordings, acknowledges=acknowledges, latency_s=latency_s, jitter_s=0.002) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        scans = read_until_lost(link)
+        assert (emulator.lost_frames, link.ended) == (0, False)
+        counters = {name: count for name, count in link.counters().items() if count}
+    for sensor, recording in zip(("4", "6"), recordings, strict=True):
+        mine = [scan for scan in scans if scan.sensor == sensor]
+        assert [scan.number for scan in mine] == list(range(60))
+        assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
+        times = [scan.time_ns for scan in mine]
+        assert times == sorted(times)
+    # The acknowledgement of the opening is seen; those before it are dropped with what is old.
+    lines = 2 * 60 * 16
+    expected = {"received_bytes": lines * 22 + acknowledges, "frames": lines, "readings": lines, "scans": 120}
+    assert counters == expected | ({"replies": 1} if acknowledges else {})
+
+
+def test_it_opens_as_adapters_want_it():
+    with Emulator([make_recording(5)], loop=True) as emulator:
+        with SlcanSerialLink(emulator.port) as link:
+            read_scans(link, 3)
+            # Closing what is not open is the only command that is refused: no empty one, no second O.
+            assert emulator.adapter.refused == 1
+        wait_for(lambda: not emulator.adapter.channel_open)
+
+
+def test_what_it_says_about_itself():
+    with Emulator([make_recording(1)]) as emulator:
+        link = SlcanSerialLink(emulator.port)
+        assert (link.kind, link.name, link.ended) == ("emulated", f"slcan:{emulator.port}", False)
+        with link as entered:
+            assert entered is link
+            assert link.low_latency is False  # a pseudo-terminal has no such mode
+    assert SlcanSerialLink("/dev/ttyUSB0").kind == "device"
+
+
+def test_a_pseudo_terminal_is_known_behind_a_link(tmp_path):
+    with Emulator([make_recording(1)]) as emulator:
+        (tmp_path / "ttyUSB0").symlink_to(emulator.port)
+        assert SlcanSerialLink(str(tmp_path / "ttyUSB0")).kind == "emulated"
+
+
+def test_opening_late_loses_nothing_of_a_recording():
+    recording = make_recording(10)
+    with Emulator([recording]) as emulator:
+        time.sleep(0.3)
+        with SlcanSerialLink(emulator.port) as link:
+            assert (stacked(read_until_lost(link)) == recording.tracks[0].counts).all()
+
+
+def counting_recording(scans: int, rate_hz: float) -> Recording:
+    """Every count tells which cycle it is of."""
+    counts = REST_COUNTS.astype(np.int32) + np.arange(scans, dtype=np.int32)[:, None, None, None]
+    return Recording(Path("counting.csv"), (Track("4", counts, None),), rate_hz)
+
+
+def cycles_in(scan: Scan) -> set[int]:
+    cycles = set((scan.counts - REST_COUNTS)[:, scan.fresh].ravel().tolist())
+    assert cycles <= set(range(500)), "a value that no cycle had"
+    return cycles
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def test_what_is_older_than_the_opening_is_dropped():
+    """A client that was killed leaves the channel open, and the kernel keeps what it did not read."""
+    recording = counting_recording(400, rate_hz=400)
+    with Emulator([recording], left_open=True) as emulator:
+        serial.Serial(emulator.port, 3_000_000).close()
+        wait_for(lambda: emulator.sent_frames >= 40 * 16)
+        old = emulator.sent_frames // 16
+        with SlcanSerialLink(emulator.port) as link:
+            scans = read_scans(link, 10)
+            assert link.counters()["frames"] < (400 - 40) * 16
+    assert min(int(number) for scan in scans for number in cycles_in(scan)) >= old
+
+
+def test_a_reader_that_is_too_slow_gets_no_made_up_scans():
+    with Emulator([counting_recording(500, rate_hz=480)]) as emulator, SlcanSerialLink(emulator.port) as link:
+        wait_for(lambda: emulator.lost_frames >= 100)
+        scans = read_until_lost(link)
+        assert link.counters()["frames"] == 500 * 16 - emulator.lost_frames
+    assert 100 < len(scans) < 500
+    last = -1
+    for scan in scans:
+        # At most two cycles share a scan, where frames between them were lost; and time never goes back.
+        cycles = cycles_in(scan)
+        assert len(cycles) <= 2 and min(cycles) >= last and max(cycles) < 500
+        last = max(cycles)
+
+
+def test_two_clients_cannot_share_a_port():
+    with (
+        Emulator([make_recording(1)]) as emulator,
+        SlcanSerialLink(emulator.port),
+        pytest.raises(DeviceError, match=r"in use: .*slcand"),
+    ):
+        SlcanSerialLink(emulator.port).__enter__()
+
+
+def test_the_wrong_line_speed_gives_no_scan():
+    recording = make_recording(20)
+    with (
+        Emulator([recording], left_open=True, loop=True) as emulator,
+        SlcanSerialLink(emulator.port, 115_200) as link,
+    ):
+        assert [scan for _ in range(5) for scan in link.read(0.1)] == []
+        assert link.counters()["frames"] == 0 < link.counters()["received_bytes"]
+    with (
+        Emulator([recording], ignores_line_speed=True) as emulator,
+        SlcanSerialLink(emulator.port, 115_200) as link,
+    ):
+        assert len(read_until_lost(link)) == 20
+
+
+def test_the_cable_out_is_told_at_once_and_every_time():
+    with Emulator([make_recording(10)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
+        read_scans(link, 5)
+        puller = threading.Timer(0.1, emulator.hang_up)
+        puller.start()
+        with pytest.raises(LinkLostError, match=f"{emulator.port}: link lost") as lost:
+            for _ in range(100):
+                link.read(10.0)
+        puller.join()
+        assert isinstance(lost.value, ConnectionError)
+        with pytest.raises(LinkLostError):
+            link.read(10.0)
+
+
+def test_reading_where_nothing_comes():
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        assert link.read(0.0) == []
+        assert link.read(0.01) == []
+
+
+def test_a_link_that_is_not_open():
+    link = SlcanSerialLink("/dev/ttyUSB0")
+    with pytest.raises(ValueError, match="with statement"):
+        link.read(0.1)
+    link.__exit__(None, None, None)
+
+
+def test_opening_again_after_closing():
+    with Emulator([make_recording(3)], loop=True) as emulator:
+        link = SlcanSerialLink(emulator.port)
+        for _ in range(2):
+            with link:
+                read_scans(link, 2)
+
+
+class SilentDevice:
+    """The far end of a pseudo-terminal that takes nothing: a dead adapter, its cable in."""
+
+    def __enter__(self):
+        self.device_fd, self.client_fd = os.openpty()
+        tty.setraw(self.client_fd)
+        self.port = os.ttyname(self.client_fd)
+        return self
+
+    def received(self, count: int) -> bytes:
+        """The first bytes that came, and any that came with them."""
+        data = b""
+        while len(data) < count and select.select([self.device_fd], [], [], 5)[0]:
+            data += os.read(self.device_fd, 1000)
+        return data
+
+    def __exit__(self, *exc_info):
+        os.close(self.device_fd)
+        os.close(self.client_fd)
+
+
+def test_commands_on_opening_and_closing():
+    with SilentDevice() as device:
+        with SlcanSerialLink(device.port) as link:
+            assert link.read(0.0) == []
+        # Nothing before, nothing between and nothing after: an empty command is refused by some adapters.
+        assert device.received(9) == b"C\rS8\rO\rC\r"
+
+
+def test_triggers_wake_older_controllers():
+    triggers = [trigger_frame(1), trigger_frame(2)]
+    with SilentDevice() as device, SlcanSerialLink(device.port, model=LAYOUT_A_MAP, triggers=triggers) as link:
+        assert device.received(27) == b"C\rS8\rO\rt20120700\rt20220700\r"
+        lines = b"".join(b"t%03X8000001000200%02X00\r" % (0x710 + taxel, 3) for taxel in range(16))
+        os.write(device.device_fd, lines)
+        (scan,) = read_scans(link, 1)
+        assert scan.sensor == "1" and scan.complete and set(scan.counts[1].ravel().tolist()) == {2}
+
+
+def fill(port_fd: int) -> None:
+    os.set_blocking(port_fd, False)
+    for _ in range(5):  # the kernel moves bytes on to a second buffer, with a delay
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(port_fd, b"xxxx")
+        time.sleep(0.01)
+
+
+def test_a_device_that_takes_nothing_does_not_hold_up_closing(monkeypatch):
+    monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.05)
+    with SilentDevice() as device:
+        with SlcanSerialLink(device.port):
+            fill(device.client_fd)
+        serial.Serial(device.port, exclusive=True).close()  # the port is free again
+
+
+def test_a_device_that_takes_nothing_does_not_hold_up_opening(monkeypatch):
+    monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.05)
+    with SilentDevice() as device:
+        fill(device.client_fd)
+        with pytest.raises(DeviceError, match="does not take commands"):
+            SlcanSerialLink(device.port).__enter__()
+        serial.Serial(device.port, exclusive=True).close()
+
+
+@pytest.mark.parametrize("unsent", [0, 5])
+def test_commands_are_thrown_away_only_if_the_device_does_not_take_them(monkeypatch, unsent):
+    """Throwing them away always would throw away the closing as well."""
+    thrown = []
+    with SilentDevice() as device:
+        with SlcanSerialLink(device.port):
+            monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.02)
+            # A pseudo-terminal never tells that something is unsent.
+            monkeypatch.setattr(serial.Serial, "out_waiting", unsent)
+            monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda port: thrown.append(port))
+        assert bool(thrown) == bool(unsent)
+
+
+def test_a_stream_that_will_not_stop_does_not_hold_up_opening(monkeypatch):
+    monkeypatch.setattr(slcan_serial, "LONGEST_SETTLE_S", 0.1)
+    stop = threading.Event()
+    with SilentDevice() as device:
+        os.set_blocking(device.device_fd, False)
+
+        def chatter():
+            while not stop.wait(0.001):
+                with contextlib.suppress(BlockingIOError):
+                    os.write(device.device_fd, b"t0048937E317E1593120F\r")
+
+        thread = threading.Thread(target=chatter)
+        thread.start()
+        try:
+            with SlcanSerialLink(device.port) as link:
+                while not link.counters()["frames"]:
+                    link.read(1.0)
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_flow_control_is_asked_for():
+    with SilentDevice() as device:
+        for rtscts in (True, False):
+            with SlcanSerialLink(device.port, rtscts=rtscts):
+                assert (
+                    bool(slcan_serial.termios.tcgetattr(device.client_fd)[2] & slcan_serial.termios.CRTSCTS) == rtscts
+                )
+
+
+# What goes wrong before anything is open.
+
+
+def test_no_such_port():
+    with pytest.raises(DeviceError, match=r"/dev/ttyNONE: no such port\. Serial ports seen: "):
+        SlcanSerialLink("/dev/ttyNONE").__enter__()
+
+
+def test_something_that_is_no_serial_port(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("")
+    for port in (str(path), str(tmp_path), "/dev/null"):
+        with pytest.raises(DeviceError, match="cannot be used as a serial port"):
+            SlcanSerialLink(port).__enter__()
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [(errno.EACCES, "dialout"), (errno.EPERM, "dialout"), (errno.EBUSY, "slcand"), (errno.EIO, "Input/output error")],
+)
+def test_why_a_port_cannot_be_opened(monkeypatch, code, words):
+    def refuse(*args, **kwargs):
+        raise serial.SerialException(code, f"could not open port: [Errno {code}]")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(DeviceError, match=words) as refused:
+        SlcanSerialLink("/dev/ttyUSB0").__enter__()
+    assert isinstance(refused.value, BridgeError) and isinstance(refused.value, OSError)
+
+
+def test_an_adapter_that_goes_while_it_is_opened(monkeypatch):
+    with Emulator([make_recording(1)]) as emulator:
+        link = SlcanSerialLink(emulator.port)
+        opened = link._open_port
+
+        def open_and_pull():
+            port = opened()
+            emulator.hang_up()
+            return port
+
+        monkeypatch.setattr(link, "_open_port", open_and_pull)
+        with pytest.raises(DeviceError):
+            link.__enter__()
+
+
+def test_low_latency_where_the_driver_has_it(monkeypatch):
+    asked = []
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda port, on: asked.append(on))
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        assert asked == [True] and link.low_latency

@@ -1,0 +1,210 @@
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.recording import CSV_HEADER, load_recording
+
+HEADER = ",".join(CSV_HEADER) + "\n"
+
+
+def row(number: int) -> str:
+    """Taxel n of row `number` reads x = 100 n + number, y = 5000 + x, z = 9000 + x."""
+    cells = [f"{base + 100 * taxel + number}.0" for taxel in range(16) for base in (0, 5000, 9000)]
+    return ",".join(cells) + "\n"
+
+
+def write_csv(folder: Path, text: str | bytes, name: str = "finger.csv") -> Path:
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def npz_arrays() -> dict[str, np.ndarray]:
+    counts = np.arange(4 * 48, dtype=np.int32).reshape(4, 3, 4, 4)
+    counts[1, :, 2, 3] = -1
+    return {
+        "format": np.array("tactile-recording"),
+        "version": np.array(1),
+        "sensor": np.array(["4", "6", "4", "6"]),
+        "scan": np.array([0, 0, 1, 1], dtype=np.int64),
+        "time_ns": np.array([10, 15, 20_000_010, 30_000_015], dtype=np.int64),
+        "counts": counts,
+    }
+
+
+def write_npz(folder: Path, **changes: object) -> Path:
+    path = folder / "finger.npz"
+    arrays = npz_arrays() | changes
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+def test_csv(tmp_path):
+    path = write_csv(tmp_path, HEADER + row(0) + row(7))
+    recording = load_recording(str(path))
+    assert recording.path == path and recording.rate_hz is None
+    (track,) = recording.tracks
+    assert track.sensor == "finger" and track.time_ns is None and track.mean_rate_hz is None
+    assert track.counts.dtype == np.int32 and track.counts.shape == (2, 3, 4, 4)
+    taxels = np.arange(16).reshape(4, 4) * 100
+    assert (track.counts[1] == np.stack([taxels + 7, taxels + 5007, taxels + 9007])).all()
+
+
+def test_csv_rate_comes_from_the_file_beside_it(tmp_path):
+    path = write_csv(tmp_path, HEADER + row(0))
+    write_csv(tmp_path, "dropped,notes,frequency_hz\n0,,59.75\n", "meta_data.csv")
+    assert load_recording(path).rate_hz == 59.75
+    write_csv(tmp_path, "dropped,notes\n0,\n", "meta_data.csv")
+    assert load_recording(path).rate_hz is None
+
+
+@pytest.mark.parametrize("cell", ["fast", "0", "-1", "nan", "inf", ""])
+def test_csv_rate_that_is_no_rate(tmp_path, cell):
+    path = write_csv(tmp_path, HEADER + row(0))
+    write_csv(tmp_path, f"frequency_hz\n{cell}\n", "meta_data.csv")
+    with pytest.raises(RecordingError, match=r"meta_data\.csv.*positive"):
+        load_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("written", "read"), [("65535", 65535), ("0.0", 0), ("12.", 12), (" 12.00 ", 12), ("000012", 12)]
+)
+def test_csv_whole_numbers(tmp_path, written, read):
+    cells = row(0).strip().split(",")
+    cells[5] = written
+    assert load_recording(write_csv(tmp_path, HEADER + ",".join(cells) + "\n")).tracks[0].counts[0, 2, 0, 1] == read
+
+
+@pytest.mark.parametrize(
+    "written", ["65536", "-1", "1.5", "", "nan", "inf", "1e4", "1_0", "0x10", "x", "\u0661", "9" * 5000]
+)
+def test_csv_other_cells(tmp_path, written):
+    cells = row(0).strip().split(",")
+    cells[5] = written
+    path = write_csv(tmp_path, HEADER + row(0) + ",".join(cells) + "\n")
+    with pytest.raises(RecordingError, match=r"finger\.csv, line 3: .*expected a whole number 0\.\.65535"):
+        load_recording(path)
+
+
+def axis_grouped() -> str:
+    return ",".join(f"txl{taxel}_{axis}" for axis in "xyz" for taxel in range(1, 17)) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ("", 1, "empty"),
+        (HEADER, 2, "row of counts"),
+        (axis_grouped() + row(0), 1, "side by side"),
+        (row(0), 1, "48: txl1_x"),
+        ("a,b\n" + row(0), 1, "2 columns"),
+        (HEADER + row(0) + row(1).replace(",", "", 1), 3, "47 columns"),
+        (HEADER + row(0).strip() + ",1\n", 2, "49 columns"),
+        (HEADER + row(0) + "\n", 3, "0 columns"),
+        (HEADER + row(0) + row(1)[:100], 3, "without its end"),
+        (HEADER + row(0) + row(1)[:-3], 3, "without its end"),
+        (HEADER.encode() + row(0).encode() + b"\xff\n", 3, "UTF-8"),
+    ],
+)
+def test_csv_that_is_none(tmp_path, text, line, words):
+    with pytest.raises(RecordingError, match=rf"finger\.csv, line {line}: .*{words}"):
+        load_recording(write_csv(tmp_path, text))
+
+
+def test_csv_with_a_byte_order_mark_and_windows_lines(tmp_path):
+    text = "\ufeff" + (HEADER + row(0)).replace("\n", "\r\n")
+    assert len(load_recording(write_csv(tmp_path, text)).tracks[0].counts) == 1
+
+
+def test_csv_with_an_open_quote(tmp_path):
+    with pytest.raises(RecordingError, match="not CSV"):
+        load_recording(write_csv(tmp_path, HEADER + '"1\n'))
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(RecordingError, match=r"gone\.csv: cannot be read: No such file"):
+        load_recording(tmp_path / "gone.csv")
+    with pytest.raises(RecordingError, match=r"gone\.npz: cannot be read: No such file"):
+        load_recording(tmp_path / "gone.npz")
+    (tmp_path / "folder.csv").mkdir()
+    with pytest.raises(RecordingError, match="directory"):
+        load_recording(tmp_path / "folder.csv")
+    with pytest.raises(RecordingError, match=r"ends in \.csv or \.npz"):
+        load_recording(write_csv(tmp_path, HEADER + row(0), "finger.txt"))
+
+
+def test_npz(tmp_path):
+    recording = load_recording(write_npz(tmp_path, pattern=np.zeros((4, 40, 40)), rate_hz=np.array(50.0)))
+    assert recording.rate_hz == 50.0
+    assert [track.sensor for track in recording.tracks] == ["4", "6"]
+    counts = npz_arrays()["counts"]
+    for track, rows in zip(recording.tracks, ([0, 2], [1, 3]), strict=True):
+        assert track.counts.dtype == np.int32 and (track.counts == counts[rows]).all()
+        assert track.time_ns is not None and track.time_ns.tolist() == npz_arrays()["time_ns"][rows].tolist()
+    assert recording.tracks[0].mean_rate_hz == pytest.approx(50.0)
+
+
+def test_npz_without_a_rate(tmp_path):
+    recording = load_recording(write_npz(tmp_path, time_ns=np.full(4, 5)))
+    assert recording.rate_hz is None and recording.tracks[0].mean_rate_hz is None
+
+
+def changed_counts(place: tuple, value: int) -> np.ndarray:
+    counts = npz_arrays()["counts"]
+    counts[place] = value
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"format": np.array("other")}, "array 'format': 'other', expected 'tactile-recording'"),
+        ({"format": np.array(["tactile-recording"])}, "array 'format'"),
+        ({"version": np.array(2)}, "array 'version': 2, expected 1"),
+        ({"version": np.array(1.0)}, "array 'version'"),
+        ({"version": np.array([1])}, "array 'version'"),
+        ({"counts": None}, "array 'counts': missing"),
+        ({"scan": None}, "array 'scan': missing"),
+        ({"counts": np.zeros((4, 3, 4, 4))}, "array 'counts': float64"),
+        ({"counts": np.zeros((4, 48), dtype=np.int32)}, "array 'counts'"),
+        ({"counts": np.zeros((4, 4, 4, 3), dtype=np.int32)}, "array 'counts'"),
+        ({"counts": np.zeros((0, 3, 4, 4), dtype=np.int32)}, "at least one scan"),
+        ({"counts": changed_counts((0, 0, 0, 0), 65536)}, r"array 'counts': counts -1\.\.65536"),
+        ({"counts": changed_counts((0, slice(None), 0, 0), -2)}, r"array 'counts': counts -2\.\."),
+        ({"counts": changed_counts((0, 0, 0, 0), -1)}, "absent on some axes"),
+        ({"sensor": np.array([4, 6, 4, 6])}, "array 'sensor': int64"),
+        ({"sensor": np.array(["4"])}, "array 'sensor'"),
+        ({"scan": np.zeros(3, dtype=np.int64)}, "array 'scan'"),
+        ({"time_ns": np.zeros(4)}, "array 'time_ns'"),
+        ({"time_ns": np.array([5, 0, 4, 0])}, "array 'time_ns': times of sensor '4' that go back"),
+        ({"rate_hz": np.array(0.0)}, "array 'rate_hz'"),
+        ({"rate_hz": np.array(float("nan"))}, "array 'rate_hz'"),
+        ({"rate_hz": np.array([50.0])}, "array 'rate_hz'"),
+        ({"rate_hz": np.array("50")}, "array 'rate_hz'"),
+    ],
+)
+def test_npz_that_is_none(tmp_path, changes, words):
+    with pytest.raises(RecordingError, match=words):
+        load_recording(write_npz(tmp_path, **changes))
+
+
+def test_npz_with_objects_is_not_unpickled(tmp_path):
+    with pytest.raises(RecordingError, match="plain arrays"):
+        load_recording(write_npz(tmp_path, sensor=np.array(["4", 6, None, {}], dtype=object)))
+
+
+def test_npz_that_is_cut_or_something_else(tmp_path):
+    whole = write_npz(tmp_path).read_bytes()
+    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+        with pytest.raises(RecordingError, match="finger"):
+            load_recording(write_csv(tmp_path, whole[:size], "finger.npz"))
+    damaged = whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:]
+    with pytest.raises(RecordingError, match="finger"):
+        load_recording(write_csv(tmp_path, damaged, "finger.npz"))
+    np.save(tmp_path / "single.npy", np.zeros(3))
+    shutil.move(tmp_path / "single.npy", tmp_path / "single.npz")
+    with pytest.raises(RecordingError, match="'format': missing"):
+        load_recording(tmp_path / "single.npz")

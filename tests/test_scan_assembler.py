@@ -1,0 +1,284 @@
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_bridge.assembler import LONGEST_SCAN_NS, ScanAssembler, SlcanScans
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.scan import ABSENT, Scan
+from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.xela import USPA44_MAP, XR1944_MAP, Reading
+
+ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
+
+
+def cycle(number: int, sensor: str = "4") -> list[Reading]:
+    """One cycle of a sensor in wire order; every reading of every cycle is different."""
+    return [Reading(sensor, taxel, 1000 * taxel + number, 2000 + number, 3000 + number) for taxel in ORDER]
+
+
+def feed(assembler: ScanAssembler, readings: list[Reading], start_ns: int = 0) -> list[Scan]:
+    return [scan for i, reading in enumerate(readings) for scan in assembler.feed(reading, start_ns + i)]
+
+
+def counters(assembler: ScanAssembler) -> dict[str, int]:
+    return {name: count for name, count in assembler.counters().items() if count}
+
+
+def test_a_scan_closes_with_its_last_taxel():
+    assembler = ScanAssembler(USPA44)
+    assert feed(assembler, cycle(0)[:-1]) == []
+    (scan,) = assembler.feed(cycle(0)[-1], 99)
+    assert (scan.sensor, scan.number, scan.time_ns) == ("4", 0, 99)
+    assert scan.complete and not scan.torn and not scan.repeated
+    assert scan.counts.dtype == np.int32 and scan.counts.shape == (3, 4, 4)
+    for taxel in range(16):
+        assert scan.counts[:, taxel // 4, taxel % 4].tolist() == [1000 * taxel, 2000, 3000]
+    assert scan.fresh.all() and scan.renewed.all()
+    assert counters(assembler) == {"readings": 16, "scans": 1}
+
+
+def test_scans_cannot_be_changed():
+    scan = feed(ScanAssembler(USPA44), cycle(0))[0]
+    for array in (scan.counts, scan.fresh, scan.renewed):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+@pytest.mark.parametrize("lost", range(1, 15))
+def test_a_lost_frame_tears_one_scan_and_no_other(lost):
+    assembler = ScanAssembler(USPA44)
+    torn_cycle = cycle(1)
+    gone = torn_cycle.pop(lost)
+    scans = feed(assembler, cycle(0) + torn_cycle + cycle(2) + cycle(3))
+    assert [scan.number for scan in scans] == [0, 1, 2, 3]
+    assert [scan.complete for scan in scans] == [True, False, True, True]
+    row, col = divmod(gone.taxel, 4)
+    assert scans[1].torn and not scans[1].repeated
+    assert np.argwhere(~scans[1].fresh).tolist() == [[row, col]]
+    assert scans[1].counts[:, row, col].tolist() == [ABSENT] * 3
+    assert not scans[1].renewed[row, col] and scans[1].renewed.sum() == 15
+    assert scans[1].time_ns == 16 + 14  # its newest reading, not the one that closed it
+    assert scans[2].renewed.all()
+    assert counters(assembler) == {"readings": 63, "scans": 4, "torn_wire": 1, "missing_taxels": 1}
+
+
+def test_losing_the_first_frame_moves_the_cut_until_a_torn_scan_puts_it_back():
+    """The known limit, held fast: nothing on the wire tells the two cycles apart."""
+    assembler = ScanAssembler(USPA44)
+    torn = cycle(3)
+    del torn[5]
+    scans = feed(assembler, cycle(0) + cycle(1)[1:] + cycle(2) + torn + cycle(4) + cycle(5))
+    assert [scan.complete for scan in scans] == [True, True, True, False, True]
+    assert {int(z) for z in scans[1].counts[2].ravel()} == {3001, 3002}
+    assert {int(z) for z in scans[-1].counts[2].ravel()} == {3004, 3005}
+
+
+def test_joining_in_mid_cycle_gives_whole_scans():
+    scans = feed(ScanAssembler(USPA44), cycle(0)[7:] + cycle(1) + cycle(2))
+    assert [scan.complete for scan in scans] == [True, True]
+
+
+def test_the_same_frame_twice_is_a_duplicate_and_moves_nothing():
+    for place in range(16):
+        assembler = ScanAssembler(USPA44)
+        doubled = cycle(1)
+        doubled.insert(place, doubled[place])
+        scans = feed(assembler, cycle(0) + doubled + cycle(2))
+        assert [scan.complete for scan in scans] == [True] * 3, place
+        assert [set(scan.counts[1].ravel().tolist()) for scan in scans] == [{2000}, {2001}, {2002}], place
+        assert counters(assembler) == {"readings": 49, "scans": 3, "duplicates": 1}, place
+
+
+@pytest.mark.parametrize("change", [{"x": 7}, {"y": 7}, {"z": 7}])
+def test_the_same_taxel_with_another_value_is_no_duplicate(change):
+    assembler = ScanAssembler(USPA44)
+    readings = cycle(0)[:9]
+    scans = feed(assembler, [*readings, readings[-1]._replace(**change)])
+    assert [int(scan.fresh.sum()) for scan in scans] == [9]
+    assert counters(assembler) == {"readings": 10, "scans": 1, "torn_wire": 1, "missing_taxels": 7}
+
+
+def test_a_duplicate_is_told_apart_for_each_sensor():
+    assembler = ScanAssembler(USPA44)
+    mine, other = cycle(0), cycle(0, "6")
+    feed(assembler, [mine[0], other[0], mine[0], other[0]])
+    assert counters(assembler) == {"readings": 4, "duplicates": 2}
+
+
+def test_renewed_is_against_the_taxels_own_reading_before():
+    assembler = ScanAssembler(USPA44)
+    second = cycle(0)
+    second[2] = second[2]._replace(z=9)
+    third = list(second)
+    del third[4]
+    fourth = list(second)
+    fourth[4] = fourth[4]._replace(x=8)
+    fourth[5] = fourth[5]._replace(y=8)
+    scans = feed(assembler, cycle(0) + second + third + fourth + fourth)
+    renewed = [np.flatnonzero(scan.renewed).tolist() for scan in scans]
+    assert renewed == [list(range(16)), [ORDER[2]], [], sorted([ORDER[4], ORDER[5]]), []]
+    assert [scan.torn for scan in scans] == [False, True, True, True, False]
+    assert [scan.repeated for scan in scans] == [False, False, False, False, True]
+    expected = {"readings": 79, "scans": 5, "torn_wire": 1, "torn_source": 2, "repeated": 1, "missing_taxels": 1}
+    assert counters(assembler) == expected
+
+
+def test_two_controllers_are_two_sensors():
+    assembler = ScanAssembler(USPA44)
+    bus = [reading for n in range(3) for pair in zip(cycle(n), cycle(n + 50, "6"), strict=True) for reading in pair]
+    scans = feed(assembler, bus)
+    assert [(scan.sensor, scan.number) for scan in scans] == [
+        ("4", 0),
+        ("6", 0),
+        ("4", 1),
+        ("6", 1),
+        ("4", 2),
+        ("6", 2),
+    ]
+    assert all(scan.complete for scan in scans)
+    assert [int(scan.counts[1, 0, 0]) for scan in scans] == [2000, 2050, 2001, 2051, 2002, 2052]
+    assert assembler.sensor_counters().keys() == {"4", "6"}
+    assert assembler.sensor_counters()["6"]["scans"] == 3
+
+
+def test_a_flipped_id_invents_no_sensor():
+    assembler = ScanAssembler(USPA44)
+    phantom = cycle(0, "5")
+    scans = feed(assembler, [*cycle(0), *phantom[:7], phantom[0]._replace(x=1), *cycle(1)])
+    assert {scan.sensor for scan in scans} == {"4"}
+    assert counters(assembler) == {"readings": 40, "scans": 2, "unconfirmed": 7}
+    assert assembler.sensor_counters().keys() == {"4"}
+
+
+def test_stray_readings_do_not_add_up_to_a_sensor():
+    assembler = ScanAssembler(USPA44)
+    scans = [assembler.feed(reading, n * LONGEST_SCAN_NS * 2) for n, reading in enumerate(cycle(0, "5"))]
+    assert scans == [[]] * 16
+    assert counters(assembler) == {"readings": 16, "unconfirmed": 15}
+
+
+def test_half_of_the_taxels_make_a_sensor():
+    """What the wrong model map shows must be seen, not hidden."""
+    assembler = ScanAssembler(USPA44)
+    scans = feed(assembler, cycle(0)[:8] + cycle(1)[:8] + cycle(2)[:3] + cycle(3)[:1])
+    assert [int(scan.fresh.sum()) for scan in scans] == [8, 8, 3]
+    assert [scan.number for scan in scans] == [0, 1, 2]
+    fewer = ScanAssembler(USPA44)
+    assert feed(fewer, cycle(0)[:7] + cycle(1)[:7] + cycle(2)[:1]) == []
+    assert counters(fewer) == {"readings": 15, "unconfirmed": 14}
+
+
+def test_a_scan_that_stood_open_too_long_takes_no_more():
+    assembler = ScanAssembler(USPA44)
+    feed(assembler, cycle(0) + cycle(1)[:10])
+    assert feed(assembler, cycle(1)[10:11], LONGEST_SCAN_NS + 16) == []
+    (scan,) = feed(assembler, cycle(1)[11:12], LONGEST_SCAN_NS + 17)
+    assert int(scan.fresh.sum()) == 11
+    (scan,) = feed(assembler, cycle(2), LONGEST_SCAN_NS + 18)
+    assert int(scan.fresh.sum()) == 12 and scan.fresh[divmod(cycle(1)[11].taxel, 4)]
+
+
+def test_a_pause_between_scans_makes_no_empty_one():
+    assembler = ScanAssembler(USPA44)
+    scans = feed(assembler, cycle(0)) + feed(assembler, cycle(1), 5 * LONGEST_SCAN_NS)
+    assert [scan.complete for scan in scans] == [True, True]
+    assert counters(assembler) == {"readings": 32, "scans": 2}
+
+
+@given(st.integers(0, 2**32), st.integers(0, 40))
+@settings(deadline=None, max_examples=60)
+def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
+    noise = random.Random(seed)
+    bus = [reading for n in range(30) for reading in cycle(n) + cycle(n, "6") if noise.randrange(100) >= percent_lost]
+    bus = [reading for reading in bus for _ in range(1 + (noise.randrange(20) == 0))]
+    assembler = ScanAssembler(USPA44)
+    scans = feed(assembler, bus)
+    told = assembler.counters()
+    fresh = sum(int(scan.fresh.sum()) for scan in scans)
+    still_open = told["readings"] - fresh - told["duplicates"] - told["unconfirmed"]
+    assert told["readings"] == len(bus) and 0 <= still_open < 2 * 16
+    assert told["scans"] == len(scans) and told["torn_wire"] == sum(not scan.complete for scan in scans)
+    assert told["missing_taxels"] == sum(int((~scan.fresh).sum()) for scan in scans)
+    for scan in scans:
+        assert ((scan.counts == ABSENT) == ~scan.fresh).all()
+        assert not (scan.renewed & ~scan.fresh).any()
+        # Nothing made up: each value is one that its taxel had in some cycle.
+        numbers = scan.counts[1][scan.fresh] - 2000
+        assert (scan.counts[0][scan.fresh] == 1000 * np.flatnonzero(scan.fresh) + numbers).all()
+        assert (scan.counts[2][scan.fresh] == 3000 + numbers).all()
+
+
+def text_of(numbers: range, model=USPA44_MAP) -> bytes:
+    lines = []
+    for number in numbers:
+        for can_id, taxel in model.wire_order("4"):
+            words = b"".join(value.to_bytes(2, "big") for value in (taxel, number, 1000 * taxel + number))
+            lines.append(encode_frame(CanFrame(can_id, b"\x93" + words + b"\x0f")))
+    return b"".join(lines)
+
+
+def test_text_to_scans():
+    scans = SlcanScans()
+    got = scans.feed(text_of(range(3)), 5)
+    assert [(scan.number, scan.time_ns, scan.complete) for scan in got] == [(0, 5, True), (1, 5, True), (2, 5, True)]
+    assert got[2].counts[0].tolist() == np.arange(16).reshape(4, 4).tolist()
+    assert (got[2].counts[1] == 2).all()
+    assert {name: count for name, count in scans.counters().items() if count} == {
+        "frames": 48,
+        "readings": 48,
+        "scans": 3,
+    }
+
+
+def test_foreign_frames_are_counted():
+    scans = SlcanScans()
+    assert scans.feed(b"t7FF8937E317E1593120F\rt0042ABCD\r", 0) == []
+    assert scans.counters()["foreign"] == 2 and scans.counters()["readings"] == 0
+
+
+def test_the_wrong_model_shows_half_of_the_taxels():
+    for sent, read in ((USPA44_MAP, XR1944_MAP), (XR1944_MAP, USPA44_MAP)):
+        scans = SlcanScans(read)
+        got = scans.feed(text_of(range(4), sent), 0)
+        assert [int(scan.fresh.sum()) for scan in got] == [8, 8, 8]
+        assert scans.counters()["foreign"] == 32
+
+
+@given(st.integers(0, 2**32))
+@settings(deadline=None, max_examples=60)
+def test_any_chunking_gives_the_same_scans_and_counters(seed):
+    noise = random.Random(seed)
+    stream = bytearray(text_of(range(6)))
+    for _ in range(noise.randrange(30)):
+        place = noise.randrange(len(stream))
+        match noise.randrange(4):
+            case 0:
+                del stream[place : place + noise.randrange(60)]
+            case 1:
+                stream[place:place] = noise.randbytes(noise.randrange(60))
+            case 2:
+                stream[place] = noise.randrange(256)
+            case 3:
+                stream[place:place] = stream[place : place + noise.randrange(60)]
+    whole = SlcanScans()
+    expected = whole.feed(bytes(stream), 0)
+    cuts = sorted(noise.randrange(len(stream) + 1) for _ in range(noise.randrange(40)))
+    chunked = SlcanScans()
+    got = [
+        scan
+        for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)
+        for scan in chunked.feed(bytes(stream[a:b]), 0)
+    ]
+    assert chunked.counters() == whole.counters()
+    assert [scan.number for scan in got] == [scan.number for scan in expected]
+    for one, other in zip(got, expected, strict=True):
+        assert (one.counts == other.counts).all() and (one.renewed == other.renewed).all()
+
+
+def test_random_bytes_make_no_scan():
+    noise = random.Random(11)
+    scans = SlcanScans()
+    assert [scan for _ in range(300) for scan in scans.feed(noise.randbytes(1000), 0)] == []

@@ -1,0 +1,293 @@
+import random
+import tracemalloc
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_bridge.slcan import BITRATE_1M, CLOSE, LONGEST_LINE, OPEN, CanFrame, SlcanDecoder, encode_frame
+
+# Two frames as a sensor sent them.
+GOLDEN = b"t0048937E317E1593120F\r"
+GOLDEN_FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
+OTHER = b"t1048938406805591BB0C\r"
+OTHER_FRAME = CanFrame(0x104, bytes.fromhex("938406805591BB0C"))
+
+NONE_COUNTED = {
+    "frames": 0,
+    "bad_lines": 0,
+    "non_ascii_lines": 0,
+    "skipped_bytes": 0,
+    "replies": 0,
+    "refusals": 0,
+    "status_lines": 0,
+}
+
+
+def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
+    """The frames, and the counters that are not zero."""
+    decoder = SlcanDecoder()
+    frames = [frame for chunk in chunks for frame in decoder.feed(chunk)]
+    return frames, {name: count for name, count in decoder.counters().items() if count}
+
+
+def frames_of(*, extended: bool, remote: bool) -> st.SearchStrategy[CanFrame]:
+    return st.builds(
+        CanFrame,
+        st.integers(0, 0x1FFFFFFF if extended else 0x7FF),
+        st.binary(max_size=0 if remote else 8),
+        st.just(extended),
+        st.just(remote),
+        st.none() | st.integers(0, 59_999),
+    )
+
+
+frames = st.one_of(
+    frames_of(extended=extended, remote=remote) for extended in (False, True) for remote in (False, True)
+)
+
+
+def test_golden_frames():
+    assert decode(GOLDEN + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], {"frames": 2})
+    assert encode_frame(GOLDEN_FRAME) == GOLDEN
+
+
+def test_nothing_is_counted_before_anything_comes():
+    assert SlcanDecoder().counters() == NONE_COUNTED
+
+
+def test_commands_are_what_adapters_know():
+    assert (CLOSE, BITRATE_1M, OPEN) == (b"C\r", b"S8\r", b"O\r")
+
+
+@given(st.lists(frames, max_size=20))
+@settings(deadline=None)
+def test_what_is_encoded_is_decoded(sent):
+    assert decode(b"".join(map(encode_frame, sent))) == (sent, {"frames": len(sent)} if sent else {})
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        CanFrame(0x800, b""),
+        CanFrame(-1, b""),
+        CanFrame(0x20000000, b"", extended=True),
+        CanFrame(1, bytes(9)),
+        CanFrame(1, b"\x01", remote=True),
+        CanFrame(1, b"", timestamp_ms=60_000),
+        CanFrame(1, b"", timestamp_ms=-1),
+    ],
+)
+def test_what_fits_no_frame_is_not_encoded(frame):
+    with pytest.raises(ValueError, match="expected"):
+        encode_frame(frame)
+
+
+# Bits and pieces of a stream as it may come, whole and broken.
+pieces = st.one_of(
+    frames.map(encode_frame),
+    frames.map(encode_frame).flatmap(lambda line: st.integers(0, len(line)).map(lambda n: line[:n])),
+    frames.map(encode_frame).flatmap(lambda line: st.integers(0, len(line)).map(lambda n: line[n:])),
+    st.binary(max_size=40),
+    st.text("tTrR0123456789abcdefABCDEFzZVNFse\r\a ", max_size=45).map(str.encode),
+    st.sampled_from([b"\r", b"\a", b"z\r", b"Z\r", b"V1013\r", b"N12AB\r", b"F04\r", b"sa127095\r", b"e1a\r", b"\0"]),
+)
+
+
+@given(st.lists(pieces, max_size=30).map(b"".join), st.data())
+@settings(deadline=None, max_examples=300)
+def test_any_chunking_gives_the_same(stream, data):
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=30)))
+    chunks = [stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
+    whole = decode(stream)
+    assert decode(*chunks) == whole
+    assert decode(*(stream[i : i + 1] for i in range(len(stream)))) == whole
+
+
+@given(st.lists(st.tuples(st.text("0123456789ABCDEFabcdef \0zx", max_size=60).map(str.encode), frames), max_size=10))
+@settings(deadline=None)
+def test_noise_without_frame_letters_before_a_frame_costs_nothing(noisy):
+    stream = b"".join(noise + encode_frame(frame) for noise, frame in noisy)
+    sent, counters = decode(stream)
+    assert sent == [frame for _, frame in noisy]
+    assert counters.get("skipped_bytes", 0) == sum(len(noise) for noise, _ in noisy)
+    assert counters.get("bad_lines", 0) == 0
+
+
+def test_every_byte_at_every_place_of_a_line():
+    """What one corrupted byte can do: nothing, or lose the frame, or another digit in its place."""
+    digits = b"0123456789ABCDEFabcdef"
+    for place in range(len(GOLDEN)):
+        for byte in range(256):
+            line = bytearray(GOLDEN)
+            line[place] = byte
+            got, counters = decode(bytes(line) + OTHER)
+            assert got[-1:] == [OTHER_FRAME], (place, byte)
+            where_digits_are = 1 <= place < len(GOLDEN) - 1 and place != 4
+            if line == GOLDEN or (place > 0 and line.upper() == GOLDEN.upper()):
+                assert got[:-1] == [GOLDEN_FRAME] and counters == {"frames": 2}, (place, byte)
+            elif where_digits_are and byte in (digits if place > 1 else b"01234567"):
+                assert len(got) == 2 and counters == {"frames": 2}, (place, byte)
+                assert bin(_bits(got[0]) ^ _bits(GOLDEN_FRAME)).count("1") <= 4, (place, byte)
+            else:
+                # A letter in mid-line may start a shorter frame, a length of 6 leaves four digits for a time
+                # stamp; but eight bytes of data come of nothing, and every loss is counted.
+                assert all(len(frame.data) < 8 or frame.extended for frame in got[:-1]), (place, byte)
+                assert len(got) == 2 or {"bad_lines", "non_ascii_lines", "skipped_bytes"} & counters.keys()
+            if byte >= 0x80:
+                assert got == [OTHER_FRAME], (place, byte)
+
+
+def _bits(frame: CanFrame) -> int:
+    return frame.can_id << 64 | int.from_bytes(frame.data, "big")
+
+
+def test_every_cut_of_a_line():
+    for start in range(len(GOLDEN)):
+        for end in range(start, len(GOLDEN)):
+            got, _ = decode(GOLDEN[:start] + GOLDEN[end:] + OTHER)
+            assert got == ([GOLDEN_FRAME, OTHER_FRAME] if start == end else [OTHER_FRAME]), (start, end)
+
+
+def test_a_whole_frame_behind_a_wreck_is_kept():
+    assert decode(GOLDEN[:12] + OTHER) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 12})
+    assert decode(GOLDEN[:-1] + OTHER) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 21})
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"t0048937E31\r",  # truncated
+        b"t1\r",
+        b"t\r",
+        b"t0048937E317E1593120F0\r",  # one digit more
+        b"t0048937E317E1593120F00\r",
+        b"t0048937E317E1593120FEA60\r",  # later than the last millisecond of a minute
+        b"t0048937E317E1593120F00000\r",
+        b"t0049937E317E1593120F00\r",  # nine bytes
+        b"t8008937E317E1593120F\r",  # id of twelve bits
+        b"T200000008937E317E1593120F\r",  # id of thirty bits
+        b"t0048937E317E15931 0F\r",  # what fromhex() would take
+        b"t0_48937E317E1593120F\r",  # what int() would take
+        b"t+048937E317E1593120F\r",
+        b"t0048937E317E15931g0F\r",
+        b"t0047937E317E1593120F\r",  # eight bytes that say seven
+        b"r0048937E317E1593120F\r",  # a remote frame has no data
+        b"t0048937E317E1593120F\n\r",
+        b"x\r",
+        b"V10\r",
+        b"VV1013\r",
+        b"sa12709\r",
+        b"sx127095\r",
+        b"e0a\r",
+        b"F0G\r",
+    ],
+)
+def test_bad_lines(line):
+    assert decode(line + GOLDEN) == ([GOLDEN_FRAME], {"frames": 1, "bad_lines": 1, "skipped_bytes": len(line) - 1})
+
+
+def test_small_letters_are_digits_too():
+    assert decode(b"t0048937e317e1593120f\r")[0] == [GOLDEN_FRAME]
+
+
+def test_time_stamps():
+    assert decode(GOLDEN[:-1] + b"EA5F\r") == ([GOLDEN_FRAME._replace(timestamp_ms=59_999)], {"frames": 1})
+    assert decode(GOLDEN[:-1] + b"0000\r") == ([GOLDEN_FRAME._replace(timestamp_ms=0)], {"frames": 1})
+
+
+def test_frames_of_other_sorts():
+    assert decode(b"T1FFFFFFF2ABCD\r")[0] == [CanFrame(0x1FFFFFFF, b"\xab\xcd", extended=True)]
+    assert decode(b"t7FF0\r")[0] == [CanFrame(0x7FF, b"")]
+    assert decode(b"r1238\r")[0] == [CanFrame(0x123, b"", remote=True)]
+    assert decode(b"R000001231\r")[0] == [CanFrame(0x123, b"", extended=True, remote=True)]
+
+
+@pytest.mark.parametrize("reply", [b"\r", b"z\r", b"Z\r", b"V1013\r", b"N12ab\r", b"F04\r", b"Vrt12\r"])
+def test_replies(reply):
+    assert decode(GOLDEN + reply + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], {"frames": 2, "replies": 1})
+
+
+@pytest.mark.parametrize("line", [b"sa127095\r", b"sb000000\r", b"e1a\r", b"e3boO\r"])
+def test_status_lines(line):
+    assert decode(GOLDEN + line + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], {"frames": 2, "status_lines": 1})
+
+
+def test_a_bel_is_a_refusal_and_ends_a_line():
+    assert decode(b"\a" + GOLDEN) == ([GOLDEN_FRAME], {"frames": 1, "refusals": 1})
+    # Not a frame: the adapter says that it went wrong.
+    wreck = GOLDEN[:-1] + b"\a"
+    assert decode(wreck + OTHER) == ([OTHER_FRAME], {"frames": 1, "refusals": 1, "bad_lines": 1, "skipped_bytes": 21})
+    assert decode(b"z\a")[1] == {"refusals": 1}
+
+
+def test_non_ascii_spoils_the_frame_it_falls_into_and_no_other():
+    spoilt = GOLDEN[:9] + b"\xb1" + GOLDEN[10:]
+    got = decode(OTHER + spoilt + OTHER)
+    assert got == ([OTHER_FRAME] * 2, {"frames": 2, "non_ascii_lines": 1, "skipped_bytes": 21})
+    assert decode(b"\xff\xfe" + OTHER) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 2})
+
+
+def test_a_line_without_end_is_bounded_and_counted():
+    got, counters = decode(b"A" * 10_000 + OTHER)
+    assert (got, counters) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 10_000})
+    got, counters = decode(b"A" * 10_000, b"\r", OTHER)
+    assert (got, counters) == ([OTHER_FRAME], {"frames": 1, "bad_lines": 1, "skipped_bytes": 10_000})
+    # Counted while it goes on: a line at the wrong speed may never end.
+    assert decode(b"A" * 10_000)[1] == {"skipped_bytes": 10_000 - LONGEST_LINE}
+
+
+def test_the_longest_frame_fits_the_bound():
+    longest = CanFrame(0x1FFFFFFF, bytes(range(8)), extended=True, timestamp_ms=59_999)
+    line = encode_frame(longest)
+    assert len(line) == LONGEST_LINE + 1
+    assert decode(b"?" * 50 + line[:-1], line[-1:])[0] == [longest]
+
+
+def test_a_million_random_bytes():
+    noise = random.Random(7)
+    decoder = SlcanDecoder()
+    decoder.feed(b"\r")
+    tracemalloc.start()
+    for _ in range(1000):
+        for frame in decoder.feed(noise.randbytes(1000)):
+            assert len(frame.data) < 8
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 10_000
+    assert decoder.counters()["skipped_bytes"] > 900_000
+    assert decoder.feed(b"\r" + GOLDEN) == [GOLDEN_FRAME]
+
+
+def test_every_byte_is_a_frame_a_reply_or_skipped():
+    noise = random.Random(3)
+    stream = b"".join(noise.choice([GOLDEN, OTHER[:9], b"\xff", b"z\r", b"\r", b"\a", b"junk"]) for _ in range(2000))
+    decoder = SlcanDecoder()
+    got = decoder.feed(stream + b"\r")
+    text = stream.replace(b"\a", b"\r").split(b"\r")
+    told = sum(line in (b"z", b"") for line in text)
+    assert len(got) == decoder.counters()["frames"]
+    ends = stream.count(b"\r") + stream.count(b"\a") + 1
+    frame_bytes = 21 * len(got)
+    assert decoder.counters()["skipped_bytes"] == len(stream) + 1 - ends - frame_bytes - text.count(b"z")
+    assert decoder.counters()["replies"] + decoder.counters()["refusals"] >= told
+
+
+def test_what_no_decoder_can_tell():
+    """The limits that the module states: well-formed frames that nobody sent."""
+    head_and_tail = GOLDEN[:9] + OTHER[9:]
+    assert decode(head_and_tail)[0] == [CanFrame(0x004, GOLDEN_FRAME.data[:2] + OTHER_FRAME.data[2:])]
+    stamped = GOLDEN[:-1] + b"1234\r"
+    assert decode(stamped[:9] + stamped[13:])[0] == [CanFrame(0x004, bytes.fromhex("937E 1593 120F 1234"))]
+
+
+@pytest.mark.parametrize(("stamp", "places"), [(b"", set()), (b"1234", {4})])
+def test_a_letter_in_mid_line_makes_eight_bytes_only_of_a_stamped_line(stamp, places):
+    noise = random.Random(5)
+    made_up = set()
+    for _ in range(300):
+        line = encode_frame(CanFrame(0x004, noise.randbytes(8)))[:-1] + stamp + b"\r"
+        for place in range(1, len(line) - 1):
+            got, _ = decode(line[:place] + b"t" + line[place + 1 :])
+            made_up |= {place for frame in got if len(frame.data) == 8}
+    assert made_up == places
