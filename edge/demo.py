@@ -1,0 +1,138 @@
+"""The demo's score: what the runtime made of a tap whose truth is known."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.contract import Contract
+from edge.draw import Palette, Panel, draw
+from edge.metrics import psnr_db, rmse_percent, ssim
+from edge.result import Result
+from edge.sinks.base import Sink
+from firmware_bridge.baseline import deformation
+
+
+@dataclass(frozen=True, slots=True)
+class TapScore:
+    """Error of one tap's pattern against its truth, at the tap's peak frame.
+
+    Attributes:
+        tap: number of the tap, from 0.
+        angle_deg: at which the surface was tapped, in [deg].
+        result: the runtime's, at the peak frame.
+        truth: (H, W) in the model's output unit.
+        psnr_db: in [dB].
+        ssim: structural similarity, mean over Gaussian windows.
+        rmse_percent: in [% of full scale].
+    """
+
+    tap: int
+    angle_deg: float
+    result: Result
+    truth: NDArray[np.float32]
+    psnr_db: float
+    ssim: float
+    rmse_percent: float
+
+
+class DemoScore(Sink):
+    """Keeps of each tap the result with the largest force.
+
+    A result finds its truth by its raw counts, not by its number: a lost scan shifts nothing.
+    """
+
+    def __init__(self, recording: Path, contract: Contract) -> None:
+        """Load the truth.
+
+        Args:
+            recording: .npz that has besides `counts` (n, 3, rows, cols): `tap` (n,), -1 without
+                contact; `indentation_mm` (n,); `unit_patterns` (taps, H, W), the truth per
+                indentation; `angles_deg` (taps,); `surface`.
+            contract: of the model that is scored.
+        """
+        self._full_scale = contract.output_full_scale
+        with np.load(recording, allow_pickle=False) as data:
+            self.surface = str(data["surface"])
+            self._angles_deg = data["angles_deg"].astype(float).tolist()
+            self._unit_patterns = data["unit_patterns"].astype(np.float32)
+            self._frames = {
+                counts.astype(np.int32).tobytes(): (int(tap), float(indentation_mm))
+                for counts, tap, indentation_mm in zip(data["counts"], data["tap"], data["indentation_mm"], strict=True)
+                if tap >= 0
+            }
+        self._peaks: dict[int, _Peak] = {}
+
+    @property
+    def taps(self) -> int:
+        """Taps that the recording holds."""
+        return len(self._angles_deg)
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Keep the result if it is the strongest of its tap."""
+        frame = self._frames.get(result.scan.counts.tobytes())
+        if frame is None or result.pattern is None or result.force_counts is None:
+            return
+        tap, indentation_mm = frame
+        if tap not in self._peaks or result.force_counts > self._peaks[tap].force_counts:
+            self._peaks[tap] = _Peak(result, result.pattern, result.force_counts, indentation_mm)
+
+    def close(self) -> None:
+        """Nothing to finish."""
+
+    def scores(self) -> list[TapScore]:
+        """Scores of the taps that got a pattern."""
+        return [self._score(tap, self._peaks[tap]) for tap in sorted(self._peaks)]
+
+    def _score(self, tap: int, peak: "_Peak") -> TapScore:
+        truth = self._unit_patterns[tap] * peak.indentation_mm
+        compared = (peak.pattern, truth, self._full_scale)
+        return TapScore(
+            tap=tap,
+            angle_deg=self._angles_deg[tap],
+            result=peak.result,
+            truth=truth,
+            psnr_db=float(psnr_db(*compared)),
+            ssim=float(ssim(*compared)),
+            rmse_percent=float(rmse_percent(*compared)),
+        )
+
+
+class _Peak(NamedTuple):
+    result: Result
+    pattern: NDArray[np.float32]
+    force_counts: float
+    indentation_mm: float
+
+
+def score_table(scores: Sequence[TapScore]) -> str:
+    """A line for each tap, 40 columns wide; RMSE in [% of full scale]."""
+    lines = ["tap angle taps   PSNR  SSIM   RMSE  time", "      deg used     dB          %fs    us"]
+    lines += [
+        f"{score.tap + 1:3d} {score.angle_deg:5.0f} {score.result.taps_used:4d} {score.psnr_db:6.2f} {score.ssim:5.3f}"
+        f" {score.rmse_percent:6.2f} {score.result.run_time_us or 0:5.0f}"
+        for score in scores
+    ]
+    return "\n".join(lines)
+
+
+def score_picture(score: TapScore, columns: int, palette: Palette) -> str:
+    """What the taxels felt, what was made of it, and the truth."""
+    result = score.result
+    if result.pattern is None or result.baseline is None:
+        raise ValueError("score has no pattern, expected one made by DemoScore")
+    taxels_z = deformation(result.scan.counts, result.baseline)[2]
+    highest = float(max(result.pattern.max(), score.truth.max()))
+    height, width = result.pattern.shape
+    return draw(
+        [
+            Panel(f"taxels, {taxels_z.shape[0]} x {taxels_z.shape[1]}", taxels_z, 0.0, float(taxels_z.max()), "counts"),
+            Panel(f"super-resolved, {height} x {width}", result.pattern, 0.0, highest, result.pattern_unit),
+            Panel("truth", score.truth, 0.0, highest, result.pattern_unit),
+        ],
+        columns,
+        palette,
+    )

@@ -1,0 +1,146 @@
+"""Maps as text for a terminal: arrays in, lines out.
+
+With colour, one character cell shows two pixels, an upper half block in one colour on a ground of
+another. Without, a cell is a character, the denser the larger.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Palette = Literal["truecolor", "256", "plain"]
+
+# A few stops of viridis, which reads the same to the colour-blind and grows steadily lighter.
+STOPS: Final = np.array(
+    [
+        *((68, 1, 84), (72, 40, 120), (62, 74, 137), (49, 104, 142), (38, 130, 142)),
+        *((31, 158, 137), (53, 183, 121), (109, 205, 89), (180, 222, 44), (253, 231, 37)),
+    ],
+    dtype=np.float64,
+)
+CUBE_LEVELS: Final = np.array([0, 95, 135, 175, 215, 255], dtype=np.float64)
+SHADES: Final = " .:-=+*#%@"
+HALF_BLOCK: Final = "\N{UPPER HALF BLOCK}"
+RESET: Final = "\x1b[0m"
+GAP: Final = 2
+WIDEST: Final = 40
+NARROWEST: Final = 20
+SHARP: Final = 8
+"""A width that is a multiple of it, and half as many lines, show a map of 4 x 4 with sharp borders."""
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One map to draw: (H, W) values, shown from `low` to `high` [unit]."""
+
+    title: str
+    values: NDArray[np.floating]
+    low: float
+    high: float
+    unit: str
+
+
+def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: str | None) -> Palette:
+    """The best palette that the output can show.
+
+    Args:
+        environment: variables; NO_COLOR, TERM and COLORTERM are heard.
+        terminal: the output is one.
+        encoding: of the output.
+    """
+    try:
+        HALF_BLOCK.encode(encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return "plain"
+    if not terminal or environment.get("NO_COLOR") or environment.get("TERM", "dumb") == "dumb":
+        return "plain"
+    return "truecolor" if environment.get("COLORTERM") in ("truecolor", "24bit") else "256"
+
+
+def draw(panels: Sequence[Panel], columns: int, palette: Palette) -> str:
+    """Panels side by side, or below each other where the terminal is too narrow.
+
+    Args:
+        panels: from left to right.
+        columns: width of the terminal; no line is wider.
+        palette: how values are shown.
+    """
+    width = min(WIDEST, (columns - GAP * (len(panels) - 1)) // len(panels))
+    width -= width % SHARP
+    if width < NARROWEST:
+        width = max(1, min(WIDEST, columns))
+        return "\n\n".join("\n".join(_lines(panel, width, palette)) for panel in panels)
+    rows = zip(*(_lines(panel, width, palette) for panel in panels), strict=True)
+    return "\n".join((" " * GAP).join(row).rstrip() for row in rows)
+
+
+def resample(values: NDArray[np.floating], height: int, width: int) -> NDArray[np.float64]:
+    """Means of (H, W) values over the cells of a height x width grid; finer cells repeat values."""
+    return _overlaps(values.shape[0], height) @ values.astype(np.float64) @ _overlaps(values.shape[1], width).T
+
+
+def _overlaps(old: int, new: int) -> NDArray[np.float64]:
+    """Share (new, old) that each old cell has in each new one, on one unit length."""
+    old_edges, new_edges = np.arange(old + 1) / old, np.arange(new + 1) / new
+    upper = np.minimum(new_edges[1:, None], old_edges[None, 1:])
+    lower = np.maximum(new_edges[:-1, None], old_edges[None, :-1])
+    return np.maximum(upper - lower, 0) * new
+
+
+def _lines(panel: Panel, width: int, palette: Palette) -> list[str]:
+    """Title, map and scale, each `width` cells wide."""
+    span = panel.high - panel.low
+    height = max(1, width // 2)
+    pixel_rows = height if palette == "plain" else 2 * height
+    shares = (resample(panel.values, pixel_rows, width) - panel.low) / (span if span > 0 else 1)
+    shares = np.clip(shares, 0, 1)
+    if palette == "plain":
+        body = ["".join(row) for row in _shades(shares)]
+    else:
+        body = [_blocks(upper, lower, palette) for upper, lower in zip(shares[::2], shares[1::2], strict=True)]
+    return [panel.title[:width].ljust(width), *body, _scale(panel, width, palette)]
+
+
+def _scale(panel: Panel, width: int, palette: Palette) -> str:
+    low, high = f"{_short(panel.low)} ", f" {_short(panel.high)} {panel.unit}"
+    room = width - len(low) - len(high)
+    if room < 0:
+        return f"{low}..{high}"[:width].ljust(width)
+    steps = np.linspace(0, 1, room)
+    return low + ("".join(_shades(steps)) if palette == "plain" else _blocks(steps, steps, palette)) + high
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def _shades(shares: NDArray[np.float64]) -> NDArray[np.str_]:
+    levels = np.array(list(SHADES))
+    return levels[np.minimum((shares * len(SHADES)).astype(int), len(SHADES) - 1)]
+
+
+def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64], palette: Palette) -> str:
+    """One line of half blocks; a colour is named only where it changes."""
+    text, last = [], ""
+    for top, bottom in zip(_colour_codes(upper, palette), _colour_codes(lower, palette), strict=True):
+        colour = f"\x1b[38;{top};48;{bottom}m"
+        text.append(HALF_BLOCK if colour == last else colour + HALF_BLOCK)
+        last = colour
+    return "".join(text) + RESET
+
+
+def colours(shares: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Colours (..., 3), red, green and blue in 0..255, of shares (...) in 0..1."""
+    positions = np.linspace(0, 1, len(STOPS))
+    return np.stack([np.interp(shares, positions, STOPS[:, channel]) for channel in range(3)], axis=-1)
+
+
+def _colour_codes(shares: NDArray[np.float64], palette: Palette) -> list[str]:
+    rgb = colours(shares)
+    if palette == "truecolor":
+        return ["2;{:.0f};{:.0f};{:.0f}".format(*colour) for colour in rgb]
+    cube = np.abs(rgb[..., None] - CUBE_LEVELS).argmin(axis=-1)
+    return [f"5;{16 + 36 * red + 6 * green + blue}" for red, green, blue in cube.tolist()]

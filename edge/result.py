@@ -1,0 +1,62 @@
+"""What the runtime says about one scan."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.links.base import SourceKind
+from firmware_bridge.scan import Scan
+
+State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One scan and what was made of it; there is one for every scan, whatever its state.
+
+    Attributes:
+        scan: as it came.
+        source: what kind of source it came from; "emulated" is not a sensor.
+        model: name of the model.
+        state: "zeroing" while there is no baseline, "incomplete" when a taxel was not heard for
+            too long, "idle" without contact, "contact" with a pattern, "dropped" when there was
+            contact but a newer scan was already waiting.
+        contact: None while it cannot be known.
+        taps_used: taps that the pattern was made from; 0 without contact.
+        pattern: (H, W) float32 in `pattern_unit`, or None.
+        pattern_unit: unit of the pattern.
+        force_counts: summed z over the baseline, or None while it cannot be known.
+        force_n: the same in [N], only if a calibration was given.
+        area_mm2: touched area of the pattern, in [mm2].
+        centroid_mm: x, y of the touched area's centroid from the sensor's centre, x to the right
+            and y down, in [mm].
+        run_time_us: of the inference, scaling of the input included, in [us].
+        baseline: subtracted from the scan, or None.
+        baseline_age_s: how long ago the baseline was taken, in [s].
+        note: what the user should know, such as why zeroing started over.
+    """
+
+    scan: Scan
+    source: SourceKind
+    model: str
+    state: State
+    contact: bool | None = None
+    taps_used: int = 0
+    pattern: NDArray[np.float32] | None = None
+    pattern_unit: str = ""
+    force_counts: float | None = None
+    force_n: float | None = None
+    area_mm2: float | None = None
+    centroid_mm: tuple[float, float] | None = None
+    run_time_us: float | None = None
+    baseline: Baseline | None = None
+    baseline_age_s: float | None = None
+    note: str | None = None
+
+
+def mask_bits(taxels: NDArray[np.bool_]) -> int:
+    """A (rows, cols) mask as a number: bit i is taxel i, row-major from the top left."""
+    return int.from_bytes(np.packbits(taxels, axis=None, bitorder="little").tobytes(), "little")

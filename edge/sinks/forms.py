@@ -1,0 +1,30 @@
+"""Sinks as a user writes them."""
+
+from pathlib import Path
+from typing import Final
+
+from edge.contract import Contract
+from edge.errors import UsageError
+from edge.sinks.base import Sink
+from edge.sinks.jsonl import JsonLinesSink
+from edge.sinks.npz import NpzSink
+from edge.sinks.status import StatusSink
+
+FORMS: Final = ("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz")
+
+
+def open_sink(text: str, contract: Contract) -> Sink:
+    """Open the sink that `text` names; `contract` says the shapes that will come.
+
+    Raises:
+        UsageError: no such form; the forms are listed.
+        SinkError: it cannot be opened.
+    """
+    form, _, target = text.partition(":")
+    if text == "status":
+        return StatusSink()
+    if form == "jsonl" and target:
+        return JsonLinesSink(target)
+    if form == "npz" and target.endswith(".npz"):
+        return NpzSink(Path(target), (3, contract.rows, contract.cols), contract.pattern_shape)
+    raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")

@@ -1,0 +1,109 @@
+"""One JSON record a line, flushed as it is written, since a robot reads it live."""
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from io import BufferedWriter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import SinkClosedError, SinkError
+from edge.result import Result, mask_bits
+from edge.sinks.base import Sink
+from firmware_bridge.scan import Scan
+
+
+class JsonLinesSink(Sink):
+    """Writes records into a file, or with "-" to stdout."""
+
+    def __init__(self, target: str) -> None:
+        """Open the target; a file that exists is replaced.
+
+        Raises:
+            SinkError: it cannot be opened.
+        """
+        self._target = "stdout" if target == "-" else target
+        try:
+            self._file = _open(target)
+        except OSError as error:
+            raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Write one record."""
+        try:
+            self._file.write(record_line(result, counters).encode())
+            self._file.flush()
+        except BrokenPipeError as error:
+            raise SinkClosedError(f"the reader of {self._target} has gone") from error
+        except OSError as error:
+            raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Close the file. Every record is on its way already; what an error kept back is lost and was told."""
+        try:
+            self._file.close()
+        except OSError:
+            # The writer tries its last record again, and fails again as it did in `write`.
+            return
+
+
+def record_line(result: Result, counters: Mapping[str, int]) -> str:
+    """A result as one line of JSON; absent is null, masks have bit i for taxel i."""
+    scan, baseline = result.scan, result.baseline
+    record: dict[str, Any] = {
+        "time_ns": scan.time_ns,
+        "sensor": scan.sensor,
+        "scan": scan.number,
+        "source": result.source,
+        "state": result.state,
+        "fresh": mask_bits(scan.fresh),
+        "renewed": mask_bits(scan.renewed),
+        "contact": result.contact,
+        "taps_used": result.taps_used,
+        "force_counts": _rounded(result.force_counts, 1),
+        "force_n": _rounded(result.force_n, 4),
+        "area_mm2": _rounded(result.area_mm2, 3),
+        "centroid_mm": None if result.centroid_mm is None else [round(value, 4) for value in result.centroid_mm],
+        "run_time_us": _rounded(result.run_time_us, 1),
+        "baseline": None if baseline is None else baseline.id,
+        "baseline_origin": None if baseline is None else baseline.origin,
+        "baseline_age_s": _rounded(result.baseline_age_s, 1),
+        "model": result.model,
+        "note": result.note,
+        "counters": dict(counters),
+        "counts": _readings(scan),
+        "pattern_unit": result.pattern_unit,
+    }
+    return f'{json.dumps(record, allow_nan=False)[:-1]}, "pattern": {_pattern_text(result.pattern)}}}\n'
+
+
+def _readings(scan: Scan) -> list[list[list[int | None]]]:
+    readings = scan.counts.astype(object)
+    readings[:, ~scan.fresh] = None
+    return readings.tolist()
+
+
+def _rounded(value: float | None, decimals: int) -> float | None:
+    return None if value is None else round(value, decimals)
+
+
+def _pattern_text(pattern: NDArray[np.float32] | None) -> str:
+    """Nested lists with five significant digits; two and a half times as fast as json.dumps."""
+    if pattern is None:
+        return "null"
+    height, width = pattern.shape
+    row = "[" + ", ".join(["%.5g"] * width) + "]"
+    return ("[" + ", ".join([row] * height) + "]") % tuple(pattern.ravel().tolist())
+
+
+def _open(target: str) -> BufferedWriter:
+    if target != "-":
+        return Path(target).open("wb")
+    if sys.stdout is None:
+        raise OSError(0, "it is closed")
+    # A writer of our own: what is left in sys.stdout after an error would be tried again at exit.
+    return os.fdopen(os.dup(sys.stdout.fileno()), "wb")

@@ -1,0 +1,220 @@
+"""Scans and patterns in one .npz, which `--source replay:` plays again.
+
+A zip archive cannot be written side by side, so while the run lasts each array grows in a file of
+its own in `FILE.npz.parts`; closing gathers them. Memory stays flat however long the run is, and
+after a crash the parts are still there: `python -m edge.sinks.npz FILE.npz` gathers them then.
+"""
+
+import contextlib
+import json
+import shutil
+import sys
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import ArrayLike
+
+from edge.errors import SinkError
+from edge.result import Result
+from edge.sinks.base import Sink
+from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
+
+LAYOUT: Final = "layout.json"
+FLUSH_SCANS: Final = 100
+CHUNK_BYTES: Final = 1 << 20
+
+
+class NpzSink(Sink):
+    """Records into `path`, by way of parts beside it.
+
+    Arrays, one row a scan: sensor, scan, time_ns, counts (3, rows, cols; -1 absent), source, state,
+    contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros
+    where there is none), run_time_us (NaN where there is none), baseline (its id, or empty) and
+    baseline_counts (3, rows, cols; NaN without).
+    """
+
+    def __init__(self, path: Path, scan_shape: tuple[int, ...], pattern_shape: tuple[int, ...]) -> None:
+        """Start the parts.
+
+        Args:
+            path: of the .npz; one that exists is replaced at the end.
+            scan_shape: (3, rows, cols).
+            pattern_shape: (H, W).
+
+        Raises:
+            SinkError: they cannot be written, or lie there from a run that did not end.
+        """
+        self._path = path
+        self._scans = 0
+        self._failed = False
+        self._no_pattern = np.zeros(pattern_shape, dtype=np.float32)
+        self._no_baseline = np.full(scan_shape, np.nan, dtype=np.float32)
+        self._layout: dict[str, tuple[str, tuple[int, ...]]] = {
+            "sensor": ("<U64", ()),
+            "scan": ("<i8", ()),
+            "time_ns": ("<i8", ()),
+            "counts": ("<i4", scan_shape),
+            "source": ("<U8", ()),
+            "state": ("<U10", ()),
+            "contact": ("|i1", ()),
+            "taps_used": ("<i2", ()),
+            "force_counts": ("<f4", ()),
+            "has_pattern": ("|b1", ()),
+            "pattern": ("<f4", pattern_shape),
+            "run_time_us": ("<f4", ()),
+            "baseline": ("<U16", ()),
+            "baseline_counts": ("<f4", scan_shape),
+        }
+        parts = parts_dir(path)
+        if path.is_dir():
+            raise SinkError(f"cannot record into {path}: it is a directory")
+        try:
+            parts.mkdir()
+            (parts / LAYOUT).write_text(json.dumps(self._layout))
+            self._files: dict[str, IO[bytes]] = {name: (parts / name).open("wb") for name in self._layout}
+        except FileExistsError as error:
+            raise SinkError(
+                f"{parts} holds a recording that was not finished: {_remedy(path)}, or delete it"
+            ) from error
+        except OSError as error:
+            raise SinkError(f"cannot record into {parts}: {error.strerror}") from error
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Add one row to every array."""
+        scan, pattern, baseline = result.scan, result.pattern, result.baseline
+        row: dict[str, ArrayLike] = {
+            "sensor": scan.sensor,
+            "scan": scan.number,
+            "time_ns": scan.time_ns,
+            "counts": scan.counts,
+            "source": result.source,
+            "state": result.state,
+            "contact": -1 if result.contact is None else result.contact,
+            "taps_used": result.taps_used,
+            "force_counts": np.nan if result.force_counts is None else result.force_counts,
+            "has_pattern": pattern is not None,
+            "pattern": self._no_pattern if pattern is None else pattern,
+            "run_time_us": np.nan if result.run_time_us is None else result.run_time_us,
+            "baseline": "" if baseline is None else baseline.id,
+            "baseline_counts": self._no_baseline if baseline is None else baseline.counts,
+        }
+        self._scans += 1
+        try:
+            for name, value in row.items():
+                self._files[name].write(_row_bytes(name, value, *self._layout[name]))
+            if self._scans % FLUSH_SCANS == 0:
+                self._flush()
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def close(self) -> None:
+        """Gather the parts. Without a single scan nothing is written."""
+        try:
+            if not self._failed:
+                self._flush()
+        except OSError as error:
+            raise self._failure(error) from error
+        finally:
+            for file in self._files.values():
+                with contextlib.suppress(OSError):  # flushed above, or told as a failure before
+                    file.close()
+        if self._failed:
+            return
+        if self._scans:
+            gather(self._path)
+        else:
+            shutil.rmtree(parts_dir(self._path))
+
+    def _flush(self) -> None:
+        for file in self._files.values():
+            file.flush()
+
+    def _failure(self, error: OSError) -> SinkError:
+        self._failed = True
+        reason = error.strerror or error
+        return SinkError(f"recording into {self._path} stopped: {reason}; what there is so far: {_remedy(self._path)}")
+
+
+def parts_dir(path: Path) -> Path:
+    """Where the arrays of `path` grow."""
+    return path.with_name(path.name + ".parts")
+
+
+def gather(path: Path) -> int:
+    """Make the .npz of its parts, delete them, and return the number of scans.
+
+    A last row that a crash left in some of the parts only is left out.
+
+    Raises:
+        SinkError: there are no parts, no scans in them, or no room.
+    """
+    parts, draft = parts_dir(path), path.with_name(path.name + ".draft")
+    try:
+        layout = {name: (np.dtype(kind), tuple(shape)) for name, (kind, shape) in _read_layout(parts).items()}
+        row_bytes = {name: dtype.itemsize * int(np.prod(shape)) for name, (dtype, shape) in layout.items()}
+        scans = min((parts / name).stat().st_size // row_bytes[name] for name in layout)
+        if scans == 0:
+            raise SinkError(f"{parts} holds no scan: delete it")
+        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION)):
+                with archive.open(f"{name}.npy", "w") as entry:
+                    npy.write_array(entry, np.asarray(value))
+            for name, (dtype, shape) in layout.items():
+                header = {"descr": dtype.str, "fortran_order": False, "shape": (scans, *shape)}
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry, (parts / name).open("rb") as part:
+                    npy.write_array_header_1_0(entry, header)
+                    left = scans * row_bytes[name]
+                    while chunk := part.read(min(left, CHUNK_BYTES)):
+                        entry.write(chunk)
+                        left -= len(chunk)
+        draft.replace(path)
+        shutil.rmtree(parts)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        if isinstance(error, SinkError):
+            raise
+        reason = error.strerror or error
+        raise SinkError(f"cannot gather {parts}: {reason}; the parts are kept: {_remedy(path)}") from error
+    return scans
+
+
+def _read_layout(parts: Path) -> dict[str, tuple[str, list[int]]]:
+    try:
+        return json.loads((parts / LAYOUT).read_text())
+    except ValueError as error:
+        raise SinkError(f"{parts / LAYOUT} cannot be read: these parts cannot be gathered") from error
+
+
+def _row_bytes(name: str, value: ArrayLike, kind: str, shape: tuple[int, ...]) -> bytes:
+    row = np.asarray(value, dtype=kind)
+    if row.shape != shape:
+        raise SinkError(f"{name} has shape {row.shape}, expected {shape}")
+    if isinstance(value, str) and str(row) != value:
+        raise SinkError(f"{name} {value!r} is too long to record")
+    return row.tobytes()
+
+
+def _remedy(path: Path) -> str:
+    return f"`python -m edge.sinks.npz {path}` makes the .npz of it"
+
+
+def main(arguments: list[str]) -> int:
+    """Gather the parts that a crash left behind; returns an exit code."""
+    if len(arguments) != 1:
+        sys.stderr.write("usage: python -m edge.sinks.npz FILE.npz\n")
+        return 2
+    try:
+        scans = gather(Path(arguments[0]))
+    except SinkError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    sys.stdout.write(f"{arguments[0]}: {scans} scans\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,123 @@
+"""One live line on a terminal."""
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Final, TextIO
+
+from edge.result import Result
+from edge.sinks.base import Sink
+
+REFRESH_S: Final = 0.1
+SILENCE_S: Final = 1.0
+RATE_SMOOTHING: Final = 0.05
+CLEAR_TO_END: Final = "\x1b[K"
+
+
+class StatusSink(Sink):
+    """Rewrites one line, at most ten times a second; writes nothing where there is no terminal."""
+
+    def __init__(
+        self,
+        stream: TextIO | None = None,
+        *,
+        clock_s: Callable[[], float] = time.monotonic,
+        columns: Callable[[], int] = lambda: shutil.get_terminal_size().columns,
+    ) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._clock_s = clock_s
+        self._columns = columns
+        self._terminal = self._stream is not None and self._stream.isatty()
+        self._latest: dict[str, Result] = {}
+        self._rates: dict[str, _Rate] = {}
+        self._counters: Mapping[str, int] = {}
+        self._last_scan_s = clock_s()
+        self._last_shown_s: float | None = None
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Show one result, unless the line is fresh."""
+        self._latest[result.scan.sensor] = result
+        self._rates.setdefault(result.scan.sensor, _Rate()).add(result.scan.time_ns)
+        self._counters = counters
+        self._last_scan_s = self._clock_s()
+        self._refresh()
+
+    def wait(self) -> None:
+        """Show for how long no scan came."""
+        self._refresh()
+
+    def close(self) -> None:
+        """Leave the last line standing."""
+        if self._last_shown_s is not None:
+            self._show("\n")
+
+    def _refresh(self) -> None:
+        now_s = self._clock_s()
+        if self._terminal and (self._last_shown_s is None or now_s - self._last_shown_s >= REFRESH_S):
+            self._last_shown_s = now_s
+            self._show()
+
+    def _show(self, end: str = "") -> None:
+        # The last column stays free: some terminals wrap as soon as it is filled.
+        try:
+            self._stream.write("\r" + self.line()[: max(self._columns() - 1, 0)] + CLEAR_TO_END + end)
+            self._stream.flush()
+        except OSError:
+            self._terminal = False  # the window was closed; that ends no recording
+
+    def line(self) -> str:
+        """The line, what matters most first."""
+        parts = []
+        sources = {result.source for result in self._latest.values()} - {"device"}
+        parts += sorted(source.upper() for source in sources)
+        silence_s = self._clock_s() - self._last_scan_s
+        if silence_s >= SILENCE_S or not self._latest:
+            parts.append(f"no scan for {silence_s:.0f} s")
+        parts += [self._sensor_text(name) for name in sorted(self._latest)]
+        count = self._counters.get
+        losses = {
+            "dropped": count("dropped", 0),
+            "overrun": count("overruns", 0),
+            "torn": count("torn_wire", 0) + count("torn_source", 0),
+        }
+        parts += [f"{number} {name}" for name, number in losses.items() if number]
+        return " | ".join(parts)
+
+    def _sensor_text(self, name: str) -> str:
+        result = self._latest[name]
+        words = [name, result.state]
+        if result.state == "zeroing" and result.note is not None:
+            return f"{name} {result.note}"
+        if result.contact:
+            words.append(f"tap {result.taps_used}")
+        if result.force_n is not None:
+            words.append(f"{result.force_n:.2f} N")
+        elif result.force_counts is not None:
+            words.append(f"{result.force_counts:.0f} counts")
+        if result.area_mm2 is not None:
+            words.append(f"{result.area_mm2:.0f} mm2")
+        if result.run_time_us is not None:
+            words.append(f"{result.run_time_us:.0f} us")
+        rate_hz = self._rates[name].rate_hz
+        if rate_hz is not None:
+            words.append(f"{rate_hz:.0f} Hz")
+        return " ".join(words)
+
+
+class _Rate:
+    """Scans a second, smoothed over about twenty scans."""
+
+    def __init__(self) -> None:
+        self.rate_hz: float | None = None
+        self._period_ns: float | None = None
+        self._last_ns: int | None = None
+
+    def add(self, time_ns: int) -> None:
+        if self._last_ns is not None and time_ns > self._last_ns:
+            period_ns = time_ns - self._last_ns
+            if self._period_ns is None:
+                self._period_ns = period_ns
+            self._period_ns += RATE_SMOOTHING * (period_ns - self._period_ns)
+            self.rate_hz = 1e9 / self._period_ns
+        self._last_ns = time_ns

@@ -1,0 +1,119 @@
+"""Figures of a run, in memory that does not grow with it."""
+
+import math
+from bisect import bisect_left
+from itertools import accumulate
+from typing import Final
+
+from edge.result import Result
+
+BUCKETS_PER_OCTAVE: Final = 32
+"""Of the run-time histogram: a quantile is at most 2.2 % too high."""
+LONGEST_US: Final = 2.0**26
+"""About a minute; longer run times are counted as this long."""
+
+
+class Histogram:
+    """Quantiles of positive numbers from logarithmic buckets."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.max = 0.0
+        self._buckets = [0] * (math.ceil(math.log2(LONGEST_US) * BUCKETS_PER_OCTAVE) + 1)
+
+    def add(self, value: float) -> None:
+        """Count a value; below 1 counts as 1."""
+        self.count += 1
+        self.max = max(self.max, value)
+        self._buckets[math.ceil(math.log2(min(max(value, 1.0), LONGEST_US)) * BUCKETS_PER_OCTAVE)] += 1
+
+    def quantile(self, share: float) -> float | None:
+        """Upper edge of the bucket that holds the `share`-th value; None without values."""
+        if self.count == 0:
+            return None
+        wanted = max(1, math.ceil(share * self.count))
+        index = bisect_left(list(accumulate(self._buckets)), wanted)
+        return min(2.0 ** (index / BUCKETS_PER_OCTAVE), self.max)
+
+
+class Statistics:
+    """What a run did, for its summary.
+
+    Attributes:
+        scans: results made, one for every scan.
+        patterns: of these, with a pattern.
+        dropped: in contact, but overtaken by a newer scan before the inference.
+        overruns: scans thrown away unseen because nobody took them in time.
+        torn_wire: scans with taxels missing.
+        torn_source: complete scans that were only partly renewed.
+        repeated: complete scans with nothing renewed.
+        run_time_us: histogram of the inference's run time.
+        commands_refused: lines on stdin that were no command.
+    """
+
+    def __init__(self) -> None:
+        self.scans = 0
+        self.patterns = 0
+        self.dropped = 0
+        self.overruns = 0
+        self.torn_wire = 0
+        self.torn_source = 0
+        self.repeated = 0
+        self.run_time_us = Histogram()
+        self.commands_refused = 0
+        self._spans: dict[str, _Span] = {}
+
+    def add(self, result: Result) -> None:
+        """Count one result."""
+        scan = result.scan
+        self.scans += 1
+        self.dropped += result.state == "dropped"
+        self.torn_wire += not scan.complete
+        self.torn_source += scan.complete and scan.torn
+        self.repeated += scan.repeated
+        if result.run_time_us is not None:
+            self.patterns += 1
+            self.run_time_us.add(result.run_time_us)
+        self._spans.setdefault(scan.sensor, _Span(scan.time_ns)).add(scan.time_ns)
+
+    def rate_hz(self) -> dict[str, float]:
+        """Scans a second of each sensor over the whole run, where there were two or more."""
+        return {name: rate_hz for name, span in self._spans.items() if (rate_hz := span.rate_hz()) is not None}
+
+    def summary(self, *, source: str, wanted_rate_hz: float | None = None) -> str:
+        """The run in a few lines of text.
+
+        Args:
+            source: the source as the user knows it.
+            wanted_rate_hz: the rate that was asked for, to be held against.
+        """
+        lines = [
+            f"{source}: {self.scans} scans, {self.patterns} patterns, {self.dropped} dropped, {self.overruns} overrun",
+            f"torn: {self.torn_wire} on the wire, {self.torn_source} at the source; {self.repeated} repeated",
+        ]
+        p50_us, p99_us = self.run_time_us.quantile(0.5), self.run_time_us.quantile(0.99)
+        if p50_us is not None and p99_us is not None:
+            lines.append(f"run time: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {self.run_time_us.max:.0f} us")
+        rates = [f"{rate_hz:.1f} Hz (sensor {name})" for name, rate_hz in sorted(self.rate_hz().items())]
+        if rates:
+            wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
+            lines.append(f"rate held: {', '.join(rates)}{wanted}")
+        if self.commands_refused:
+            lines.append(f"stdin: {self.commands_refused} lines were no command")
+        return "\n".join(lines)
+
+
+class _Span:
+    """Time from a sensor's first scan to its last."""
+
+    def __init__(self, first_ns: int) -> None:
+        self._first_ns = self._last_ns = first_ns
+        self._scans = 0
+
+    def add(self, time_ns: int) -> None:
+        self._last_ns = time_ns
+        self._scans += 1
+
+    def rate_hz(self) -> float | None:
+        duration_ns = self._last_ns - self._first_ns
+        return (self._scans - 1) * 1e9 / duration_ns if duration_ns > 0 else None

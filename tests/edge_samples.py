@@ -1,0 +1,187 @@
+"""What the runtime's tests share: a tiny real model, a sensor at rest and under load, links that are scripts."""
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from edge.contract import INPUT_NAME, OUTPUT_NAME, Contract
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.scan import ABSENT, Scan
+
+ROOT = Path(__file__).parent.parent
+PERIOD_NS = 10_000_000
+REST = (
+    np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None] + np.arange(16, dtype=np.int32).reshape(4, 4) * 37
+)
+BASELINE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")
+
+
+def make_contract(**changes) -> Contract:
+    values = {
+        "version": 1,
+        "taps": 4,
+        "scale": 10,
+        "tap_order": "newest first",
+        "angle_step_deg": 5.0,
+        "counts_per_unit": (500.0, 500.0, 1000.0),
+        "output_unit": "mm",
+        "output_full_scale": 2.0,
+        "contact_level": 0.25,
+        "sensor": "uSPa44",
+        "rows": 4,
+        "cols": 4,
+        "pitch_mm": 4.7,
+        "training_sha256": "ab" * 32,
+        "test_set_sha256": "cd" * 32,
+        "test_error": {"1": {"psnr_db": 30.1}, "4": {"psnr_db": 33.2, "rmse_percent": 2.1}},
+    }
+    return Contract(**(values | changes))
+
+
+def write_model(
+    path: Path,
+    contract: Contract | None = None,
+    *,
+    metadata: dict[str, str] | None = None,
+    input_name: str = INPUT_NAME,
+    output_name: str = OUTPUT_NAME,
+    input_shape: list | None = None,
+    element_type: int = TensorProto.FLOAT,
+    gain: float = 1.0,
+) -> Path:
+    """A real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap."""
+    contract = contract or make_contract()
+    taps, scale = contract.taps, contract.scale
+    weights = np.zeros((3 * taps, 1, scale, scale), dtype=np.float32)
+    for tap in range(taps):
+        weights[3 * tap + 2] = gain * 10.0**-tap
+    height, width = contract.pattern_shape
+    graph = helper.make_graph(
+        [
+            helper.make_node("Cast", [input_name], ["floats"], to=TensorProto.FLOAT),
+            helper.make_node("ConvTranspose", ["floats", "weights"], ["squares"], strides=[scale, scale]),
+            helper.make_node("Squeeze", ["squares", "axis"], [output_name]),
+        ],
+        "tiny",
+        [helper.make_tensor_value_info(input_name, element_type, input_shape or list(contract.window_shape))],
+        [helper.make_tensor_value_info(output_name, TensorProto.FLOAT, [(input_shape or [1])[0], height, width])],
+        [numpy_helper.from_array(weights, "weights"), numpy_helper.from_array(np.array([1]), "axis")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+    helper.set_model_props(model, contract.to_metadata() if metadata is None else metadata)
+    onnx.save(model, path)
+    return path
+
+
+def tiny_pattern(window_units: np.ndarray, scale: int = 10) -> np.ndarray:
+    """What the tiny model makes of a window (taps, 3, rows, cols) in network units."""
+    z = sum(window_units[tap, 2] * 10.0**-tap for tap in range(len(window_units)))
+    return np.kron(z, np.ones((scale, scale)))
+
+
+def make_scan(
+    number: int = 0,
+    *,
+    press_counts: float = 0.0,
+    taxel: int = 5,
+    sensor: str = "4",
+    absent: tuple[int, ...] = (),
+    stale: tuple[int, ...] = (),
+    time_ns: int | None = None,
+    noise: int = 0,
+) -> Scan:
+    """A scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
+    counts = REST.copy()
+    counts[2].flat[taxel] += int(press_counts)
+    if noise:
+        counts += np.random.default_rng(number).integers(-noise, noise + 1, counts.shape, dtype=np.int32)
+    fresh = np.ones((4, 4), dtype=bool)
+    fresh.flat[list(absent)] = False
+    renewed = fresh.copy()
+    renewed.flat[list(stale)] = False
+    counts[:, ~fresh] = ABSENT
+    time_ns = (number + 1) * PERIOD_NS if time_ns is None else time_ns
+    return Scan(sensor, number, time_ns, counts, fresh, renewed)
+
+
+class FakeModel:
+    """The tiny model without onnxruntime; `on_run` is called before each run."""
+
+    def __init__(self, contract: Contract | None = None, on_run=lambda: None) -> None:
+        self.name = "fake"
+        self.contract = contract or make_contract()
+        self.windows: list[np.ndarray] = []
+        self._on_run = on_run
+
+    def run(self, window: np.ndarray) -> np.ndarray:
+        self._on_run()
+        self.windows.append(window.copy())
+        return tiny_pattern(window).astype(np.float32)
+
+
+class FakeLink:
+    """Gives one batch of scans at each read, waiting where a batch is an event; then ends, or fails."""
+
+    def __init__(self, batches, *, error: Exception | None = None, kind="device", endless: bool = False) -> None:
+        self.name = "fake"
+        self.kind = kind
+        self.ended = False
+        self.reads = 0
+        self.thread: threading.Thread | None = None
+        self._batches = list(batches)
+        self._error = error
+        self._endless = endless
+        self._given = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc_info):
+        pass
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        self.thread = threading.current_thread()
+        self.reads += 1
+        if not self._batches:
+            if self._error is not None:
+                raise self._error
+            if self._endless:
+                time.sleep(min(timeout_s, 0.01))
+                return []
+            self.ended = True
+            return []
+        batch = self._batches.pop(0)
+        if isinstance(batch, threading.Event):
+            batch.wait(10)
+            return []
+        self._given += len(batch)
+        return batch
+
+    def counters(self) -> dict[str, int]:
+        return {"scans": self._given}
+
+
+class ListSink:
+    """Keeps what it gets."""
+
+    def __init__(self, on_write=lambda result: None) -> None:
+        self.results = []
+        self.counters = []
+        self.waits = 0
+        self.closed = False
+        self._on_write = on_write
+
+    def write(self, result, counters) -> None:
+        self.results.append(result)
+        self.counters.append(dict(counters))
+        self._on_write(result)
+
+    def wait(self) -> None:
+        self.waits += 1
+
+    def close(self) -> None:
+        self.closed = True

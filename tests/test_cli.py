@@ -1,0 +1,429 @@
+"""`edge-sr` as a user runs it: a process of its own, real pipes, real signals, a real pseudo-terminal."""
+
+import fcntl
+import json
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
+
+from edge import bundle, cli
+from firmware_bridge.baseline import load_baselines, save_baselines
+from firmware_bridge.emulator import Emulator
+from firmware_bridge.links import source
+from firmware_bridge.links.ports import Port
+from firmware_bridge.recording import load_recording
+
+EDGE_SR = [sys.executable, "-m", "edge.cli"]
+TIMEOUT_S = 60
+
+
+def write_recording(path: Path, presses, period_ns=10_000_000) -> Path:
+    scans = [make_scan(n, press_counts=press, noise=3) for n, press in enumerate(presses)]
+    np.savez(
+        path,
+        format=np.array("tactile-recording"),
+        version=np.array(1),
+        sensor=np.array(["4"] * len(scans)),
+        scan=np.arange(len(scans)),
+        time_ns=np.arange(len(scans)) * period_ns,
+        counts=np.stack([scan.counts for scan in scans]),
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A tiny model, a stored baseline, a recording of four taps and one of a pad at rest."""
+    folder = tmp_path_factory.mktemp("files")
+    write_model(folder / "tiny.onnx")
+    save_baselines(folder / "zero.json", [BASELINE])
+    write_recording(folder / "taps.npz", ([0] * 5 + [3000] * 5) * 4)
+    write_recording(folder / "rest.npz", [0] * 120)
+    return folder
+
+
+def base_options(files):
+    return ["--model", str(files / "tiny.onnx"), "--baseline", str(files / "zero.json")]
+
+
+def run(*arguments, **settings):
+    settings.setdefault("stdin", subprocess.DEVNULL)
+    return subprocess.run(
+        [*EDGE_SR, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, **settings
+    )
+
+
+def start(*arguments, **settings):
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | settings
+    return subprocess.Popen([*EDGE_SR, *map(str, arguments)], cwd=ROOT, text=True, **pipes)
+
+
+def records(text):
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def assert_refused(done, code, *words):
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("edge-sr: ") and done.stderr.count("\n") == 1, done.stderr
+    for word in words:
+        assert word in done.stderr
+
+
+class TestHelp:
+    @pytest.mark.parametrize("command", [[], ["models"], ["baseline"]])
+    def test_help_fits_40_columns(self, command):
+        done = run(*command, "--help", env=os.environ | {"COLUMNS": "40"})
+        assert done.returncode == 0 and done.stderr == ""
+        assert max(map(len, done.stdout.splitlines())) <= 40
+
+    def test_help_names_all_there_is(self):
+        text = run("--help").stdout
+        options = "model source sink rate-hz duration-s baseline counts-per-newton contact-on-counts contact-off-counts"
+        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s")]
+        for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "npz:FILE", "models", "reset"):
+            assert word in text
+
+    def test_help_loads_no_onnxruntime(self):
+        script = (
+            "import sys\nfrom edge.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+            "sys.exit('onnxruntime' in sys.modules)"
+        )
+        subprocess.run(
+            [sys.executable, "-c", script], cwd=ROOT, check=True, stdout=subprocess.DEVNULL, timeout=TIMEOUT_S
+        )
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (["--rate-hz", "0"], ["--rate-hz: '0' is not a positive number"]),
+            (["--duration-s", "nan"], ["--duration-s: 'nan' is not a positive number"]),
+            (["--counts-per-newton", "x"], ["--counts-per-newton: 'x' is not"]),
+            (["--mode", "x"], ["unrecognized arguments: --mode"]),
+            (["model"], ["unrecognized arguments: model"]),
+            (["models", "x"], ["unrecognized arguments: x", "edge-sr models --help"]),
+            (["baseline"], ["--out"]),
+            (["baseline", "--out", "x", "--scans", "99"], ["'99' is not a whole number from 100"]),
+            (["baseline", "--out", "x", "--skip", "-1"], ["--skip"]),
+            (["--source", "serial:x"], ["'serial:x'", "slcan:/dev/ttyUSB0", "replay:FILE", "demo"]),
+            (["--source", "replay:none\nsuch.npz"], ["none such.npz"]),
+            (["--source", "replay:none.npz"], ["none.npz", "No such file"]),
+            (["--source", "demo", "--baseline", "none.json"], ["none.json", "No such file"]),
+        ],
+    )
+    def test_wrong_usage_is_2(self, arguments, words, capsys):
+        try:
+            code = cli.main(arguments)
+        except SystemExit as end:
+            code = end.code
+        assert_refused(subprocess.CompletedProcess(arguments, code, *capsys.readouterr()), 2, *words)
+
+    def test_thresholds_and_sinks_that_cannot_be_are_2(self, files):
+        replay = [*base_options(files), "--source", f"replay:{files}/rest.npz"]
+        assert_refused(run(*replay, "--contact-on-counts", "10"), 2, "on 10", "off 750")
+        assert_refused(run(*replay, "--sink", "csv:x"), 2, "'csv:x'", "jsonl:FILE", "npz:FILE")
+
+    def test_a_port_that_cannot_be_used_is_3(self, files):
+        assert_refused(run(*base_options(files), "--source", "slcan:/dev/none"), 3, "/dev/none", "no such port")
+        assert_refused(run(*base_options(files), "--source", "slcan:/dev/null"), 3, "/dev/null")
+        assert_refused(run(*base_options(files), "--source", "slcan:serial=NOSUCH"), 3, "NOSUCH")
+
+    @pytest.mark.parametrize("ports", [[], ["/dev/ttyUSB0", "/dev/ttyUSB1"]])
+    def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(
+        self, monkeypatch, capsys, tmp_path, ports
+    ):
+        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+        seen = [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
+        monkeypatch.setattr(source, "serial_ports", lambda: [*seen, Port("/dev/ttyS9", None, None, "n/a")])
+        assert cli.main(["--sink", "jsonl:-"]) == 3
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1
+        for word in ("--source demo", "/dev/ttyS9", *ports):
+            assert word in err
+
+    def test_a_demo_that_is_not_installed_is_2(self, monkeypatch, capsys, tmp_path):
+        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+        assert cli.main(["--source", "demo"]) == 2
+        assert "demo.npz is missing" in capsys.readouterr().err
+
+    def test_a_model_that_cannot_be_used_is_4(self, files, tmp_path):
+        replay = ["--source", f"replay:{files}/rest.npz", "--model"]
+        assert_refused(run(*replay, "none"), 4, "no model 'none'", "bundled: ")
+        (tmp_path / "text.onnx").write_text("text")
+        assert_refused(run(*replay, tmp_path / "text.onnx"), 4, "text.onnx")
+        other = write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
+        assert_refused(run(*replay, other), 4, "'pitch_mm' is 5.0", "4.7")
+
+    def test_a_sink_that_cannot_be_opened_is_5_and_old_files_stay(self, files, tmp_path):
+        replay = [*base_options(files), "--source", f"replay:{files}/rest.npz"]
+        assert_refused(run(*replay, "--sink", f"jsonl:{tmp_path}/none/x"), 5, "none/x", "No such file")
+        kept = tmp_path / "kept.jsonl"
+        kept.write_text("old")
+        assert_refused(run(*base_options(files), "--source", "slcan:/dev/none", "--sink", f"jsonl:{kept}"), 3)
+        assert kept.read_text() == "old"
+
+    def test_a_full_disk_is_5_after_the_summary(self, files):
+        done = run(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:/dev/full")
+        lines = done.stderr.splitlines()
+        assert done.returncode == 5 and lines[0].startswith("REPLAY")
+        assert lines[-1] == "edge-sr: cannot write records to /dev/full: No space left on device"
+
+
+class TestReplay:
+    def test_every_scan_is_a_record_and_the_summary_goes_to_stderr(self, files):
+        done = run(*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-")
+        assert done.returncode == 0
+        got = records(done.stdout)
+        assert [record["scan"] for record in got] == list(range(40))
+        assert {record["source"] for record in got} == {"replay"}
+        assert [record["taps_used"] for record in got if record["contact"]] == [
+            t for t in (1, 2, 3, 4) for _ in range(5)
+        ]
+        assert {record["baseline"] for record in got} == {BASELINE.id}
+        assert all(record["force_n"] is None for record in got)
+        lines = done.stderr.splitlines()
+        assert re.fullmatch(r"REPLAY replay:.*taps.npz: 40 scans, \d+ patterns, \d+ dropped, 0 overrun", lines[0])
+        assert re.search(r"rate held: (99|100)\.\d Hz \(sensor 4\)", done.stderr)
+        assert "p50" in done.stderr and "\x1b" not in done.stderr
+
+    def test_what_was_recorded_replays_as_the_same_scans(self, files, tmp_path):
+        options = [*base_options(files), "--rate-hz", "400"]
+        first = run(*options, "--source", f"replay:{files}/taps.npz", "--sink", f"npz:{tmp_path}/a.npz")
+        second = run(*options, "--source", f"replay:{tmp_path}/a.npz", "--sink", f"npz:{tmp_path}/b.npz")
+        assert first.returncode == second.returncode == 0
+        original = load_recording(files / "taps.npz").tracks[0].counts
+        for name in ("a", "b"):
+            np.testing.assert_array_equal(load_recording(tmp_path / f"{name}.npz").tracks[0].counts, original)
+
+    def test_newtons_thresholds_and_idle_time_are_heard(self, files):
+        done = run(
+            *base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-",
+            "--counts-per-newton", "1000", "--contact-on-counts", "2999000", "--rate-hz", "500",
+        )  # fmt: skip
+        got = records(done.stdout)
+        assert not any(record["contact"] for record in got)
+        assert got[7]["force_n"] == pytest.approx(3, abs=0.1)
+        assert "500 Hz asked for" in done.stderr
+        done = run(
+            *base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-", "--idle-reset-s", "0.03",
+        )  # fmt: skip
+        assert {record["taps_used"] for record in records(done.stdout)} == {0, 1}
+
+    def test_two_sensors_and_several_sinks_at_once(self, files, tmp_path):
+        other = write_recording(tmp_path / "other.csv.npz", [0] * 10)
+        data = dict(np.load(other))
+        data["sensor"] = np.array(["6"] * 10)
+        np.savez(other, **data)
+        done = run(
+            *base_options(files), "--source", f"replay:{files}/taps.npz,{other}",
+            "--sink", "jsonl:-", "--sink", f"jsonl:{tmp_path}/copy.jsonl", "--sink", f"npz:{tmp_path}/out.npz",
+        )  # fmt: skip
+        assert done.returncode == 0
+        assert (tmp_path / "copy.jsonl").read_text() == done.stdout
+        assert [len(track.counts) for track in load_recording(tmp_path / "out.npz").tracks] == [40, 10]
+
+    def test_duration_ends_it(self, files, tmp_path):
+        slow = write_recording(tmp_path / "slow.npz", [0] * 3, period_ns=10**11)
+        done = run(*base_options(files), "--source", f"replay:{slow}", "--duration-s", "0.3", "--sink", "jsonl:-")
+        assert done.returncode == 0 and len(records(done.stdout)) == 1
+
+    def test_a_reset_on_stdin_forgets_the_taps(self, files, tmp_path):
+        taps = write_recording(tmp_path / "many.npz", ([0] * 5 + [3000] * 5) * 12)
+        process = start(*base_options(files), "--source", f"replay:{taps}", "--sink", "jsonl:-", stdin=subprocess.PIPE)
+        assert process.stdout is not None and process.stdin is not None
+        used = []
+        for line in process.stdout:
+            record = json.loads(line)
+            used.append(record["taps_used"])
+            if used[-1] == 4:
+                process.stdin.write('{"cmd": "reset"}\nnonsense\n')
+                process.stdin.flush()
+                break
+        used += [json.loads(line)["taps_used"] for line in process.stdout]
+        assert process.wait(TIMEOUT_S) == 0
+        after = used[used.index(4) :]
+        assert 1 in after and after.index(1) < 30
+        assert process.stderr is not None and "stdin: 1 lines were no command" in process.stderr.read()
+
+
+class TestEnds:
+    @pytest.fixture
+    def emulator(self, files):
+        with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
+            yield emulator
+
+    def follow(self, emulator, files, *more):
+        """A run on the emulator that has given its first records."""
+        process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
+        assert process.stdout is not None
+        first = [process.stdout.readline() for _ in range(10)]
+        return process, first
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+    def test_signals_end_it_cleanly_with_the_summary(self, emulator, files, tmp_path, number):
+        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz")
+        process.send_signal(number)
+        rest, errors = process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 0
+        got = records("".join(first) + rest)
+        assert [record["scan"] for record in got] == list(range(len(got)))
+        assert {record["source"] for record in got} == {"emulated"}
+        assert errors.startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans") and "Traceback" not in errors
+        assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got)
+
+    def test_a_closed_pipe_ends_it_cleanly_with_the_summary(self, emulator, files):
+        process, _ = self.follow(emulator, files)
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.wait(TIMEOUT_S) == 0
+        errors = process.stderr.read()
+        assert errors.startswith("EMULATED ") and "Traceback" not in errors and "Exception" not in errors
+
+    def test_the_cable_out_keeps_the_records_and_is_3(self, emulator, files, tmp_path):
+        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz")
+        emulator.hang_up()
+        rest, errors = process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 3
+        got = records("".join(first) + rest)
+        assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got) >= 10
+        *summary, last = errors.splitlines()
+        assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
+        assert last.startswith(f"edge-sr: {emulator.port}: link lost")
+
+    def test_models_into_a_closed_pipe_stay_quiet(self, files):
+        script = f"import sys; from edge import bundle, cli; bundle.BUNDLE_DIR = bundle.Path({str(files)!r})\n"
+        script += "sys.exit(cli.main(['models']))"
+        reader, writer = os.pipe()
+        os.close(reader)
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=ROOT,
+            stdout=writer,
+            stderr=subprocess.PIPE,
+            timeout=TIMEOUT_S,
+            env=environment,
+        )
+        os.close(writer)
+        assert (done.returncode, done.stderr) == (0, b"")
+
+
+class TestTerminal:
+    def on_terminal(self, folder, *arguments, columns):
+        """What a terminal of that width gets on stderr, and what goes to stdout."""
+        leader, follower = pty.openpty()
+        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        with (folder / "stdout").open("w") as output:
+            process = start(
+                *arguments, stderr=follower, stdin=follower, stdout=output, env=environment | {"TERM": "xterm"}
+            )
+        os.close(follower)
+        shown = b""
+        while select.select([leader], [], [], TIMEOUT_S)[0]:
+            try:
+                shown += os.read(leader, 65536)
+            except OSError:  # the process has ended
+                break
+        os.close(leader)
+        assert process.wait(TIMEOUT_S) == 0
+        return shown.decode(), (folder / "stdout").read_text()
+
+    def test_the_live_line_is_there_without_asking(self, files, tmp_path):
+        replay = ["--source", f"replay:{files}/taps.npz"]
+        shown, output = self.on_terminal(tmp_path, *base_options(files), *replay, columns=120)
+        live = re.findall(r"\r([^\r\n]*)\x1b\[K", shown)
+        assert live and live[-1].startswith("REPLAY | 4 contact tap 4 ") and output == ""
+        assert max(map(len, live)) <= 119
+
+    def test_asked_for_it_is_there_once(self):
+        assert cli._with_status(["status", "npz:a.npz"]) == ["status", "npz:a.npz"]
+
+    def test_it_gives_way_to_records_on_stdout(self, files, tmp_path):
+        replay = ["--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
+        shown, output = self.on_terminal(tmp_path, *base_options(files), *replay, columns=80)
+        assert "\x1b" not in shown and len(records(output)) == 40
+
+
+class TestModels:
+    def test_models_are_listed_from_their_contracts(self, monkeypatch, capsys, tmp_path):
+        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+        write_model(tmp_path / "mtsr4.onnx")
+        write_model(tmp_path / "stsr.onnx", make_contract(taps=1))
+        assert cli.main(["models"]) == 0
+        out = capsys.readouterr().out.splitlines()
+        size_mb = (tmp_path / "mtsr4.onnx").stat().st_size / 1e6
+        figures = ["psnr_db", "33.2,", "rmse_percent", "2.1"]
+        assert out[1].split() == ["mtsr4", "4", "x10", f"{size_mb:.1f}", "MB", *figures]
+        assert out[2].split() == ["stsr", "1", "x10", f"{size_mb:.1f}", "MB", "psnr_db", "30.1"]
+
+    def test_none_bundled_is_4(self, monkeypatch, capsys, tmp_path):
+        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+        assert cli.main(["models"]) == 4
+        assert "no models" in capsys.readouterr().err
+
+
+class TestBaseline:
+    def test_a_baseline_is_taken_kept_and_used(self, files, tmp_path):
+        zero = tmp_path / "zero.json"
+        done = run(
+            "baseline", "--source", f"replay:{files}/rest.npz", "--rate-hz", "1000", "--skip", "5", "--out", zero
+        )
+        assert done.returncode == 0 and done.stderr == ""
+        baseline = load_baselines(zero)["4"]
+        assert done.stdout == f"sensor 4: baseline {baseline.id} of 100 scans (REPLAY) -> {zero}\n"
+        assert np.abs(baseline.counts - BASELINE.counts).max() <= 2
+        done = run(
+            "--model", files / "tiny.onnx", "--source", f"replay:{files}/taps.npz",
+            "--baseline", zero, "--sink", "jsonl:-",
+        )  # fmt: skip
+        assert {record["baseline"] for record in records(done.stdout)} == {baseline.id}
+        assert any(record["contact"] for record in records(done.stdout))
+
+    def test_a_moving_pad_is_3_and_nothing_is_written(self, files, tmp_path):
+        moving = write_recording(tmp_path / "moving.npz", range(0, 2000, 10))
+        done = run("baseline", "--source", f"replay:{moving}", "--rate-hz", "1000", "--out", tmp_path / "zero.json")
+        assert_refused(done, 3, "sensor 4: taxel (1, 1) z", "keep the pad still and free")
+        assert not (tmp_path / "zero.json").exists()
+
+    def test_a_recording_too_short_is_3(self, files, tmp_path):
+        source = f"replay:{files}/taps.npz"
+        done = run("baseline", "--source", source, "--rate-hz", "1000", "--out", tmp_path / "zero.json")
+        assert_refused(done, 3, "ended before 100 complete scans")
+
+
+class TestDemo:
+    def test_the_demo_scores_its_taps_and_draws_the_last(self, files):
+        done = run(
+            "--source", "demo", "--model", files / "tiny.onnx", "--rate-hz", "300", env=os.environ | {"COLUMNS": "80"}
+        )
+        assert done.returncode == 0, done.stderr
+        assert "demo: an emulated sensor taps" in done.stderr and "EMULATED demo: 470 scans" in done.stderr
+        assert "4 of 4 taps scored" in done.stdout
+        rows = re.findall(r"^ +(\d) +(\d+) +(\d) +(-?[\d.]+) (-?[\d.]+) +([\d.]+) +(\d+)$", done.stdout, re.MULTILINE)
+        assert [(int(row[0]), int(row[2])) for row in rows] == [(n, n) for n in (1, 2, 3, 4)]
+        angles_deg = [int(row[1]) for row in rows]
+        assert np.diff(angles_deg).tolist() == [5, 5, 5]
+        assert re.search(r"^taxels, 4 x 4 +super-resolved, 40 x 40 +truth$", done.stdout, re.MULTILINE)
+        assert "\x1b" not in done.stdout and "@" in done.stdout
+
+    def test_with_records_on_stdout_the_score_goes_to_stderr(self, files):
+        done = run(
+            "--source", "demo", "--model", files / "tiny.onnx", "--rate-hz", "300", "--sink", "jsonl:-",
+        )  # fmt: skip
+        got = records(done.stdout)
+        assert len(got) == 470 and {record["source"] for record in got} == {"emulated"}
+        assert "4 of 4 taps scored" in done.stderr

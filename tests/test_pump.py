@@ -1,0 +1,200 @@
+import itertools
+import threading
+
+import pytest
+from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
+
+from edge.errors import SinkClosedError
+from edge.pump import ScanReader, pump
+from edge.runtime import Runtime
+from edge.statistics import Statistics
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.errors import LinkLostError
+
+BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
+
+
+def scans(numbers, sensor="4", press=3000):
+    return [make_scan(number, sensor=sensor, press_counts=press) for number in numbers]
+
+
+def run(link, *sinks, model=None, statistics=None, **settings):
+    runtime = settings.pop("runtime", None) or Runtime(model or FakeModel(), source=link.kind, baselines=BASELINES)
+    settings.setdefault("stop", threading.Event())
+    statistics = statistics or Statistics()
+    pump(link, runtime, sinks, statistics, **settings)
+    return statistics
+
+
+def numbers(sink, sensor="4"):
+    return [result.scan.number for result in sink.results if result.scan.sensor == sensor]
+
+
+def test_every_scan_gives_one_record_in_order_and_a_finite_source_ends_it():
+    sink = ListSink()
+    batches = [[scan] for scan in scans(range(50))]
+    run(FakeLink(batches), sink)
+    assert numbers(sink) == list(range(50))
+
+
+def test_reading_goes_on_beside_inference():
+    """The model waits until the link has been read again, which only another thread can do."""
+    read_again = threading.Event()
+    link = FakeLink([scans([0]), *[scans([n]) for n in range(1, 5)]])
+    inner = link.read
+
+    def read(timeout_s):
+        if link.reads >= 3:
+            read_again.set()
+        return inner(timeout_s)
+
+    link.read = read
+    seen = []
+    run(link, ListSink(), model=FakeModel(on_run=lambda: seen.append(read_again.wait(10))))
+    assert all(seen)
+    assert link.thread is not threading.current_thread()
+
+
+def slow_run(batch_while_busy, **settings):
+    """One scan occupies the model; all of `batch_while_busy` arrives meanwhile."""
+    busy, arrived = threading.Event(), threading.Event()
+    link = FakeLink([scans([0]), busy, *batch_while_busy])
+
+    def read(timeout_s, inner=link.read):
+        got = inner(timeout_s)
+        if link.ended:
+            arrived.set()
+        return got
+
+    link.read = read
+    sink = ListSink()
+    model = FakeModel(on_run=lambda: (busy.set(), arrived.wait(10)))
+    statistics = run(link, sink, model=model, **settings)
+    return sink, statistics, model
+
+
+def test_when_inference_falls_behind_the_newest_scan_wins_and_the_rest_is_counted():
+    sink, statistics, model = slow_run([scans([n]) for n in range(1, 8)])
+    assert numbers(sink) == list(range(8))
+    assert [result.state for result in sink.results] == ["contact"] + ["dropped"] * 6 + ["contact"]
+    assert statistics.dropped == 6 and statistics.overruns == 0 and len(model.windows) == 2
+    assert [counters["dropped"] for counters in sink.counters] == [0, 1, 2, 3, 4, 5, 6, 6]
+
+
+def test_each_sensor_keeps_its_newest():
+    mixed = [[*scans([n]), *scans([n], "6")] for n in range(1, 4)]
+    sink, statistics, _ = slow_run([*mixed, scans([4])])
+    states = {(r.scan.sensor, r.scan.number): r.state for r in sink.results}
+    assert states[("4", 4)] == states[("6", 3)] == "contact"
+    assert statistics.dropped == 5
+
+
+def test_a_full_queue_throws_away_the_oldest_and_counts_it():
+    sink, statistics, _ = slow_run([scans([n]) for n in range(1, 11)], capacity_scans=4)
+    assert numbers(sink) == [0, 7, 8, 9, 10]
+    assert statistics.overruns == 6
+    assert sink.counters[-1]["overruns"] == 6
+
+
+def test_a_lost_link_is_told_after_all_scans_before_it():
+    sink = ListSink()
+    statistics = Statistics()
+    link = FakeLink([scans([0, 1]), scans([2])], error=LinkLostError("gone"))
+    with pytest.raises(LinkLostError, match="gone"):
+        run(link, sink, statistics=statistics)
+    assert numbers(sink) == [0, 1, 2]
+    assert statistics.scans == 3
+
+
+def test_a_fault_in_the_reader_is_not_swallowed():
+    with pytest.raises(ZeroDivisionError):
+        run(FakeLink([], error=ZeroDivisionError()), ListSink())
+
+
+def test_stop_ends_an_endless_source():
+    stop = threading.Event()
+    sink = ListSink(on_write=lambda result: stop.set())
+    run(FakeLink([scans([0])], endless=True), sink, stop=stop)
+    assert numbers(sink) == [0]
+
+
+def test_duration_ends_an_endless_source():
+    ticks = itertools.count()
+    link = FakeLink([], endless=True)
+    run(link, ListSink(), duration_s=5.0, clock_s=lambda: float(next(ticks)))
+    assert next(ticks) == 6  # 0 was the start, 1 to 4 were within, 5 was over
+
+
+def test_the_reader_thread_is_over_when_the_pump_returns():
+    link = FakeLink([], endless=True)
+    run(link, ListSink(), duration_s=0.05)
+    reads = link.reads
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("scan-reader")]
+    assert link.reads == reads
+
+
+def test_sinks_hear_that_nothing_comes():
+    stop = threading.Event()
+    sink = ListSink()
+    wait = sink.wait
+    sink.wait = lambda: (wait(), stop.set())
+    run(FakeLink([], endless=True), sink, stop=stop)
+    assert sink.waits == 1 and sink.results == []
+
+
+def test_a_closed_sink_ends_it():
+    def refuse(result):
+        raise SinkClosedError("gone")
+
+    with pytest.raises(SinkClosedError):
+        run(FakeLink([scans([0])], endless=True), ListSink(on_write=refuse))
+
+
+def test_records_carry_the_links_counters_as_they_were():
+    sink = ListSink()
+    run(FakeLink([scans([0]), scans([1, 2])]), sink)
+    assert [counters["scans"] for counters in sink.counters] == [1, 3, 3]
+
+
+class Script:
+    """Commands that come before the given polls."""
+
+    def __init__(self, at) -> None:
+        self.refused = 3
+        self._at = at
+        self._polls = itertools.count()
+
+    def poll(self):
+        return ["reset"] if next(self._polls) in self._at else []
+
+
+def test_a_reset_command_resets_the_runtime():
+    resets = []
+    runtime = Runtime(FakeModel(), source="device", baselines=BASELINES)
+    runtime.reset = lambda: resets.append(1)
+    statistics = run(FakeLink([], endless=True), runtime=runtime, commands=Script({1, 2}), duration_s=0.5)
+    assert resets == [1, 1]
+    assert statistics.commands_refused == 3
+
+
+def test_reader_takes_all_that_waits_and_says_when_it_is_through():
+    with ScanReader(FakeLink([scans([0]), scans([1, 2])])) as reader:
+        taken = []
+        while (arrivals := reader.take(10)) is not None:
+            taken += [arrival.scan.number for arrival in arrivals]
+        assert taken == [0, 1, 2]
+        assert reader.take(0) is None
+
+
+def test_a_scan_wakes_who_waits_for_it():
+    gate = threading.Event()
+    link = FakeLink([gate, scans([0])], endless=True)
+    with ScanReader(link) as reader:
+        threading.Timer(0.1, gate.set).start()
+        assert reader.take(10) != []
+        assert link.reads < 100, "it slept through some thousand more reads"
+
+
+def test_reader_gives_nothing_after_the_timeout():
+    with ScanReader(FakeLink([], endless=True)) as reader:
+        assert reader.take(0.01) == []

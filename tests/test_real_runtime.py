@@ -1,0 +1,104 @@
+"""Real recordings through the whole road: emulated controller, pseudo-terminal, `edge-sr`, records."""
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from edge_samples import ROOT, write_model
+
+from firmware_bridge.baseline import Baseline, save_baselines
+from firmware_bridge.emulator import Emulator
+from firmware_bridge.recording import load_recording
+
+RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
+TRIALS = sorted(path.name for path in RECORDINGS.glob("data_sample_*")) if RECORDINGS.is_dir() else []
+RELEASED = "data_sample_2022-02-22-08-10-01"
+SENSORS = ("4", "6")
+BASELINE_ROWS = 20
+
+pytestmark = pytest.mark.skipif(not TRIALS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
+
+
+def counts_of(trial):
+    """Raw counts (n, 3, 4, 4) of both fingers."""
+    return [load_recording(RECORDINGS / trial / f"xela_sensor{n}.csv").tracks[0].counts for n in (1, 2)]
+
+
+def play(trial, folder):
+    """Records of `edge-sr` for one trial, both fingers at once at the recorded rate."""
+    baselines = [
+        Baseline.from_counts(sensor, counts[-BASELINE_ROWS:], created_unix_s=1.0)
+        for sensor, counts in zip(SENSORS, counts_of(trial), strict=True)
+    ]
+    save_baselines(folder / f"{trial}.json", baselines)
+    tracks = [load_recording(RECORDINGS / trial / f"xela_sensor{n}.csv") for n in (1, 2)]
+    with Emulator(tracks, controllers=[4, 6]) as emulator:
+        options = ["--model", folder / "tiny.onnx", "--baseline", folder / f"{trial}.json", "--sink", "jsonl:-"]
+        done = subprocess.run(
+            [sys.executable, "-m", "edge.cli", "--source", f"slcan:{emulator.port}", *map(str, options)],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        lost_frames = emulator.lost_frames
+    assert done.returncode == 3, done.stderr  # the emulator hangs up at the end, which is the cable out
+    records = [json.loads(line) for line in done.stdout.splitlines()]
+    return {sensor: [record for record in records if record["sensor"] == sensor] for sensor in SENSORS}, lost_frames
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("real")
+    write_model(folder / "tiny.onnx")
+    with ThreadPoolExecutor(len(TRIALS)) as pool:
+        return dict(zip(TRIALS, pool.map(lambda trial: play(trial, folder), TRIALS), strict=True))
+
+
+@pytest.mark.parametrize("trial", TRIALS)
+def test_one_record_for_every_row_none_lost_none_invented(played, trial):
+    records, lost_frames = played[trial]
+    assert lost_frames == 0, "this machine was too busy to read in time"
+    for sensor, counts in zip(SENSORS, counts_of(trial), strict=True):
+        mine = records[sensor]
+        assert [record["scan"] for record in mine] == list(range(len(counts)))
+        np.testing.assert_array_equal([record["counts"] for record in mine], counts)
+        assert {record["source"] for record in mine} == {"emulated"}
+        assert {record["fresh"] for record in mine} == {0xFFFF}
+
+
+@pytest.mark.parametrize("trial", TRIALS)
+def test_torn_and_repeated_rows_are_reported(played, trial):
+    records, _ = played[trial]
+    torn = repeated = 0
+    for sensor, counts in zip(SENSORS, counts_of(trial), strict=True):
+        changed = (np.diff(counts, axis=0) != 0).any(axis=1).reshape(len(counts) - 1, 16)
+        masks = [0xFFFF, *(int(sum(1 << int(taxel) for taxel in np.flatnonzero(row))) for row in changed)]
+        assert [record["renewed"] for record in records[sensor]] == masks
+        torn += sum(mask not in (0, 0xFFFF) for mask in masks)
+        repeated += masks.count(0)
+    last = max((mine[-1] for mine in records.values()), key=lambda record: record["counters"]["scans"])["counters"]
+    assert (last["torn_source"], last["repeated"], last["torn_wire"]) == (torn, repeated, 0)
+    assert torn > 0 and repeated > 0
+
+
+@pytest.mark.skipif(RELEASED not in TRIALS, reason=f"{RELEASED} is not there")
+def test_contact_is_seen_from_the_start_and_its_end_within_five_scans_of_the_release(played):
+    records, _ = played[RELEASED]
+    for sensor, counts in zip(SENSORS, counts_of(RELEASED), strict=True):
+        z_counts = (counts[:, 2] - np.median(counts[-BASELINE_ROWS:, 2], axis=0)).sum(axis=(1, 2))
+        # Released: the first row with less than half of the grip that the trial starts with.
+        release = int(np.argmax(z_counts < z_counts[0] / 2))
+        contact = [record["contact"] for record in records[sensor]]
+        end = contact.index(False)
+        assert 0 <= end - release <= 5
+        assert all(contact[:end]) and not any(contact[end:])
+        states = [record["state"] for record in records[sensor]]
+        assert set(states[:end]) <= {"contact", "dropped"} and set(states[end:]) == {"idle"}
+        assert all((record["pattern"] is None) == (record["state"] != "contact") for record in records[sensor])

@@ -1,0 +1,429 @@
+import contextlib
+import io
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, PERIOD_NS, ROOT, FakeModel, make_contract, make_scan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.errors import SinkClosedError, SinkError, UsageError
+from edge.runtime import Runtime
+from edge.sinks import npz
+from edge.sinks.forms import FORMS, open_sink
+from edge.sinks.jsonl import JsonLinesSink, record_line
+from edge.sinks.npz import NpzSink, gather, parts_dir
+from edge.sinks.status import StatusSink
+from firmware_bridge.recording import load_recording
+from firmware_bridge.scan import ABSENT
+
+SHAPES = ((3, 4, 4), (40, 40))
+RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
+
+
+def make_results(count=6, runtime=None, **settings):
+    """Idle and contact in turn, of two sensors, some torn; sensor 6 has no baseline and stays in zeroing."""
+    settings = {"source": "emulated", "baselines": {"4": BASELINE}, "unix_time_s": lambda: 1012.34} | settings
+    runtime = runtime or Runtime(FakeModel(), **settings)
+    results = []
+    for number in range(count):
+        for sensor in ("4", "6"):
+            absent = (3, 7) if number % 4 == 2 else ()
+            press = 3000 if number % 4 > 1 else 0
+            scan = make_scan(number, sensor=sensor, press_counts=press, absent=absent, noise=3)
+            results.append(runtime.push(scan))
+    return results
+
+
+class TestJsonLines:
+    def test_a_record_says_all_of_a_contact(self):
+        ticks = iter([0, 123_456])
+        runtime = Runtime(
+            FakeModel(),
+            source="emulated",
+            baselines={"4": BASELINE},
+            counts_per_newton=1200,
+            clock_ns=lambda: next(ticks),
+            unix_time_s=lambda: 1012.34,
+        )
+        result = runtime.push(make_scan(7, press_counts=3000, stale=(0, 15)))
+        record = json.loads(record_line(result, RUN))
+        pattern = record.pop("pattern")
+        assert np.shape(pattern) == (40, 40)
+        np.testing.assert_allclose(pattern, result.pattern, rtol=1e-5)
+        assert record.pop("counts") == result.scan.counts.tolist()
+        assert record.pop("centroid_mm") == pytest.approx([-2.35, -2.35])
+        assert record == {
+            "time_ns": 8 * PERIOD_NS,
+            "sensor": "4",
+            "scan": 7,
+            "source": "emulated",
+            "state": "contact",
+            "fresh": 0xFFFF,
+            "renewed": 0x7FFE,
+            "contact": True,
+            "taps_used": 1,
+            "force_counts": 3000.0,
+            "force_n": 2.5,
+            "area_mm2": 22.09,
+            "run_time_us": 123.5,
+            "baseline": BASELINE.id,
+            "baseline_origin": "file",
+            "baseline_age_s": 12.3,
+            "model": "fake",
+            "note": None,
+            "counters": RUN,
+            "pattern_unit": "mm",
+        }
+
+    def test_absent_is_null(self):
+        runtime = Runtime(FakeModel(), source="device")
+        record = json.loads(record_line(runtime.push(make_scan(absent=(2,))), {}))
+        for name in ("contact", "force_counts", "force_n", "area_mm2", "centroid_mm", "run_time_us", "pattern"):
+            assert record[name] is None
+        assert record["baseline"] is record["baseline_age_s"] is record["baseline_origin"] is None
+        assert record["state"] == "zeroing" and record["fresh"] == 0xFFFF - 4
+        assert [axis[0][2] for axis in record["counts"]] == [None] * 3
+        assert ABSENT not in np.array(record["counts"]).ravel().tolist()
+
+    @settings(max_examples=50, deadline=None)
+    @given(st.lists(st.floats(-(2.0**99), 2.0**99, width=32, allow_subnormal=False), min_size=4, max_size=4))
+    def test_patterns_keep_five_digits_and_are_json(self, values):
+        result = make_results(3)[4]
+        pattern = np.array(values, dtype=np.float32).reshape(2, 2)
+        object.__setattr__(result, "pattern", pattern)
+        line = record_line(result, {})
+        got = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))["pattern"]
+        assert got == [[float(f"{value:.5g}") for value in row] for row in pattern.tolist()]
+        assert line.endswith("}\n") and line.count("\n") == 1
+
+    def test_a_file_holds_a_record_a_line_there_as_soon_as_written(self, tmp_path):
+        path = tmp_path / "out.jsonl"
+        path.write_text("old\n")
+        sink = JsonLinesSink(str(path))
+        results = make_results()
+        for count, result in enumerate(results, 1):
+            sink.write(result, RUN)
+            assert len(path.read_text().splitlines()) == count
+        sink.close()
+        assert [json.loads(line)["scan"] for line in path.read_text().splitlines()] == [r.scan.number for r in results]
+
+    def test_what_cannot_be_opened_is_told(self, tmp_path):
+        with pytest.raises(SinkError, match=r"none/out.jsonl: No such file"):
+            JsonLinesSink(str(tmp_path / "none" / "out.jsonl"))
+
+    def test_a_full_disk_is_told_and_closing_stays_quiet(self):
+        sink = JsonLinesSink("/dev/full")
+        with pytest.raises(SinkError, match="/dev/full: No space left") as raised:
+            sink.write(make_results(1)[0], {})
+        assert not isinstance(raised.value, SinkClosedError)
+        sink.close()
+
+    def test_a_reader_that_has_gone_is_an_ordinary_end(self, tmp_path):
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+        sink = JsonLinesSink(str(fifo))
+        sink.write(make_results(1)[0], {})
+        os.close(reader)
+        with pytest.raises(SinkClosedError, match="has gone"):
+            sink.write(make_results(1)[0], {})
+        sink.close()
+
+
+class TestNpz:
+    def record(self, path, results):
+        sink = NpzSink(path, *SHAPES)
+        for result in results:
+            sink.write(result, {})
+        sink.close()
+
+    def test_what_replay_reads_back_is_the_same_scans(self, tmp_path):
+        path = tmp_path / "out.npz"
+        results = make_results()
+        self.record(path, results)
+        tracks = load_recording(path).tracks
+        assert [track.sensor for track in tracks] == ["4", "6"]
+        for track in tracks:
+            mine = [result.scan for result in results if result.scan.sensor == track.sensor]
+            np.testing.assert_array_equal(track.counts, np.stack([scan.counts for scan in mine]))
+            assert track.time_ns is not None and track.time_ns.tolist() == [scan.time_ns for scan in mine]
+        assert not parts_dir(path).exists() and list(tmp_path.iterdir()) == [path]
+
+    def test_every_array_holds_its_row(self, tmp_path):
+        results = make_results(counts_per_newton=5)
+        self.record(tmp_path / "out.npz", results)
+        data = dict(np.load(tmp_path / "out.npz"))
+        assert str(data.pop("format")) == "tactile-recording" and int(data.pop("version")) == 1
+        assert {len(column) for column in data.values()} == {len(results)}
+        for i, result in enumerate(results):
+            row = {name: column[i] for name, column in data.items()}
+            assert row["scan"] == result.scan.number and row["sensor"] == result.scan.sensor
+            assert row["source"] == "emulated" and row["state"] == result.state
+            assert row["contact"] == {None: -1, False: 0, True: 1}[result.contact]
+            assert row["taps_used"] == result.taps_used
+            assert row["has_pattern"] == (result.pattern is not None)
+            np.testing.assert_array_equal(row["pattern"], 0 if result.pattern is None else result.pattern)
+            for name in ("force_counts", "run_time_us"):
+                value = getattr(result, name)
+                assert np.isnan(row[name]) if value is None else row[name] == np.float32(value)
+            assert row["baseline"] == ("" if result.baseline is None else result.baseline.id)
+            counts = np.nan if result.baseline is None else result.baseline.counts
+            np.testing.assert_array_equal(row["baseline_counts"], counts)
+        assert {"contact", "idle", "zeroing"} <= set(data["state"].tolist())
+
+    def test_nothing_is_at_the_target_before_the_end_and_an_old_one_is_replaced(self, tmp_path):
+        path = tmp_path / "out.npz"
+        path.write_bytes(b"old")
+        sink = NpzSink(path, *SHAPES)
+        sink.write(make_results(1)[0], {})
+        assert path.read_bytes() == b"old"
+        sink.close()
+        assert len(load_recording(path).tracks[0].counts) == 1
+
+    def test_without_a_scan_nothing_is_written(self, tmp_path):
+        path = tmp_path / "out.npz"
+        path.write_bytes(b"old")
+        NpzSink(path, *SHAPES).close()
+        assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+    def test_memory_stays_flat(self, tmp_path):
+        """No row is kept: the sink's own arrays are all there is, and the rest lies on disk."""
+        sink = NpzSink(tmp_path / "out.npz", *SHAPES)
+        result = make_results(3)[4]
+        for _ in range(npz.FLUSH_SCANS):
+            sink.write(result, {})
+        size = (parts_dir(tmp_path / "out.npz") / "pattern").stat().st_size
+        assert size == npz.FLUSH_SCANS * 40 * 40 * 4
+        sink.close()
+
+    def test_after_a_crash_the_parts_make_the_npz(self, tmp_path):
+        path = tmp_path / "out.npz"
+        results = make_results()
+        script = (
+            "import os, sys; sys.path.insert(0, 'tests'); from test_sinks import *\n"
+            "sink = NpzSink(Path(sys.argv[1]), *SHAPES)\n"
+            "for result in make_results(): sink.write(result, {})\n"
+            "sink._flush(); sink.write(make_results(1)[0], {}); os.kill(os.getpid(), 9)"
+        )
+        done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=ROOT, timeout=60)
+        assert done.returncode == -signal.SIGKILL and not path.exists()
+        with (parts_dir(path) / "scan").open("ab") as part:
+            part.write(b"\1" * 13)  # a row and a half that the other parts do not have
+        with pytest.raises(SinkError, match=r"not finished: `python -m edge.sinks.npz .*out.npz` makes the .npz"):
+            NpzSink(path, *SHAPES)
+        done = subprocess.run(
+            [sys.executable, "-m", "edge.sinks.npz", str(path)], cwd=ROOT, capture_output=True, text=True, timeout=60
+        )
+        assert (done.returncode, done.stdout) == (0, f"{path}: {len(results)} scans\n")
+        counts = np.stack([result.scan.counts for result in results])
+        np.testing.assert_array_equal(np.load(path)["counts"], counts)
+        assert len(zipfile.ZipFile(path).read("scan.npy")) == 128 + 8 * len(results), "nothing hangs on behind"
+        assert not parts_dir(path).exists()
+
+    def test_gathering_what_is_not_there_is_told(self, tmp_path, capsys):
+        assert npz.main([str(tmp_path / "none.npz")]) == 1
+        assert "none.npz.parts: No such file" in capsys.readouterr().err
+        assert npz.main([]) == 2
+        NpzSink(tmp_path / "empty.npz", *SHAPES)
+        with pytest.raises(SinkError, match=r"^\S+/empty.npz.parts holds no scan: delete it$"):
+            gather(tmp_path / "empty.npz")
+        (parts_dir(tmp_path / "empty.npz") / npz.LAYOUT).write_text("{")
+        with pytest.raises(SinkError, match=r"layout.json cannot be read"):
+            gather(tmp_path / "empty.npz")
+
+    def test_what_cannot_be_recorded_into_is_told_at_the_start(self, tmp_path):
+        with pytest.raises(SinkError, match="is a directory"):
+            NpzSink(tmp_path, *SHAPES)
+        with pytest.raises(SinkError, match=r"No such file"):
+            NpzSink(tmp_path / "none" / "out.npz", *SHAPES)
+
+    def test_wrong_rows_are_refused_rather_than_shifting_the_array(self, tmp_path):
+        sink = NpzSink(tmp_path / "out.npz", (3, 4, 4), (20, 20))
+        with pytest.raises(SinkError, match=r"pattern has shape \(40, 40\), expected \(20, 20\)"):
+            sink.write(make_results(3)[4], {})
+        sink = NpzSink(tmp_path / "long.npz", *SHAPES)
+        runtime = Runtime(FakeModel(), source="device")
+        with pytest.raises(SinkError, match="too long"):
+            sink.write(runtime.push(make_scan(sensor="x" * 65)), {})
+
+    @pytest.mark.parametrize("when", ["writing", "gathering"])
+    def test_a_full_disk_keeps_the_parts_and_says_so(self, tmp_path, when):
+        """The limit on a file's size stands for the disk's end."""
+        path = tmp_path / "out.npz"
+        sink = NpzSink(path, *SHAPES)
+        result = make_results(3)[4]
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        try:
+            if when == "writing":
+                resource.setrlimit(resource.RLIMIT_FSIZE, (20 * 6400, limits[1]))
+            with pytest.raises(SinkError, match=r"File too large.*python -m edge.sinks.npz"):
+                for _ in range(50):
+                    sink.write(result, {})
+                    sink._flush()
+                resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+                sink.close()
+            sink.close() if when == "writing" else None
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert list(tmp_path.iterdir()) == [parts_dir(path)]
+        assert gather(path) == (20 if when == "writing" else 50)
+        assert zipfile.ZipFile(path).testzip() is None
+
+    def test_rows_reach_the_disk_in_time_and_what_fails_fails_once(self, tmp_path):
+        sink = NpzSink(tmp_path / "out.npz", *SHAPES)
+        sink._files["scan"].close()
+        sink._files["scan"] = io.BufferedWriter(io.FileIO("/dev/full", "w"))
+        result = make_results(1)[0]
+        for _ in range(npz.FLUSH_SCANS - 1):
+            sink.write(result, {})
+        with pytest.raises(SinkError, match="No space left"):
+            sink.write(result, {})
+        sink.close()
+        assert parts_dir(tmp_path / "out.npz").exists()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+class TestStatus:
+    def make(self, columns=200, **settings):
+        self.now_s = 0.0
+        self.stream = Terminal()
+        return StatusSink(self.stream, clock_s=lambda: self.now_s, columns=lambda: columns, **settings)
+
+    def shown(self):
+        return [line.removesuffix("\x1b[K") for line in self.stream.getvalue().split("\r")[1:]]
+
+    def test_the_line_says_source_state_taps_force_area_time_rate_and_losses(self):
+        sink = self.make()
+        ticks = iter(range(0, 10**9, 250_000))
+        for result in make_results(4, clock_ns=lambda: next(ticks)):
+            sink.write(result, RUN)
+        assert sink.line() == (
+            "EMULATED | 4 contact tap 1 3002 counts 22 mm2 250 us 100 Hz"
+            " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overrun | 7 torn"
+        )
+
+    def test_newtons_where_calibrated_and_no_source_for_a_device(self):
+        sink = self.make()
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, counts_per_newton=1000)
+        sink.write(runtime.push(make_scan(0, press_counts=3000)), {})
+        assert sink.line().startswith("4 contact tap 1 3.00 N 22 mm2 ")
+
+    def test_a_note_while_zeroing_is_shown(self):
+        sink = self.make()
+        runtime = Runtime(FakeModel(), source="replay", baselines={"9": BASELINE})
+        sink.write(runtime.push(make_scan()), {})
+        assert sink.line() == "REPLAY | 4 no stored baseline for sensor 4, only for 9: zeroing"
+
+    def test_it_is_rewritten_at_most_ten_times_a_second(self):
+        sink = self.make()
+        result = make_results(1)[0]
+        for _ in range(101):
+            sink.write(result, {})
+            self.now_s += 1 / 64
+        assert len(self.shown()) == 1 + 100 // 7  # every 7/64 s
+
+    def test_the_rate_follows_the_sensor(self):
+        sink = self.make()
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        time_ns = 0
+        for period_ns, rate in ((10_000_000, "100 Hz"), (20_000_000, "50 Hz"), (0, "50 Hz"), (-5_000_000, "50 Hz")):
+            for _ in range(200):
+                time_ns += period_ns
+                sink.write(runtime.push(make_scan(time_ns=time_ns)), {})
+            assert sink.line().endswith(f" {rate}")
+        sink.write(runtime.push(make_scan(time_ns=time_ns + 10_000_000)), {})
+        sink.write(runtime.push(make_scan(time_ns=time_ns + 20_000_000)), {})
+        assert sink.line().endswith(" 53 Hz"), "a single scan moves it little"
+
+    def test_silence_is_shown(self):
+        sink = self.make()
+        sink.wait()
+        assert self.shown()[-1] == "no scan for 0 s"
+        sink.write(make_results(1)[0], {})
+        self.now_s = 0.99
+        sink.wait()
+        assert "no scan" not in self.shown()[-1]
+        self.now_s = 3.2
+        sink.wait()
+        assert self.shown()[-1].startswith("EMULATED | no scan for 3 s | 4 idle")
+
+    @pytest.mark.parametrize("columns", [1, 2, 10, 40, 80])
+    def test_it_never_wraps(self, columns):
+        sink = self.make(columns)
+        for result in make_results(8):
+            sink.write(result, RUN)
+            self.now_s += 1
+        assert max(len(line) for line in self.shown()) == columns - 1
+
+    def test_the_last_line_stands_at_the_end(self):
+        sink = self.make()
+        first, last = make_results(1)
+        sink.write(first, {})
+        sink.write(last, {})
+        sink.close()
+        assert "| 6 no stored" in self.stream.getvalue().rsplit("\r", 1)[1]
+        assert self.stream.getvalue().endswith("\n")
+
+    def test_a_window_that_was_closed_ends_nothing(self):
+        self.now_s = 0.0
+        leader, follower = os.openpty()
+        stream = os.fdopen(follower, "w")
+        sink = StatusSink(stream, clock_s=lambda: self.now_s, columns=lambda: 80)
+        sink.write(make_results(1)[0], {})
+        os.close(leader)
+        self.now_s = 1.0
+        sink.write(make_results(1)[0], {})
+        sink.close()
+        with contextlib.suppress(OSError):  # it still has what nobody took
+            stream.close()
+
+    def test_nothing_where_there_is_no_terminal(self):
+        stream = io.StringIO()
+        sink = StatusSink(stream)
+        sink.write(make_results(1)[0], {})
+        sink.wait()
+        sink.close()
+        assert stream.getvalue() == ""
+
+
+def test_forms_open_their_sinks(tmp_path):
+    contract = make_contract()
+    for text, kind in (
+        ("status", StatusSink),
+        (f"jsonl:{tmp_path}/a", JsonLinesSink),
+        (f"npz:{tmp_path}/a.npz", NpzSink),
+    ):
+        sink = open_sink(text, contract)
+        assert type(sink) is kind
+        sink.close()
+
+
+def test_the_npz_sink_gets_the_shapes_of_the_contract(tmp_path):
+    sink = open_sink(f"npz:{tmp_path}/a.npz", make_contract(scale=2))
+    layout = json.loads((parts_dir(tmp_path / "a.npz") / npz.LAYOUT).read_text())
+    assert layout["pattern"][1] == [8, 8] and layout["counts"][1] == [3, 4, 4]
+    sink.close()
+
+
+@pytest.mark.parametrize("text", ["", "jsonl", "jsonl:", "npz:", "npz:a", "csv:a", "status:x", "out.jsonl", "JSONL:a"])
+def test_other_forms_are_refused_listing_those_there_are(text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError) as refused:
+        open_sink(text, make_contract())
+    assert repr(text) in str(refused.value)
+    for form in FORMS:
+        assert form in str(refused.value)
+    assert list(Path().iterdir()) == []

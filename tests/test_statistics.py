@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+from edge_samples import make_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.result import Result
+from edge.statistics import Histogram, Statistics
+
+
+def result(scan, state="idle", run_time_us=None):
+    return Result(scan, "device", "m", state, run_time_us=run_time_us)
+
+
+@given(st.lists(st.floats(1, 1e7), min_size=1, max_size=200), st.floats(0.01, 1))
+def test_quantiles_are_at_most_one_bucket_too_high(values, share):
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    exact = float(np.quantile(values, share, method="inverted_cdf"))
+    got = histogram.quantile(share)
+    assert got is not None
+    assert exact * (1 - 1e-9) <= got <= exact * 1.0219
+    assert got <= histogram.max == max(values)
+
+
+def test_extreme_values_stay_within_the_histogram():
+    histogram = Histogram()
+    size = len(histogram._buckets)
+    for value in (0.0, 1e-9, 1e30):
+        histogram.add(value)
+    assert histogram.count == 3 and histogram.max == 1e30 and len(histogram._buckets) == size
+    assert histogram.quantile(0.5) == 1.0
+
+
+def test_no_values_have_no_quantile():
+    assert Histogram().quantile(0.5) is None
+
+
+def test_counts_what_happened():
+    statistics = Statistics()
+    statistics.add(result(make_scan(0), "contact", 200.0))
+    statistics.add(result(make_scan(1), "dropped"))
+    statistics.add(result(make_scan(2, absent=(1, 2))))
+    statistics.add(result(make_scan(3, stale=(1,))))
+    statistics.add(result(make_scan(4, stale=tuple(range(16)))))
+    statistics.add(result(make_scan(5, absent=(0,), stale=tuple(range(16)))))
+    got = {name: getattr(statistics, name) for name in ("scans", "patterns", "dropped")}
+    assert got == {"scans": 6, "patterns": 1, "dropped": 1}
+    assert (statistics.torn_wire, statistics.torn_source, statistics.repeated) == (2, 1, 1)
+
+
+def test_rate_is_held_per_sensor_over_the_whole_run():
+    statistics = Statistics()
+    for number in range(11):
+        statistics.add(result(make_scan(number, time_ns=number * 10_000_000)))
+        statistics.add(result(make_scan(number, sensor="6", time_ns=number * 20_000_000)))
+    statistics.add(result(make_scan(0, sensor="7")))
+    assert statistics.rate_hz() == pytest.approx({"4": 100.0, "6": 50.0})
+
+
+def test_summary_tells_all_of_it():
+    statistics = Statistics()
+    for number in range(3):
+        statistics.add(result(make_scan(number, absent=(0,)), "contact", 200.0))
+    statistics.overruns = 7
+    statistics.commands_refused = 2
+    text = statistics.summary(source="EMULATED demo", wanted_rate_hz=100)
+    assert text.splitlines() == [
+        "EMULATED demo: 3 scans, 3 patterns, 0 dropped, 7 overrun",
+        "torn: 3 on the wire, 0 at the source; 0 repeated",
+        "run time: p50 200 us, p99 200 us, max 200 us",
+        "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
+        "stdin: 2 lines were no command",
+    ]
+
+
+def test_summary_of_nothing():
+    assert Statistics().summary(source="x").splitlines() == [
+        "x: 0 scans, 0 patterns, 0 dropped, 0 overrun",
+        "torn: 0 on the wire, 0 at the source; 0 repeated",
+    ]
