@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, TextIO
 
 from edge.bundle import bundled_models, demo_recording, find_model
 from edge.errors import EdgeError, ModelError, SinkClosedError, SinkError
-from edge.options import EXIT_USAGE, baseline_parser, models_parser, run_parser
+from edge.options import EXIT_USAGE, baseline_parser, bench_parser, models_parser, run_parser
 from firmware_bridge.errors import BaselineRefusedError, BridgeError, DeviceError
 from firmware_bridge.links.base import Link
 
@@ -169,7 +169,21 @@ def _baseline(arguments: Sequence[str]) -> int:
     return 0
 
 
-COMMANDS: Final = {"models": _models, "baseline": _baseline}
+def _bench(arguments: Sequence[str]) -> int:
+    options = bench_parser().parse_args(arguments)
+    from edge.bench import bench, header, surface_table, table_line
+
+    rows = []
+    print(header(options.rate_hz, options.ticks), flush=True)
+    for row in bench(bundled_models(), options.rate_hz, options.ticks):
+        rows.append(row)
+        print(table_line(row), flush=True)
+    if options.by_surface:
+        print(f"\n{surface_table(rows)}")
+    return 0
+
+
+COMMANDS: Final = {"models": _models, "baseline": _baseline, "bench": _bench}
 
 
 def _open_source(text: str | None, rate_hz: float | None) -> Link:

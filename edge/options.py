@@ -33,6 +33,7 @@ object.
 other commands:
   edge-sr models    bundled models
   edge-sr baseline  zero, and keep it
+  edge-sr bench     error and run time
 
 examples:
   edge-sr --source demo
@@ -53,6 +54,13 @@ example:
 """
 
 
+BENCH_HELP: Final = """\
+One inference at each tick, the processor
+idle between, as on a robot. Nothing else
+should run meanwhile.
+"""
+
+
 class Parser(argparse.ArgumentParser):
     """Reports wrong usage in one line."""
 
@@ -68,7 +76,7 @@ def run_parser() -> argparse.ArgumentParser:
     """Options of `edge-sr`."""
     parser = Parser(
         prog="edge-sr",
-        usage="edge-sr [options]\n       edge-sr models\n       edge-sr baseline --out FILE",
+        usage="edge-sr [options]\n       edge-sr models\n       edge-sr baseline --out FILE\n       edge-sr bench",
         description="Reads tactile scans and\nsuper-resolves them at sensor rate.",
         epilog=RUN_HELP,
     )
@@ -115,6 +123,19 @@ def baseline_parser() -> argparse.ArgumentParser:
     scans_help = f"scans to use (default and least {FEWEST_SCANS})"
     parser.add_argument("--scans", metavar="N", type=_whole(FEWEST_SCANS), default=FEWEST_SCANS, help=scans_help)
     parser.add_argument("--skip", metavar="N", type=_whole(0), default=0, help="scans to leave out first (default 0)")
+    return parser
+
+
+def bench_parser() -> argparse.ArgumentParser:
+    """Options of `edge-sr bench`."""
+    parser = Parser(
+        prog="edge-sr bench",
+        description="Error against run time of the bundled\nmodels and of methods without a network.",
+        epilog=BENCH_HELP,
+    )
+    parser.add_argument("--rate-hz", metavar="R", type=_positive, default=100.0, help="pace (default 100)")
+    parser.add_argument("--ticks", metavar="N", type=_whole(10), default=1000, help="runs a row (default 1000)")
+    parser.add_argument("--by-surface", action="store_true", help="a second table: PSNR of each surface")
     return parser
 
 

@@ -90,8 +90,8 @@ class TrainingConfig:
     chains: tuple[tuple[Stage, ...], ...] = (
         (Stage(taps=4, steps=9000, learning_rate=2e-3, given=(0.25, 0.15, 0.1, 0.5)),),
         (
-            Stage(taps=2, steps=6000, learning_rate=2e-3, given=(0.4, 0.6)),
-            Stage(taps=1, steps=3000, learning_rate=1e-3, given=(1.0,)),
+            Stage(taps=2, steps=7500, learning_rate=2e-3, given=(0.4, 0.6)),
+            Stage(taps=1, steps=2500, learning_rate=1e-3, given=(1.0,)),
         ),
     )
 
