@@ -1,5 +1,6 @@
 """`edge-sr`: taxel scans in, super-resolved patterns out."""
 
+import argparse
 import contextlib
 import os
 import shutil
@@ -14,6 +15,7 @@ from edge.errors import EdgeError, ModelError, SinkClosedError, SinkError
 from edge.options import EXIT_USAGE, baseline_parser, bench_parser, models_parser, run_parser
 from firmware_bridge.errors import BaselineRefusedError, BridgeError, DeviceError
 from firmware_bridge.links.base import Link
+from firmware_bridge.xela import ID_MAPS
 
 if TYPE_CHECKING:
     from edge.demo import DemoScore
@@ -68,7 +70,7 @@ def _run(arguments: Sequence[str]) -> int:
 
     stdout_taken = "jsonl:-" in options.sink
     with _stop_on_signals() as stop:
-        link = _open_source(options.source, options.rate_hz)
+        link = _open_source(options)
         baselines = load_baselines(options.baseline) if options.baseline else None
         model = ModelSession(find_model(options.model))
         score = DemoScore(demo_recording(), model.contract) if options.source == "demo" else None
@@ -159,7 +161,7 @@ def _baseline(arguments: Sequence[str]) -> int:
     from edge.zeroing import take_baselines
     from firmware_bridge.baseline import save_baselines
 
-    with _stop_on_signals() as stop, _open_source(options.source, options.rate_hz) as link:
+    with _stop_on_signals() as stop, _open_source(options) as link:
         kind = link.kind
         baselines = take_baselines(link, scans=options.scans, skip=options.skip, stop=stop)
     save_baselines(options.out, baselines.values())
@@ -186,10 +188,11 @@ def _bench(arguments: Sequence[str]) -> int:
 COMMANDS: Final = {"models": _models, "baseline": _baseline, "bench": _bench}
 
 
-def _open_source(text: str | None, rate_hz: float | None) -> Link:
+def _open_source(options: argparse.Namespace) -> Link:
     from firmware_bridge.links.source import open_source
 
-    return open_source(text, rate_hz, demo_recording() if text == "demo" else None)
+    recording = demo_recording() if options.source == "demo" else None
+    return open_source(options.source, options.rate_hz, recording, ID_MAPS[options.id_map])
 
 
 @contextlib.contextmanager

@@ -135,7 +135,8 @@ def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64], palette: Pal
 def colours(shares: NDArray[np.floating]) -> NDArray[np.float64]:
     """Colours (..., 3), red, green and blue in 0..255, of shares (...) in 0..1."""
     positions = np.linspace(0, 1, len(STOPS))
-    return np.stack([np.interp(shares, positions, STOPS[:, channel]) for channel in range(3)], axis=-1)
+    channels = [np.interp(shares, positions, STOPS[:, channel]) for channel in range(3)]
+    return np.stack(channels, axis=-1).astype(np.float64)
 
 
 def _colour_codes(shares: NDArray[np.float64], palette: Palette) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any, Final, NoReturn
 from edge.bundle import DEFAULT_MODEL
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
 from firmware_bridge.baseline import FEWEST_SCANS
+from firmware_bridge.xela import ID_MAPS, USPA44_MAP
 
 EXIT_USAGE: Final = 2
 
@@ -55,9 +56,9 @@ example:
 
 
 BENCH_HELP: Final = """\
-One inference at each tick, the processor
-idle between, as on a robot. Nothing else
-should run meanwhile.
+One inference a tick, idle in between,
+as on a robot. Nothing else should run
+meanwhile.
 """
 
 
@@ -130,7 +131,7 @@ def bench_parser() -> argparse.ArgumentParser:
     """Options of `edge-sr bench`."""
     parser = Parser(
         prog="edge-sr bench",
-        description="Error against run time of the bundled\nmodels and of methods without a network.",
+        description="Error against run time of the\nbundled models and of methods without a\nnetwork.",
         epilog=BENCH_HELP,
     )
     parser.add_argument("--rate-hz", metavar="R", type=_positive, default=100.0, help="pace (default 100)")
@@ -146,6 +147,13 @@ def models_parser() -> argparse.ArgumentParser:
 
 def _add_source(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--source", metavar="SRC", help="where scans come from (default: looks for an adapter)")
+    parser.add_argument(
+        "--id-map",
+        metavar="MAP",
+        choices=ID_MAPS,
+        default=USPA44_MAP.name,
+        help=f"which CAN id is which taxel: {', '.join(ID_MAPS)}; A and B are boards before 2021 (default uSPa44)",
+    )
     parser.add_argument(
         "--rate-hz",
         metavar="R",

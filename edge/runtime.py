@@ -21,6 +21,8 @@ from firmware_bridge.scan import Scan
 
 HOLD_SCANS: Final = 5
 """A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
+SILENT_SCANS: Final = 50
+"""A taxel not heard for so long is not lost for a moment: the user is told."""
 
 
 class Model(Protocol):
@@ -109,8 +111,8 @@ class Runtime:
         if sensor.baseline is None:
             sensor.zero(scan)
 
-        unit = self._model.contract.output_unit
-        result = Result(scan, self._source, self._model.name, "zeroing", pattern_unit=unit, note=sensor.note)
+        unit, note = self._model.contract.output_unit, sensor.silence() or sensor.note
+        result = Result(scan, self._source, self._model.name, "zeroing", pattern_unit=unit, note=note)
         if sensor.baseline is None:
             return result
         age_s = sensor.baseline.age_s(self._unix_time_s())
@@ -175,13 +177,23 @@ class _Sensor:
         self._estimator = BaselineEstimator()
         self._held = np.zeros(geometry.scan_shape, dtype=np.int32)
         self._age_scans = np.full((geometry.rows, geometry.cols), HOLD_SCANS + 1)
+        self._oldest_scans = 0
 
     def hold(self, scan: Scan) -> NDArray[np.int32] | None:
         """The newest reading of every taxel, or None if one is too old or was never heard."""
         np.copyto(self._held, scan.counts, where=scan.fresh)
         self._age_scans += 1
         self._age_scans[scan.fresh] = 0
-        return self._held if int(self._age_scans.max()) <= HOLD_SCANS else None
+        self._oldest_scans = int(self._age_scans.max())
+        return self._held if self._oldest_scans <= HOLD_SCANS else None
+
+    def silence(self) -> str | None:
+        """What to tell of taxels that are not heard; None while all are."""
+        if self._oldest_scans < SILENT_SCANS:
+            return None
+        silent = np.flatnonzero(self._age_scans >= SILENT_SCANS)
+        remedy = "try another --id-map" if 2 * silent.size == self._age_scans.size else "it may be broken"
+        return f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}"
 
     def zero(self, scan: Scan) -> None:
         """Use the scan for the baseline; a refusal becomes the note, and zeroing starts over."""

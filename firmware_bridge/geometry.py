@@ -35,7 +35,7 @@ class SensorGeometry:
         x_mm = (np.arange(self.cols) - (self.cols - 1) / 2) * self.pitch_mm
         y_mm = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch_mm
         grid_x_mm, grid_y_mm = np.meshgrid(x_mm, y_mm)
-        return np.stack([grid_x_mm.ravel(), grid_y_mm.ravel()], axis=1)
+        return np.stack([grid_x_mm.ravel(), grid_y_mm.ravel()], axis=1).astype(np.float64)
 
     def pixel_pitch_mm(self, scale: int) -> float:
         """Distance of neighbouring pixels of a pattern at x`scale`, in [mm]."""

@@ -163,7 +163,7 @@ def _refuse(path: Path, line: int, got: str, expected: str) -> NoReturn:
 def _load_npz(path: Path) -> Recording:
     arrays = _npz_arrays(path)
     form, version = arrays["format"], arrays["version"]
-    if form.shape or str(form) != NPZ_FORMAT:
+    if str(form) != NPZ_FORMAT:
         _refuse_array(path, "format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
     if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
         _refuse_array(path, "version", str(version)[:40], f"{NPZ_VERSION}")

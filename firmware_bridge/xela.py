@@ -20,6 +20,7 @@ from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.slcan import CanFrame
 
 PAYLOAD_BYTES: Final = 8
+BOARDS: Final = range(1, 8)
 _unpack_xyz = struct.Struct(">HHH").unpack_from
 
 
@@ -62,9 +63,14 @@ def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
     return Reading(*place, *_unpack_xyz(frame.data, 1))
 
 
+def trigger_frames(model: ModelMap) -> list[CanFrame]:
+    """What wakes every board that a model's ids can name; each hears its own frame alone."""
+    return [trigger_frame(board) for board in BOARDS] if model.triggered else []
+
+
 def trigger_frame(board: int) -> CanFrame:
     """The frame that starts a controller of layout A or B; `board` is 1..7."""
-    if not 1 <= board <= 7:
+    if board not in BOARDS:
         raise ValueError(f"board is {board}, expected 1..7")
     return CanFrame(0x200 | board, bytes((0x07, 0x00)))
 
@@ -91,14 +97,17 @@ def _layout_c_xr1944() -> dict[int, tuple[str, int]]:
 
 
 def _layout_a() -> dict[int, tuple[str, int]]:
-    return {0x700 | board << 4 | taxel: (str(board), taxel) for board in range(1, 8) for taxel in range(16)}
+    return {0x700 | board << 4 | taxel: (str(board), taxel) for board in BOARDS for taxel in range(16)}
 
 
 def _layout_b() -> dict[int, tuple[str, int]]:
-    return {board << 8 | n: (f"{board}{'ab'[n // 16]}", n % 16) for board in range(1, 8) for n in range(32)}
+    return {board << 8 | n: (f"{board}{'ab'[n // 16]}", n % 16) for board in BOARDS for n in range(32)}
 
 
 USPA44_MAP: Final = ModelMap("uSPa44", USPA44, MappingProxyType(_layout_c_uspa44()))
 XR1944_MAP: Final = ModelMap("XR1944", USPA44, MappingProxyType(_layout_c_xr1944()))
 LAYOUT_A_MAP: Final = ModelMap("layout A", USPA44, MappingProxyType(_layout_a()), triggered=True)
 LAYOUT_B_MAP: Final = ModelMap("layout B", USPA44, MappingProxyType(_layout_b()), triggered=True)
+
+ID_MAPS: Final = {"uSPa44": USPA44_MAP, "XR1944": XR1944_MAP, "A": LAYOUT_A_MAP, "B": LAYOUT_B_MAP}
+"""The maps by the name a user gives."""

@@ -82,7 +82,7 @@ def assert_refused(done, code, *words):
 
 
 class TestHelp:
-    @pytest.mark.parametrize("command", [[], ["models"], ["baseline"]])
+    @pytest.mark.parametrize("command", [[], ["models"], ["baseline"], ["bench"]])
     def test_help_fits_40_columns(self, command):
         done = run(*command, "--help", env=os.environ | {"COLUMNS": "40"})
         assert done.returncode == 0 and done.stderr == ""

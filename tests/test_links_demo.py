@@ -51,10 +51,13 @@ def test_the_demo_plays_through_and_ends(recording):
 
 
 def test_leaving_early_ends_the_emulator(recording):
-    with DemoLink(recording, rate_hz=50) as link:
-        read_scans(link, 3)
+    open_before = len(list(Path("/proc/self/fd").iterdir()))
+    with DemoLink(recording, rate_hz=2) as link:  # fifteen seconds, if it were left to play on
+        read_scans(link, 1)
         assert len(processes_playing(recording)) == 1
-        process = link._process
+        process, serial_link = link._process, link._link
+    assert serial_link is not None and serial_link._serial is None
+    assert len(list(Path("/proc/self/fd").iterdir())) == open_before
     assert process is not None and process.returncode == 0  # by itself: nobody had to kill it
     assert processes_playing(recording) == []
 

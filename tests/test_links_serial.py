@@ -162,6 +162,19 @@ def test_the_cable_out_is_told_at_once_and_every_time():
             link.read(10.0)
 
 
+def test_what_came_before_the_loss_is_not_lost(monkeypatch):
+    """The last byte may come alone, and the cable go before the next look: it may close a scan."""
+
+    def gone(port):
+        raise OSError(errno.EIO, "Input/output error")
+
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        monkeypatch.setattr(serial.Serial, "in_waiting", property(gone))
+        os.write(device.device_fd, b"\r")
+        assert link.read(5.0) == []
+        assert link.counters()["received_bytes"] == link.counters()["replies"] == 1
+
+
 def test_reading_where_nothing_comes():
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         assert link.read(0.0) == []
@@ -333,6 +346,25 @@ def test_an_adapter_that_goes_while_it_is_opened(monkeypatch):
             return port
 
         monkeypatch.setattr(link, "_open_port", open_and_pull)
+        with pytest.raises(DeviceError):
+            link.__enter__()
+
+
+def test_terminal_errors_are_link_errors(monkeypatch):
+    """pyserial lets them through from some calls, and they are no OSError."""
+
+    def fail(*args, **kwargs):
+        raise slcan_serial.termios.error(errno.EIO, "Input/output error")
+
+    with SilentDevice() as device:
+        with SlcanSerialLink(device.port) as link:
+            monkeypatch.setattr(serial.Serial, "read", fail)
+            with pytest.raises(LinkLostError):
+                link.read(0.0)
+            monkeypatch.setattr(serial.Serial, "write", fail)
+        with pytest.raises(DeviceError):
+            link.__enter__()
+        monkeypatch.setattr(serial, "Serial", fail)
         with pytest.raises(DeviceError):
             link.__enter__()
 

@@ -1,3 +1,5 @@
+import os
+import tty
 from types import SimpleNamespace
 
 import pytest
@@ -11,6 +13,8 @@ from firmware_bridge.links.ports import Port, find_adapter, find_by_serial, seri
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.source import FORMS, open_source
+from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.xela import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
 SECOND_VSCOM = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30XXXXX", "USB-CAN Plus")
@@ -161,3 +165,36 @@ def test_nothing_but_demo_is_the_demo(tmp_path):
 def test_the_demo_source(tmp_path):
     link = open_source("demo", 50.0, tmp_path / "demo.npz")
     assert isinstance(link, DemoLink) and link.kind == "emulated"
+
+
+def read_one_scan(model, ids):
+    """What comes of one frame of each id, put on a line that `open_source` reads, and what it sent at opening."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    try:
+        with open_source(f"slcan:{os.ttyname(slave)}", model=model) as link:
+            sent = os.read(master, 4096)
+            for can_id in [*ids, ids[0]]:
+                os.write(master, encode_frame(CanFrame(can_id, bytes((1, 2, 3, 4, 5, can_id >> 8, can_id & 0xF0, 7)))))
+            scans = [scan for _ in range(20) for scan in link.read(0.05)]
+    finally:
+        os.close(master)
+        os.close(slave)
+    return scans, sent
+
+
+def test_the_id_map_is_the_one_asked_for():
+    ids = [sda << 8 | taxel << 4 | 4 for sda in range(2) for taxel in range(8)]
+    (scan,), _ = read_one_scan(ID_MAPS["XR1944"], ids)
+    assert scan.complete
+    (half,), _ = read_one_scan(ID_MAPS["uSPa44"], ids)
+    assert half.fresh.sum() == 8
+
+
+def test_older_controllers_are_woken_and_others_are_not():
+    ids = [0x710 | taxel for taxel in range(16)]
+    (scan,), sent = read_one_scan(ID_MAPS["A"], ids)
+    assert scan.complete and scan.sensor == "1"
+    assert all(b"t20%d20700\r" % board in sent for board in range(1, 8))
+    _, sent = read_one_scan(ID_MAPS["uSPa44"], [0x004])
+    assert b"t2" not in sent

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from edge.errors import ModelError, UsageError, WindowError
 from edge.result import mask_bits
-from edge.runtime import HOLD_SCANS, Runtime, touched_patch
+from edge.runtime import HOLD_SCANS, SILENT_SCANS, Runtime, touched_patch
 from edge.session import ModelSession
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
@@ -259,3 +259,15 @@ def test_any_scans_give_one_result_each_and_a_pattern_only_in_contact(scans):
         assert (result.taps_used > 0) == (result.state in ("contact", "dropped"))
     for window in model.windows:
         assert np.isfinite(window).all()
+
+
+@pytest.mark.parametrize(
+    ("silent", "remedy"), [([8, 9, 10, 11, 12, 13, 14, 15], "try another --id-map"), ([5], "it may be broken")]
+)
+@pytest.mark.parametrize("baselines", [{}, {"4": BASELINE}])
+def test_a_taxel_that_stays_silent_is_named(silent, remedy, baselines):
+    runtime = make_runtime(baselines=baselines)
+    notes = [runtime.push(make_scan(number, absent=tuple(silent))).note for number in range(SILENT_SCANS)]
+    assert notes[HOLD_SCANS] is None
+    assert notes[-1] == f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}"
+    assert "silent" not in (runtime.push(make_scan(SILENT_SCANS)).note or "")

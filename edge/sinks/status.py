@@ -87,7 +87,7 @@ class StatusSink(Sink):
     def _sensor_text(self, name: str) -> str:
         result = self._latest[name]
         words = [name, result.state]
-        if result.state == "zeroing" and result.note is not None:
+        if result.state in ("zeroing", "incomplete") and result.note is not None:
             return f"{name} {result.note}"
         if result.contact:
             words.append(f"tap {result.taps_used}")

@@ -12,7 +12,7 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scan import Scan
 
 START_TIMEOUT_S: Final = 20.0
-END_TIMEOUT_S: Final = 2.0
+END_TIMEOUT_S: Final = 5.0
 
 
 class DemoLink:
