@@ -89,7 +89,7 @@ class Statistics:
         """
         lines = [
             f"{source}: {self.scans} scans, {self.patterns} patterns, {self.dropped} dropped, {self.overruns} overrun",
-            f"torn: {self.torn_wire} on the wire, {self.torn_source} at the source; {self.repeated} repeated",
+            f"torn: {self.torn_wire} on the wire, {self.torn_source} renewed in part; {self.repeated} repeated",
         ]
         p50_us, p99_us = self.run_time_us.quantile(0.5), self.run_time_us.quantile(0.99)
         if p50_us is not None and p99_us is not None:

@@ -312,7 +312,7 @@ class TestStatus:
             sink.write(result, RUN)
         assert sink.line() == (
             "EMULATED | 4 contact tap 1 3002 counts 22 mm2 250 us 100 Hz"
-            " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overrun | 7 torn"
+            " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overrun | 3 torn"
         )
 
     def test_newtons_where_calibrated_and_no_source_for_a_device(self):

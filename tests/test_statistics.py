@@ -68,7 +68,7 @@ def test_summary_tells_all_of_it():
     text = statistics.summary(source="EMULATED demo", wanted_rate_hz=100)
     assert text.splitlines() == [
         "EMULATED demo: 3 scans, 3 patterns, 0 dropped, 7 overrun",
-        "torn: 3 on the wire, 0 at the source; 0 repeated",
+        "torn: 3 on the wire, 0 renewed in part; 0 repeated",
         "run time: p50 200 us, p99 200 us, max 200 us",
         "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
         "stdin: 2 lines were no command",
@@ -78,5 +78,5 @@ def test_summary_tells_all_of_it():
 def test_summary_of_nothing():
     assert Statistics().summary(source="x").splitlines() == [
         "x: 0 scans, 0 patterns, 0 dropped, 0 overrun",
-        "torn: 0 on the wire, 0 at the source; 0 repeated",
+        "torn: 0 on the wire, 0 renewed in part; 0 repeated",
     ]
