@@ -56,6 +56,14 @@ class Result:
     baseline_age_s: float | None = None
     note: str | None = None
 
+    def baseline_text(self) -> str:
+        """Which baseline, how old."""
+        if self.baseline is None or self.baseline_age_s is None:
+            return "no baseline"
+        age_s = self.baseline_age_s
+        age = f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
+        return f"baseline {self.baseline.id} {age} old"
+
 
 def mask_bits(taxels: NDArray[np.bool_]) -> int:
     """A (rows, cols) mask as a number: bit i is taxel i, row-major from the top left."""

@@ -62,6 +62,7 @@ class Statistics:
         self.run_time_us = Histogram()
         self.commands_refused = 0
         self._spans: dict[str, _Span] = {}
+        self._baselines: dict[str, str] = {}
 
     def add(self, result: Result) -> None:
         """Count one result."""
@@ -74,6 +75,8 @@ class Statistics:
         if result.run_time_us is not None:
             self.patterns += 1
             self.run_time_us.add(result.run_time_us)
+        if result.baseline is not None:
+            self._baselines[scan.sensor] = f"{result.baseline_text()}, from {result.baseline.origin}"
         self._spans.setdefault(scan.sensor, _Span(scan.time_ns)).add(scan.time_ns)
 
     def rate_hz(self) -> dict[str, float]:
@@ -98,6 +101,7 @@ class Statistics:
         if rates:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
+        lines += [f"sensor {name}: {text}" for name, text in sorted(self._baselines.items())]
         if self.commands_refused:
             lines.append(f"stdin: {self.commands_refused} lines were no command")
         return "\n".join(lines)

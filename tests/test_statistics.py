@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from edge_samples import make_scan
+from edge_samples import BASELINE, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,6 +10,13 @@ from edge.statistics import Histogram, Statistics
 
 def result(scan, state="idle", run_time_us=None):
     return Result(scan, "device", "m", state, run_time_us=run_time_us)
+
+
+@pytest.mark.parametrize(("age_s", "age"), [(12.4, "12 s"), (599, "599 s"), (660, "11 min"), (40000, "11 h")])
+def test_which_baseline_and_how_old(age_s, age):
+    known = Result(make_scan(), "device", "m", "idle", baseline=BASELINE, baseline_age_s=age_s)
+    assert known.baseline_text() == f"baseline {BASELINE.id} {age} old"
+    assert result(make_scan()).baseline_text() == "no baseline"
 
 
 @given(st.lists(st.floats(1, 1e7), min_size=1, max_size=200), st.floats(0.01, 1))
@@ -63,14 +70,17 @@ def test_summary_tells_all_of_it():
     statistics = Statistics()
     for number in range(3):
         statistics.add(result(make_scan(number, absent=(0,)), "contact", 200.0))
+    zeroed = Result(make_scan(3), "device", "m", "idle", baseline=BASELINE, baseline_age_s=90.0)
+    statistics.add(zeroed)
     statistics.overruns = 7
     statistics.commands_refused = 2
     text = statistics.summary(source="EMULATED demo", wanted_rate_hz=100)
     assert text.splitlines() == [
-        "EMULATED demo: 3 scans, 3 patterns, 0 dropped, 7 overrun",
+        "EMULATED demo: 4 scans, 3 patterns, 0 dropped, 7 overrun",
         "torn: 3 on the wire, 0 renewed in part; 0 repeated",
         "run time: p50 200 us, p99 200 us, max 200 us",
         "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
+        f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
         "stdin: 2 lines were no command",
     ]
 

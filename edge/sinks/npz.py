@@ -33,8 +33,8 @@ class NpzSink(Sink):
 
     Arrays, one row a scan: sensor, scan, time_ns, counts (3, rows, cols; -1 absent), source, state,
     contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros
-    where there is none), run_time_us (NaN where there is none), baseline (its id, or empty) and
-    baseline_counts (3, rows, cols; NaN without).
+    where there is none), run_time_us (NaN where there is none), baseline (its id, or empty),
+    baseline_age_s (NaN without) and baseline_counts (3, rows, cols; NaN without).
     """
 
     def __init__(self, path: Path, scan_shape: tuple[int, ...], pattern_shape: tuple[int, ...]) -> None:
@@ -67,6 +67,7 @@ class NpzSink(Sink):
             "pattern": ("<f4", pattern_shape),
             "run_time_us": ("<f4", ()),
             "baseline": ("<U16", ()),
+            "baseline_age_s": ("<f4", ()),
             "baseline_counts": ("<f4", scan_shape),
         }
         parts = parts_dir(path)
@@ -100,6 +101,7 @@ class NpzSink(Sink):
             "pattern": self._no_pattern if pattern is None else pattern,
             "run_time_us": np.nan if result.run_time_us is None else result.run_time_us,
             "baseline": "" if baseline is None else baseline.id,
+            "baseline_age_s": np.nan if result.baseline_age_s is None else result.baseline_age_s,
             "baseline_counts": self._no_baseline if baseline is None else baseline.counts,
         }
         self._scans += 1

@@ -83,6 +83,8 @@ class StatusSink(Sink):
             "torn": count("torn_wire", 0),
         }
         parts += [f"{number} {name}" for name, number in losses.items() if number]
+        zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
+        parts += [result.baseline_text() for result in zeroed]
         return " | ".join(parts)
 
     def _sensor_text(self, name: str) -> str:
