@@ -22,7 +22,8 @@ TINY = TrainingConfig(
     batch=16,
     channels=8,
     blocks=1,
-    chains=((Stage(2, 6, 1e-3, (0.5, 0.5)), Stage(1, 3, 1e-3, (1.0,))),),
+    base=Stage(2, 4, 1e-3, (0.5, 0.5)),
+    stages=(Stage(2, 2, 1e-3, (0.5, 0.5)), Stage(1, 2, 1e-3, (1.0,))),
 )
 
 
@@ -54,13 +55,17 @@ def test_a_run_is_repeatable_and_its_configuration_lies_beside_the_weights(check
 def test_every_setting_changes_the_hash():
     changes = [{"seed": 2}, {"sequences": 65}, {"nuisances": replace(TINY.nuisances, noise_counts=3.0)}]
     changes.append({"layer": replace(TINY.layer, poisson=0.48)})
-    changes.append({"chains": (TINY.chains[0][:1],)})
-    assert len({replace(TINY, **change).sha256() for change in changes} | {TINY.sha256()}) == 6
+    changes.append({"stages": TINY.stages[:1]})
+    changes.append({"base": replace(TINY.base, steps=5)})
+    assert len({replace(TINY, **change).sha256() for change in changes} | {TINY.sha256()}) == 7
 
 
 def test_training_lowers_the_error(tmp_path):
     def error(steps):
-        fit(replace(TINY, channels=16, chains=((Stage(1, steps, 3e-3, (1.0,)),),)), tmp_path)
+        fit(
+            replace(TINY, channels=16, base=Stage(1, steps, 3e-3, (1.0,)), stages=(Stage(1, 1, 1e-4, (1.0,)),)),
+            tmp_path,
+        )
         return json.loads((tmp_path / "stsr.json").read_text())["validation_psnr_db"]
 
     assert error(60) > error(1) + 3

@@ -2,10 +2,10 @@
 
     python -m train.fit checkpoints
 
-Older taps drop out at random in training, so a network is right with fewer taps than it takes. One process trains
-MTSR-4; another MTSR-2, and then STSR, which starts as MTSR-2 with one tap. Each works on one thread: two threads on
-one network this small are hardly faster than one. A checkpoint is NAME.pt (weights) beside NAME.json (its
-configuration and what was measured).
+Older taps drop out at random in training, so a network is right with fewer taps than it takes. One base network of four
+taps is trained from nothing; each of the three starts as that network, with its own number of taps, and is trained on
+for equally long, a process and a thread each. A checkpoint is NAME.pt (weights) beside NAME.json (its configuration
+and what was measured).
 """
 
 import argparse
@@ -42,6 +42,8 @@ from train.layer import Layer
 from train.simulation import SimulatedSensor
 from train.skin import Nuisances
 
+BASE_FILE: Final = "base.pt"
+WORKERS: Final = 2
 _CONTACT_LEVELS: Final = tuple(np.arange(0.5, 0.95, 0.05).round(2).tolist())
 
 
@@ -72,8 +74,8 @@ class TrainingConfig:
     """All that decides the weights.
 
     Attributes:
-        chains: each is trained in a process of its own; its first stage starts from nothing, the next ones from the
-            network before.
+        base: starts from nothing.
+        stages: start from what the base has learnt.
     """
 
     seed: int = 1
@@ -87,12 +89,11 @@ class TrainingConfig:
     set_force_n: tuple[float, float] = SET_FORCE_N
     layer: Layer = field(default_factory=Layer)
     nuisances: Nuisances = field(default_factory=Nuisances)
-    chains: tuple[tuple[Stage, ...], ...] = (
-        (Stage(taps=4, steps=9000, learning_rate=2e-3, given=(0.25, 0.15, 0.1, 0.5)),),
-        (
-            Stage(taps=2, steps=7500, learning_rate=2e-3, given=(0.4, 0.6)),
-            Stage(taps=1, steps=2500, learning_rate=1e-3, given=(1.0,)),
-        ),
+    base: Stage = Stage(taps=4, steps=9000, learning_rate=2e-3, given=(0.25, 0.15, 0.1, 0.5))
+    stages: tuple[Stage, ...] = (
+        Stage(taps=4, steps=1000, learning_rate=5e-4, given=(0.2, 0.1, 0.1, 0.6)),
+        Stage(taps=2, steps=1000, learning_rate=5e-4, given=(0.3, 0.7)),
+        Stage(taps=1, steps=1000, learning_rate=5e-4, given=(1.0,)),
     )
 
     def sha256(self) -> str:
@@ -168,26 +169,33 @@ def best_contact_level(patterns: NDArray[np.float32], validation: FrozenSet) -> 
     return _CONTACT_LEVELS[int(np.argmax(overlap))]
 
 
-def fit_chain(config: TrainingConfig, chain: int, solved: Sequences, validation: FrozenSet, folder: Path) -> list[str]:
-    """Train the stages of one chain, write their checkpoints, and say of each what came out."""
+def fit_base(config: TrainingConfig, solved: Sequences, folder: Path) -> str:
+    """Train the base network, write its weights, and say so."""
+    started_s = time.monotonic()
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
-    rng = np.random.default_rng([config.seed, chain])
-    stages = config.chains[chain]
-    net = CompactNet(stages[0].taps, config.scale, config.channels, config.blocks)
-    lines = []
-    for stage in stages:
-        started_s = time.monotonic()
-        net = net.with_fewer_taps(stage.taps)
-        train_stage(net, stage, config, solved, rng, position=chain)
-        report = _report(net, stage, config, validation)
-        torch.save(net.state_dict(), folder / f"{stage.name}.pt")
-        (folder / f"{stage.name}.json").write_text(json.dumps(report, indent=1) + "\n")
-        lines.append(
-            f"{stage.name}: validation {report['validation_psnr_db']:.2f} dB, SSIM {report['validation_ssim']:.3f},"
-            f" {time.monotonic() - started_s:.0f} s"
-        )
-    return lines
+    net = CompactNet(config.base.taps, config.scale, config.channels, config.blocks)
+    train_stage(net, config.base, config, solved, np.random.default_rng([config.seed, 0]))
+    torch.save(net.state_dict(), folder / BASE_FILE)
+    return f"base: {time.monotonic() - started_s:.0f} s"
+
+
+def fit_stage(config: TrainingConfig, index: int, solved: Sequences, validation: FrozenSet, folder: Path) -> str:
+    """Train the base on for one network, write its checkpoint, and say what came out."""
+    started_s = time.monotonic()
+    torch.set_num_threads(1)
+    stage = config.stages[index]
+    base = CompactNet(config.base.taps, config.scale, config.channels, config.blocks)
+    base.load_state_dict(torch.load(folder / BASE_FILE, weights_only=True))
+    net = base.with_fewer_taps(stage.taps)
+    train_stage(net, stage, config, solved, np.random.default_rng([config.seed, 1 + index]), position=index)
+    report = _report(net, stage, config, validation)
+    torch.save(net.state_dict(), folder / f"{stage.name}.pt")
+    (folder / f"{stage.name}.json").write_text(json.dumps(report, indent=1) + "\n")
+    return (
+        f"{stage.name}: validation {report['validation_psnr_db']:.2f} dB, SSIM {report['validation_ssim']:.3f},"
+        f" {time.monotonic() - started_s:.0f} s"
+    )
 
 
 def _report(net: CompactNet, stage: Stage, config: TrainingConfig, validation: FrozenSet) -> dict[str, Any]:
@@ -204,7 +212,7 @@ def _report(net: CompactNet, stage: Stage, config: TrainingConfig, validation: F
 
 
 def fit(config: TrainingConfig, folder: Path) -> None:
-    """Make the training taps, train every chain in a process of its own, and write checkpoints."""
+    """Make the training taps, train the base, then the stages side by side, and write checkpoints."""
     folder.mkdir(parents=True, exist_ok=True)
     sensor = SimulatedSensor(USPA44, config.layer, config.scale)
     started_s, count = time.monotonic(), config.sequences * MAX_TAPS
@@ -213,12 +221,13 @@ def fit(config: TrainingConfig, folder: Path) -> None:
         solved = solve_sequences(sensor, *poses, progress=bar.update)
     _say(f"{count} poses, {count / (time.monotonic() - started_s):.0f} a second")
     validation = freeze(sensor, VALIDATION_POSITION, config.nuisances, config.seed)
-    with ProcessPoolExecutor(len(config.chains), multiprocessing.get_context("spawn")) as pool:
-        chains = [
-            pool.submit(fit_chain, config, chain, solved, validation, folder) for chain in range(len(config.chains))
+    with ProcessPoolExecutor(WORKERS, multiprocessing.get_context("spawn")) as pool:
+        _say(pool.submit(fit_base, config, solved, folder).result())
+        stages = [
+            pool.submit(fit_stage, config, index, solved, validation, folder) for index in range(len(config.stages))
         ]
-        for done in as_completed(chains):
-            _say("\n".join(done.result()))
+        for done in as_completed(stages):
+            _say(done.result())
 
 
 def _say(line: str) -> None:
