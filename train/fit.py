@@ -3,9 +3,9 @@
     python -m train.fit checkpoints
 
 Older taps drop out at random in training, so a network is right with fewer taps than it takes. One base network of four
-taps is trained from nothing; each of the three starts as that network, with its own number of taps, and is trained on
-for equally long, a process and a thread each. A checkpoint is NAME.pt (weights) beside NAME.json (its configuration
-and what was measured).
+taps is trained from nothing, on two threads; each of the three starts as that network, with its own number of taps, and
+is trained on for equally long, a process and a thread each. A checkpoint is NAME.pt (weights) beside NAME.json (its
+configuration and what was measured).
 """
 
 import argparse
@@ -172,7 +172,7 @@ def best_contact_level(patterns: NDArray[np.float32], validation: FrozenSet) -> 
 def fit_base(config: TrainingConfig, solved: Sequences, folder: Path) -> str:
     """Train the base network, write its weights, and say so."""
     started_s = time.monotonic()
-    torch.set_num_threads(1)
+    torch.set_num_threads(WORKERS)  # nothing else runs yet
     torch.manual_seed(config.seed)
     net = CompactNet(config.base.taps, config.scale, config.channels, config.blocks)
     train_stage(net, config.base, config, solved, np.random.default_rng([config.seed, 0]))
