@@ -6,7 +6,11 @@ from typing import Final
 from edge.errors import ModelError, UsageError
 
 BUNDLE_DIR: Final = Path(__file__).parent / "models"
-DEFAULT_MODEL: Final = "mtsr4"
+DEFAULT_MODEL: Final = "stsr"
+"""Takes nothing for granted: a model of several taps is wrong, and looks right, where the taps before were of another
+object or the pad was not turned."""
+DEMO_MODEL: Final = "mtsr4"
+"""The demo's taps are turned as this one expects."""
 
 
 def bundled_models() -> list[Path]:

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final, TextIO
 
-from edge.bundle import bundled_models, demo_recording, find_model
+from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, bundled_models, demo_recording, find_model
 from edge.errors import EdgeError, ModelError, SinkClosedError, SinkError
 from edge.options import EXIT_USAGE, baseline_parser, bench_parser, models_parser, run_parser
 from firmware_bridge.errors import BaselineRefusedError, BridgeError, DeviceError
@@ -72,7 +72,8 @@ def _run(arguments: Sequence[str]) -> int:
     with _stop_on_signals() as stop:
         link = _open_source(options)
         baselines = load_baselines(options.baseline) if options.baseline else None
-        model = ModelSession(find_model(options.model))
+        default = DEMO_MODEL if options.source == "demo" else DEFAULT_MODEL
+        model = ModelSession(find_model(options.model or default))
         score = DemoScore(demo_recording(), model.contract) if options.source == "demo" else None
         statistics = Statistics()
         if score is not None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from edge.bundle import DEFAULT_MODEL
+from edge.bundle import DEFAULT_MODEL, DEMO_MODEL
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
 from firmware_bridge.baseline import FEWEST_SCANS
 from firmware_bridge.xela import ID_MAPS, USPA44_MAP
@@ -82,7 +82,7 @@ def run_parser() -> argparse.ArgumentParser:
         epilog=RUN_HELP,
     )
     add = parser.add_argument
-    add("--model", metavar="M", default=DEFAULT_MODEL, help=f"file, or bundled model (default {DEFAULT_MODEL})")
+    add("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL}; for the demo {DEMO_MODEL})")
     _add_source(parser)
     add("--sink", metavar="S", action="append", default=[], help="where results go; may be repeated")
     add("--duration-s", metavar="T", type=_positive, help="stop after this time")

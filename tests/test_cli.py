@@ -81,6 +81,15 @@ def assert_refused(done, code, *words):
         assert word in done.stderr
 
 
+def test_one_tap_is_what_a_sensor_gets_unless_asked_and_the_demo_gets_four(tmp_path):
+    recording = tmp_path / "rest.csv"
+    header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
+    recording.write_text("\n".join([header, *[",".join(["30000.0"] * 48)] * 3, ""]))
+    for name, model in ((f"replay:{recording}", "stsr"), ("demo", "mtsr4")):
+        done = run("--source", name, "--rate-hz", "100", "--duration-s", "0.5", "--sink", "jsonl:-")
+        assert {record["model"] for record in records(done.stdout)} == {model}
+
+
 class TestHelp:
     @pytest.mark.parametrize("command", [[], ["models"], ["baseline"], ["bench"]])
     def test_help_fits_40_columns(self, command):
