@@ -1,4 +1,5 @@
 import os
+import select
 import tty
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from firmware_bridge.links.ports import Port, find_adapter, find_by_serial, seri
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.source import FORMS, open_source
-from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.xela import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
@@ -168,15 +169,18 @@ def test_the_demo_source(tmp_path):
 
 
 def read_one_scan(model, ids):
-    """What comes of one frame of each id, put on a line that `open_source` reads, and what it sent at opening."""
+    """What comes of one frame of each id, put on a line that `open_source` reads, and what it sent."""
     master, slave = os.openpty()
     tty.setraw(slave)
+    sent = b""
     try:
         with open_source(f"slcan:{os.ttyname(slave)}", model=model) as link:
-            sent = os.read(master, 4096)
             for can_id in [*ids, ids[0]]:
                 os.write(master, encode_frame(CanFrame(can_id, bytes((1, 2, 3, 4, 5, can_id >> 8, can_id & 0xF0, 7)))))
             scans = [scan for _ in range(20) for scan in link.read(0.05)]
+        # The kernel passes it on in pieces, in its own time: all is there with the closing command.
+        while not sent.endswith(b"\r" + CLOSE) and select.select([master], [], [], 5)[0]:
+            sent += os.read(master, 4096)
     finally:
         os.close(master)
         os.close(slave)
