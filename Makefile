@@ -19,7 +19,7 @@ lint: $(VENV)/.dev  ## format, lint, types, import rules
 	$(BIN)/lint-imports
 
 models: $(VENV)/.dev  ## retrain and re-export the bundled models: about 20 minutes on two cores
-	$(BIN)/python -m train.frozen edge/models
+	$(BIN)/python -m train.freeze edge/models
 	$(BIN)/python -m train.fit checkpoints
 	$(BIN)/python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt --out edge/models
 
