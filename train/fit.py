@@ -91,7 +91,7 @@ class TrainingConfig:
     nuisances: Nuisances = field(default_factory=Nuisances)
     base: Stage = Stage(taps=4, steps=9000, learning_rate=2e-3, given=(0.25, 0.15, 0.1, 0.5))
     stages: tuple[Stage, ...] = (
-        Stage(taps=4, steps=1000, learning_rate=5e-4, given=(0.2, 0.1, 0.1, 0.6)),
+        Stage(taps=4, steps=2000, learning_rate=5e-4, given=(0.3, 0.15, 0.1, 0.45)),
         Stage(taps=2, steps=1000, learning_rate=5e-4, given=(0.3, 0.7)),
         Stage(taps=1, steps=1000, learning_rate=5e-4, given=(1.0,)),
     )
