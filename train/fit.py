@@ -4,8 +4,8 @@
 
 Older taps drop out at random in training, so a network is right with fewer taps than it takes. One base network of four
 taps is trained from nothing, on two threads; each of the three starts as that network, with its own number of taps, and
-is trained on for equally long, a process and a thread each. A checkpoint is NAME.pt (weights) beside NAME.json (its
-configuration and what was measured).
+is trained on, a process and a thread each: MTSR-4 for twice as long, as it has to be right with one tap as well as with
+four. A checkpoint is NAME.pt (weights) beside NAME.json (its configuration and what was measured).
 """
 
 import argparse
