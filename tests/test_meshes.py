@@ -1,0 +1,256 @@
+import numpy as np
+import pytest
+import trimesh
+
+from train.errors import MeshError, TrainError
+from train.meshes import MAX_TRIANGLES, load_mesh
+
+BOX_MM = (10.0, 8.0, 3.0)
+AT_REST = [-5, -4, -3, 5, 4, 0]
+
+
+def box(extents=BOX_MM, at=(20.0, -7.0, 11.0)):
+    return trimesh.creation.box(extents).apply_translation(at)
+
+
+def ascii_stl(mesh, name="part"):
+    lines = [f"solid {name}"]
+    for normal, corners in zip(mesh.face_normals, mesh.triangles, strict=True):
+        lines += ["facet normal {} {} {}".format(*normal), "outer loop"]
+        lines += ["vertex {!r} {!r} {!r}".format(*map(float, corner)) for corner in corners]
+        lines += ["endloop", "endfacet"]
+    return "\n".join([*lines, f"endsolid {name}", ""]).encode("latin-1")
+
+
+def binary_stl(triangles):
+    """80 bytes of header, a count, and 50 bytes a triangle: normal, three corners, two spare bytes."""
+    record = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
+    record["corners"] = triangles
+    return bytes(80) + np.uint32(len(triangles)).tobytes() + record.tobytes()
+
+
+def obj(mesh, head=""):
+    corners = "".join("v {!r} {!r} {!r}\n".format(*map(float, corner)) for corner in mesh.vertices)
+    return (head + corners + "".join("f {} {} {}\n".format(*(face + 1)) for face in mesh.faces)).encode("latin-1")
+
+
+def ply(mesh, comment=""):
+    head = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex {len(mesh.vertices)}\n"
+    head += "property double x\nproperty double y\nproperty double z\n"
+    head += f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    body = "".join("{!r} {!r} {!r}\n".format(*map(float, corner)) for corner in mesh.vertices)
+    return (head + body + "".join("3 {} {} {}\n".format(*face) for face in mesh.faces)).encode("latin-1")
+
+
+FILES = {
+    "ascii.stl": ascii_stl(box()),
+    "binary.STL": binary_stl(box().triangles),
+    "part.obj": obj(box()),
+    "ascii.ply": ply(box()),
+    "binary.ply": box().export(file_type="ply", encoding="binary"),
+}
+
+
+def saved(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    return path
+
+
+def refused(path, match, **options):
+    with pytest.raises(MeshError, match=match) as error:
+        load_mesh(path, **options)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_format_comes_to_rest_under_the_sensor(tmp_path, name):
+    mesh = load_mesh(saved(tmp_path, name, FILES[name]))
+    assert mesh.bounds.ravel() == pytest.approx(AT_REST)
+    assert mesh.is_watertight
+    assert len(mesh.vertices) == 8 and len(mesh.faces) == 12
+    assert mesh.volume == pytest.approx(10 * 8 * 3)
+
+
+def test_the_mesh_is_used_as_it_stands(tmp_path):
+    cone = trimesh.creation.cone(radius=3, height=4, sections=64)
+    mesh = load_mesh(saved(tmp_path, "cone.stl", binary_stl(cone.triangles)))
+    top = mesh.vertices[mesh.vertices[:, 2] > -1e-6]
+    assert top == pytest.approx(np.zeros((1, 3)), abs=1e-6)
+
+
+@pytest.mark.parametrize(("unit_mm", "scale"), [(25.4, 1 / 25.4), (1000, 1e-3), (0.001, 1e3)])
+def test_a_file_in_another_unit(tmp_path, unit_mm, scale):
+    path = saved(tmp_path, "part.stl", binary_stl(box().triangles * scale))
+    assert load_mesh(path, unit_mm).bounds.ravel() == pytest.approx(AT_REST, rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("unit_mm", [0, -1, float("nan"), float("inf")])
+def test_an_impossible_unit(tmp_path, unit_mm):
+    with pytest.raises(MeshError, match="unit_mm"):
+        load_mesh(saved(tmp_path, "part.stl", FILES["ascii.stl"]), unit_mm)
+
+
+def test_a_file_of_several_bodies_is_one_surface(tmp_path):
+    left, right = box(at=(0, 0, 0)), box(at=(30, 0, -1))
+    both = obj(left, "o left\n") + b"o right\n"
+    both += "".join("v {} {} {}\n".format(*corner) for corner in right.vertices).encode()
+    both += "".join("f {} {} {}\n".format(*(face + 9)) for face in right.faces).encode()
+    solids = ascii_stl(left, "left") + ascii_stl(right, "right")
+    for name, content in (("two.obj", both), ("two.stl", solids)):
+        mesh = load_mesh(saved(tmp_path, name, content))
+        assert mesh.bounds.ravel() == pytest.approx([-20, -4, -4, 20, 4, 0])
+        assert mesh.volume == pytest.approx(2 * 10 * 8 * 3)
+
+
+def test_bodies_that_touch_along_an_edge_are_closed(tmp_path):
+    both = np.concatenate([box(at=(0, 0, 0)).triangles, box(at=(10, 8, 0)).triangles])
+    assert load_mesh(saved(tmp_path, "touching.stl", binary_stl(both))).volume == pytest.approx(2 * 10 * 8 * 3)
+
+
+def test_a_triangle_without_width_opens_nothing(tmp_path):
+    corners = box().triangles
+    needle = corners[0][[0, 0, 1]][None]
+    assert len(load_mesh(saved(tmp_path, "needle.stl", binary_stl(np.concatenate([corners, needle])))).faces) == 12
+
+
+def test_names_in_an_old_encoding_are_no_fault(tmp_path):
+    for name, content in (
+        ("part.stl", ascii_stl(box(), "Prüfkörper")),
+        ("part.obj", obj(box(), "o Prüfkörper\n")),
+        ("part.ply", ply(box(), "Prüfkörper")),
+    ):
+        assert load_mesh(saved(tmp_path, name, content)).bounds.ravel() == pytest.approx(AT_REST)
+
+
+def test_materials_beside_the_file_are_left_alone(tmp_path, caplog):
+    for name, content in (
+        ("part.obj", obj(box(), "mtllib absent.mtl\nusemtl gold\n")),
+        ("part.ply", ply(box(), "TextureFile absent.png")),
+    ):
+        assert load_mesh(saved(tmp_path, name, content)).bounds.ravel() == pytest.approx(AT_REST)
+    assert not caplog.records
+
+
+def test_an_absent_file_and_a_folder(tmp_path):
+    refused(tmp_path / "absent.stl", "cannot be read: No such file")
+    (tmp_path / "folder.stl").mkdir()
+    refused(tmp_path / "folder.stl", "cannot be read")
+
+
+@pytest.mark.parametrize("name", ["part.glb", "part.step", "part.stl.gz", "part"])
+def test_an_unknown_format_names_the_known(tmp_path, name):
+    refused(saved(tmp_path, name, FILES["ascii.stl"]), r"unknown mesh format.*\.stl, \.obj, \.ply")
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\n",
+        b"A letter to the editor, not a mesh.\n" * 9,
+        bytes(range(256)) * 4,
+        b"solid\n",
+        b"ply\n",
+        b"v 1 2\nf 1 2",
+    ],
+    ids=["zero-byte", "blank", "prose", "all bytes", "solid", "ply", "half a line"],
+)
+def test_garbage_in_any_format(tmp_path, suffix, content):
+    refused(saved(tmp_path, f"garbage{suffix}", content), "no triangles|cut short or broken")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_cut_anywhere_is_refused_or_whole(tmp_path, name):
+    content = FILES[name].rstrip()
+    for length in range(0, len(content) - 8, max(len(content) // 60, 1)):
+        path = saved(tmp_path, f"cut{name[-4:]}", content[:length])
+        refused(path, "no triangles|cut short or broken|is open|corners outside|flat|at least")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_bytes_changed_at_random_never_raise_anything_else(tmp_path, name):
+    rng = np.random.default_rng(7)
+    for _ in range(60):
+        content = np.frombuffer(FILES[name], dtype=np.uint8).copy()
+        content[rng.integers(len(content), size=rng.integers(1, 8))] = rng.integers(256, dtype=np.uint8)
+        path = saved(tmp_path, f"changed{name[-4:]}", content.tobytes())
+        try:
+            mesh = load_mesh(path)
+        except MeshError as error:
+            assert "\n" not in str(error)
+        else:
+            assert mesh.bounds[1, 2] == 0 and np.isfinite(mesh.bounds).all()
+
+
+def test_points_are_no_mesh(tmp_path):
+    cloud = box()
+    cloud.update_faces(np.zeros(12, dtype=bool))
+    for name, content in (("cloud.ply", ply(cloud)), ("cloud.obj", obj(cloud))):
+        refused(saved(tmp_path, name, content), "8 points but no triangles")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_corners_that_are_no_number(tmp_path, bad):
+    corners = box().triangles.copy()
+    corners[3, 1, 2] = bad
+    refused(saved(tmp_path, "nan.stl", binary_stl(corners)), "1 of 12 triangles.*no finite number")
+    sick = box()
+    sick.vertices[0, 0] = bad
+    refused(saved(tmp_path, "nan.ply", ply(sick)), "no finite number")
+
+
+def test_triangles_that_name_absent_corners(tmp_path):
+    for corner in (8, -1):
+        sick = box()
+        sick.faces[5, 0] = corner
+        refused(saved(tmp_path, "sick.ply", ply(sick)), "broken")
+
+
+def test_an_open_box_counts_its_open_edges(tmp_path):
+    lidless = box()
+    lidless.update_faces(lidless.face_normals[:, 2] < 0.5)
+    refused(saved(tmp_path, "open.stl", binary_stl(lidless.triangles)), "open, 4 of its edges.*fill_holes")
+    holed = box()
+    holed.update_faces(np.arange(12) != 4)
+    refused(saved(tmp_path, "holed.ply", ply(holed)), "open, 3 of its edges")
+
+
+def test_a_sheet_is_flat_however_it_stands(tmp_path):
+    sheet = box((10, 8, 0))
+    refused(saved(tmp_path, "sheet.stl", binary_stl(sheet.triangles)), "flat, a sheet.*10 x 8 x 0 mm.*extrude")
+    sheet.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
+    refused(saved(tmp_path, "tilted.stl", binary_stl(sheet.triangles)), "flat")
+    assert load_mesh(saved(tmp_path, "plate.stl", binary_stl(box((100, 80, 0.1)).triangles))).is_watertight
+
+
+def test_an_impossible_size_says_the_size_and_the_unit(tmp_path):
+    for extent_mm in (1.001, 499.9):
+        load_mesh(saved(tmp_path, "fits.stl", binary_stl(box((extent_mm, extent_mm / 2, extent_mm / 3)).triangles)))
+    refused(saved(tmp_path, "big.stl", binary_stl(box((501, 8, 3)).triangles)), "501 x 8 x 3 mm.*give unit_mm")
+    metres = saved(tmp_path, "metres.stl", binary_stl(box((0.02, 0.02, 0.002), at=(0, 0, 0)).triangles))
+    refused(metres, "0.02 x 0.02 x 0.002 mm.*unit_mm=1000")
+    refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "unit_mm=1000, at most 500 mm", unit_mm=1000)
+
+
+def test_a_huge_grid_is_refused_for_its_triangles(tmp_path):
+    faces = np.zeros(MAX_TRIANGLES + 1, dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, [0, 1, 2]
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    head += "property float x\nproperty float y\nproperty float z\n"
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    content = head.encode() + np.eye(3, dtype="<f4").tobytes() + faces.tobytes()
+    refused(saved(tmp_path, "huge.ply", content), "2000001 triangles; at most 2000000")
+
+
+def test_a_file_too_long_to_read_is_not_read(tmp_path):
+    path = tmp_path / "long.obj"
+    with path.open("wb") as file:
+        file.truncate(400_000_001)  # a hole in the file: takes no room on the disk
+    refused(path, "400 MB; at most 400 MB")
+
+
+def test_a_mesh_error_is_one_of_trainings_and_a_value_error():
+    assert issubclass(MeshError, TrainError) and issubclass(MeshError, ValueError)

@@ -1,0 +1,141 @@
+"""Random figures to train on, so that a network meets shapes nobody has drawn. Lengths in [mm].
+
+A seed gives one figure: coordinates are rounded to whole micrometres, so that the last digits in which machines
+differ are lost. Detail that no tap could show, slits and slivers finer than half a millimetre, is left out.
+"""
+
+from math import cos, pi, sin
+from typing import Final, Literal
+
+import numpy as np
+from shapely import LinearRing, LineString, Polygon, affinity, set_precision, unary_union
+from shapely.geometry.base import BaseGeometry
+
+from train.figures import Points, arc
+
+GLYPH_REACH_MM: Final = 8.0
+"""Glyphs stay within this of the plate's centre along x and y."""
+POLYGON_REACH_MM: Final = 9.5
+AREA_MM2: Final = (8.0, 250.0)
+"""Smallest and largest contact area."""
+_GRID_MM: Final = 1e-3
+_FINEST_MM: Final = 0.5
+_CAPS: Final[tuple[Literal["round", "square", "flat"], ...]] = ("round", "square", "flat")
+_JOINS: Final[tuple[Literal["round", "mitre", "bevel"], ...]] = ("round", "mitre", "bevel")
+
+
+def glyph(seed: int) -> BaseGeometry:
+    """One to four random strokes of one width, like a letter of an unknown script.
+
+    Args:
+        seed: 0 or more.
+
+    Returns:
+        Polygon or MultiPolygon within GLYPH_REACH_MM, in [mm].
+    """
+    rng = np.random.default_rng([seed, 0])
+    while True:  # one draw in four is too wide, too small or too large
+        outline = _placed(rng, _strokes(rng), GLYPH_REACH_MM)
+        if outline is not None:
+            return outline
+
+
+def polygon(seed: int) -> BaseGeometry:
+    """One or two random polygons or ellipses, full or hollow.
+
+    Args:
+        seed: 0 or more.
+
+    Returns:
+        Polygon or MultiPolygon within POLYGON_REACH_MM, in [mm].
+    """
+    rng = np.random.default_rng([seed, 1])
+    while True:
+        first = _blob(rng, 8.0)
+        if rng.random() < 0.3:
+            way, far_mm = rng.uniform(0, 2 * pi), rng.uniform(4, 10)
+            second = affinity.translate(_blob(rng, 5.0), far_mm * cos(way), far_mm * sin(way))
+            first = first.union(second) if rng.random() < 0.7 else first.difference(second)
+        outline = _placed(rng, first, POLYGON_REACH_MM)
+        if outline is not None:
+            return outline
+
+
+def _strokes(rng: np.random.Generator) -> BaseGeometry:
+    half = (rng.uniform(3, 6), rng.uniform(3.5, 6.5))
+    width_mm, cap, join = 2 + 2 * rng.random() ** 2, _CAPS[rng.integers(3)], _JOINS[rng.integers(3)]
+    lattice = int(rng.integers(0, 4))  # 0: corners anywhere; 1, 2, 3: letter-like, on 2, 3 or 4 lines each way
+    count = int(rng.integers(1, 5))
+    places = np.zeros((count, 2))
+    if count > 1 and rng.random() < 0.4:  # apart: each stroke half the size, in a quarter of its own
+        places = rng.permutation([(-0.6, -0.6), (-0.6, 0.6), (0.6, -0.6), (0.6, 0.6)])[:count]
+        half = (0.6 * half[0], 0.6 * half[1])
+    strokes = []
+    for right, up in places:
+        stroke = _stroke(rng, half, lattice).buffer(width_mm / 2, cap_style=cap, join_style=join, quad_segs=6)
+        strokes.append(affinity.translate(stroke, right * 2 * half[0], up * 2 * half[1]))
+    drawn = unary_union(strokes)
+    return affinity.rotate(drawn, rng.uniform(0, 360), origin=(0, 0)) if rng.random() < 0.5 else drawn
+
+
+def _stroke(rng: np.random.Generator, half: tuple[float, float], lattice: int) -> LineString:
+    """A polyline, an arc or a closed loop, its corners within +-`half`."""
+    kind = rng.random()
+    if kind < 0.55:
+        return LineString(_corners(rng, half, lattice, int(rng.integers(2, 5))))
+    if kind < 0.65:
+        return LinearRing(_corners(rng, half, lattice, int(rng.integers(3, 6))))
+    radii = (half[0] * rng.uniform(0.6, 1), half[1] * rng.uniform(0.6, 1))
+    centre = (rng.uniform(-1, 1) * (half[0] - radii[0]), rng.uniform(-1, 1) * (half[1] - radii[1]))
+    if kind < 0.75:
+        return LinearRing(arc(centre, radii, 0, 360))
+    start_deg = rng.uniform(0, 360)
+    return LineString(arc(centre, radii, start_deg, start_deg + rng.uniform(90, 300)))
+
+
+def _corners(rng: np.random.Generator, half: tuple[float, float], lattice: int, count: int) -> Points:
+    """Random corners; on the lattice, no two in a row are the same."""
+    shares = rng.uniform(-1, 1, (count, 2))
+    if lattice:
+        places = [int(rng.integers((lattice + 1) ** 2))]
+        while len(places) < count:
+            step = int(rng.integers(1, (lattice + 1) ** 2))
+            places.append((places[-1] + step) % (lattice + 1) ** 2)
+        shares = np.array([divmod(place, lattice + 1) for place in places]) / lattice * 2 - 1
+    return [(half[0] * x, half[1] * y) for x, y in shares]
+
+
+def _blob(rng: np.random.Generator, largest_mm: float) -> BaseGeometry:
+    """A polygon of 3 to 8 corners or an ellipse round the origin, regular or not, full or hollow."""
+    radius_mm, squeeze, turn_deg = rng.uniform(2.5, largest_mm), rng.uniform(0.4, 1), rng.uniform(0, 360)
+    count = int(rng.integers(3, 10))
+    if count == 9:
+        outline = Polygon(arc((0, 0), (radius_mm, radius_mm * squeeze), 0, 360))
+    else:
+        shift, dent = np.zeros(count), np.ones(count)
+        if rng.random() < 0.6:
+            shift, dent = rng.uniform(-0.4, 0.4, count), rng.uniform(0.45, 1, count)
+        angles = (np.arange(count) + shift) * 2 * pi / count
+        corners = [(radius_mm * d * cos(a), radius_mm * d * sin(a)) for a, d in zip(angles, dent, strict=True)]
+        outline = Polygon(corners)
+        if rng.random() < 0.3:
+            outline = affinity.scale(outline, 1, squeeze, origin=(0, 0))
+    if rng.random() < 0.4:
+        outline = outline.difference(outline.buffer(-rng.uniform(1.5, 3.5), join_style="mitre"))
+    return affinity.rotate(outline, turn_deg, origin=(0, 0))
+
+
+def _placed(rng: np.random.Generator, drawn: BaseGeometry, reach_mm: float) -> BaseGeometry | None:
+    """The drawing without its finest detail, moved somewhere within reach; None if it does not do."""
+    fine = _FINEST_MM / 2
+    shut = drawn.buffer(fine, join_style="mitre").buffer(-2 * fine, join_style="mitre")
+    cleaned = shut.buffer(fine, join_style="mitre").simplify(0.02)
+    if not (cleaned.is_valid and AREA_MM2[0] <= cleaned.area <= AREA_MM2[1]):  # simplified outlines may cross
+        return None
+    left, low, right, high = cleaned.bounds
+    slack = (reach_mm - (right - left) / 2, reach_mm - (high - low) / 2)
+    if min(slack) < 0:
+        return None
+    x_mm, y_mm = rng.uniform(-0.7, 0.7) * slack[0], rng.uniform(-0.7, 0.7) * slack[1]
+    placed = affinity.translate(cleaned, x_mm - (left + right) / 2, y_mm - (low + high) / 2)
+    return set_precision(placed, _GRID_MM)

@@ -1,0 +1,137 @@
+"""Users' mesh files as surfaces to tap: read, checked, and moved under the sensor."""
+
+from io import BytesIO
+from math import isfinite
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from train.errors import MeshError
+
+SUFFIXES: Final = (".stl", ".obj", ".ply")
+MAX_TRIANGLES: Final = 2_000_000
+MAX_FILE_BYTES: Final = 400_000_000
+"""Two million triangles in the wordiest of OBJ files; a longer file would fill the memory before it is refused."""
+EXTENT_MM: Final = (1.0, 500.0)
+"""Smallest and largest longest side: outside, the unit is wrong more likely than the part."""
+_MERGED_DIGITS: Final = 4
+"""Corners that agree to this many digits of a millimetre are one: no press tells a tenth of a micrometre."""
+_TO_ASCII: Final = bytes(range(128)) + b"?" * 128
+_FLAT: Final = 1e-5
+"""Thickness over length below which a body is a sheet: a hundred times the rounding of single precision."""
+
+
+def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
+    """Read an STL, OBJ or PLY file as a surface: z up as it stands, top at z = 0, centred on x = y = 0.
+
+    Args:
+        path: the file; several bodies in it are taken together.
+        unit_mm: length of the file's unit, > 0, in [mm]; 1000 for metres, 25.4 for inches.
+
+    Returns:
+        Closed mesh, in [mm].
+
+    Raises:
+        MeshError: the file is absent, broken, empty, open, flat, or of an impossible size.
+    """
+    path = Path(path)
+    if not (isfinite(unit_mm) and unit_mm > 0):
+        raise MeshError(f"unit_mm is {unit_mm}; it must be a length above 0, such as 1000 for a file in metres")
+    corners, faces = _read(path)
+    corners = corners * unit_mm
+    _check_size(path, corners[faces].reshape(-1, 3), unit_mm)
+    mesh = trimesh.Trimesh(corners, faces, process=False)
+    mesh.merge_vertices(digits_vertex=_MERGED_DIGITS)
+    a, b, c = mesh.faces.T
+    mesh.update_faces((a != b) & (b != c) & (c != a))  # triangles that merging shut
+    mesh.remove_unreferenced_vertices()
+    if count := _open_edges(mesh.faces):
+        raise MeshError(
+            f"{path}: the mesh is open, {count} of its edges bound a hole or overlap; "
+            "close it in a mesh editor (make solid, fill holes) or with trimesh.repair.fill_holes"
+        )
+    low, high = mesh.bounds
+    mesh.apply_translation([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -high[2]])
+    return mesh
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Corners (n, 3), finite, in the file's unit, and the triangles (m, 3) between them, at least one."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise MeshError(f"{path}: unknown mesh format {suffix!r}; save it as one of {', '.join(SUFFIXES)}")
+    try:
+        if (size := path.stat().st_size) > MAX_FILE_BYTES:
+            raise MeshError(
+                f"{path}: {size / 1e6:.0f} MB; at most {MAX_FILE_BYTES / 1e6:.0f} MB are read: "
+                "save it as a binary file, or reduce the mesh"
+            )
+        content = path.read_bytes()
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read: {error.strerror}; give the path of a mesh file") from error
+    corners, faces = _parse(path, content, suffix)
+    if not len(faces):
+        held = f"{len(corners)} points but no triangles" if len(corners) else "no triangles"
+        raise MeshError(f"{path}: the file holds {held} (empty, cut short, or not a mesh); save it as a closed mesh")
+    if len(faces) > MAX_TRIANGLES:
+        raise MeshError(f"{path}: {len(faces)} triangles; at most {MAX_TRIANGLES} are taken: reduce the mesh")
+    if faces.min() < 0 or faces.max() >= len(corners):
+        raise MeshError(f"{path}: broken: triangles name corners outside the {len(corners)} there are; save it anew")
+    if bad := int((~np.isfinite(corners[faces]).all(axis=(1, 2))).sum()):
+        raise MeshError(f"{path}: {bad} of {len(faces)} triangles have corners that are no finite number; repair it")
+    return corners, faces
+
+
+def _parse(path: Path, content: bytes, suffix: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """All bodies of a file side by side. Corners alone, of a point cloud, come without triangles."""
+    try:
+        # From bytes and without materials: a mesh file must not make us open others.
+        scene = trimesh.load_scene(
+            BytesIO(_legible(content, suffix)), file_type=suffix[1:], process=False, skip_materials=True
+        )
+        corners, faces, count = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
+        for body in scene.geometry.values():
+            corners.append(np.asarray(body.vertices, dtype=np.float64).reshape(-1, 3))
+            faces.append(np.asarray(getattr(body, "faces", faces[0]), dtype=np.int64).reshape(-1, 3) + count)
+            count += len(corners[-1])
+    except Exception as error:  # on a broken file a parser raises whatever it trips over, and all of it means that
+        raise MeshError(f"{path}: no {suffix[1:].upper()} file, or one cut short or broken; save it anew") from error
+    return np.concatenate(corners), np.concatenate(faces)
+
+
+def _legible(content: bytes, suffix: str) -> bytes:
+    """The file with all its text in ASCII: a name in an old encoding is no reason to refuse a mesh."""
+    if suffix == ".ply":
+        header, end, body = content.partition(b"end_header")
+        return header.translate(_TO_ASCII) + end + body
+    is_binary = suffix == ".stl" and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little")
+    return content if is_binary else content.translate(_TO_ASCII)
+
+
+def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> None:
+    extent_mm = np.ptp(corners, axis=0)
+    sides = " x ".join(f"{side:.4g}" for side in extent_mm)
+    smallest_mm, largest_mm = EXTENT_MM
+    if extent_mm.max() > largest_mm:
+        raise MeshError(
+            f"{path}: {sides} mm with unit_mm={unit_mm:g}, at most {largest_mm:g} mm; "
+            "if its unit is another give unit_mm (25.4 for inches, 0.001 for micrometres), else cut out the part to tap"
+        )
+    if extent_mm.max() < smallest_mm:
+        raise MeshError(
+            f"{path}: {sides} mm with unit_mm={unit_mm:g}, at least {smallest_mm:g} mm; "
+            "if it is in metres give unit_mm=1000, in inches unit_mm=25.4"
+        )
+    spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
+    if spreads[0] <= _FLAT**2 * spreads[-1]:
+        raise MeshError(f"{path}: flat, a sheet without thickness ({sides} mm); extrude it to a closed body")
+
+
+def _open_edges(faces: NDArray[np.int64]) -> int:
+    """Edges with an odd number of triangles: a closed body has none, nor have bodies that touch along an edge."""
+    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(ends[:, 0] * (faces.max() + 1) + ends[:, 1], return_counts=True)
+    return int((counts % 2).sum())
