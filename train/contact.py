@@ -2,7 +2,11 @@
 
 Pressure >= 0, gap >= 0, and one of them zero in every cell (Polonsky and Keer 1999: conjugate gradients on
 the touching cells, which change from step to step). Displacement from pressure is a convolution, done by FFT
-on a padded grid. Many poses are solved side by side.
+on a padded grid. Only the bounding box of the cells that a press can reach is worked on: the kernel is the whole
+pad's, cut to the box, so a box gives what the whole pad gives. Poses of like boxes are solved side by side.
+
+A cell that a surface's edge runs through carries as much as it is covered: readings then change steadily while the
+surface moves, where whole cells alone make them jump by 1 to 2 % (docs/log.md).
 """
 
 from dataclasses import dataclass
@@ -17,6 +21,9 @@ from train.layer import Layer, surface_compliance
 _MAX_STEPS: Final = 200
 _PADDED_LENGTHS: Final = 2
 """Grid with padding over grid: the response of a bonded layer dies within a few thicknesses."""
+REACH: Final = 1.5
+"""Cells this many indentations deep may touch: the pad bulges out beside a contact, by 0.39 of the indentation at
+most over the 18 surfaces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,15 +32,25 @@ class ContactResult:
 
     Attributes:
         pressure_mpa: (n, size, size), in [MPa].
-        displacement_mm: (n, size, size), surface displacement downwards, in [mm].
-        steps: conjugate-gradient steps taken.
-        residual: (n,) root mean square gap error where pressure acts, as a share of the indentation.
+        steps: conjugate-gradient steps taken, of the slowest pose.
+        residual: (n,) root mean square gap where pressure acts or surfaces overlap, as a share of the indentation.
+        solver: whose solution it is.
     """
 
     pressure_mpa: NDArray[np.float32]
-    displacement_mm: NDArray[np.float32]
     steps: int
     residual: NDArray[np.float32]
+    solver: "ContactSolver"
+
+    @property
+    def displacement_mm(self) -> NDArray[np.float32]:
+        """Surface displacement downwards on the whole pad, (n, size, size) in [mm]; worked out when asked for."""
+        return self.solver.displacement_mm(self.pressure_mpa)
+
+    @property
+    def force_n(self) -> NDArray[np.float32]:
+        """Force on the pad, (n,) in [N]."""
+        return self.pressure_mpa.sum(axis=(1, 2)) * np.float32(self.solver.cell_mm**2)
 
 
 class ContactSolver:
@@ -44,75 +61,185 @@ class ContactSolver:
         size: cells along a side.
         cell_mm: their size, in [mm].
         dtype: torch.float32 or torch.float64.
+        boxed: work on boxes; else on the whole pad, for comparison.
     """
 
-    def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32, boxed: bool = True
+    ) -> None:
         self.size = size
         self.cell_mm = cell_mm
-        self._padded = _PADDED_LENGTHS * size
-        q_x = 2 * np.pi * np.fft.rfftfreq(self._padded, cell_mm)
-        q_y = 2 * np.pi * np.fft.fftfreq(self._padded, cell_mm)
+        padded = _PADDED_LENGTHS * size
+        q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
+        q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
         compliance = surface_compliance(layer, np.hypot(q_x[None, :], q_y[:, None]))
-        self._compliance = torch.as_tensor(compliance, dtype=dtype)
+        self._kernel = np.fft.irfft2(compliance, s=(padded, padded))
         self._dtype = dtype
+        # Powers of two: the FFT is at its best, and there are few shapes, so that many poses share one.
+        self._sides = [side for side in (8, 16, 32, 64, 128, 256) if side < size and boxed] + [size]
+        self._spectra: dict[tuple[int, int], torch.Tensor] = {}
 
-    def displace(self, pressure_mpa: torch.Tensor) -> torch.Tensor:
-        """Surface displacement downwards of pressures (n, size, size), in [mm]."""
-        spectrum = torch.fft.rfft2(pressure_mpa, s=(self._padded, self._padded))
-        moved = torch.fft.irfft2(spectrum * self._compliance, s=(self._padded, self._padded))
-        return moved[:, : self.size, : self.size]
+    @property
+    def cell_compliance_mm_per_mpa(self) -> float:
+        """How far a cell sinks under its own pressure alone, in [mm/MPa]."""
+        return float(self._kernel[0, 0])
+
+    def displacement_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Surface displacement downwards under pressures (n, size, size), in [mm]."""
+        return self._displace(torch.as_tensor(pressure_mpa, dtype=self._dtype)).numpy().astype(np.float32)
 
     def solve(
-        self, depth_mm: NDArray[np.float32], indentation_mm: float = 1.0, tolerance: float = 1e-3
+        self,
+        depth_mm: NDArray[np.floating],
+        indentation_mm: float | NDArray[np.floating] = 1.0,
+        tolerance: float = 1e-3,
+        start_mpa: NDArray[np.floating] | None = None,
+        cover: NDArray[np.floating] | None = None,
     ) -> ContactResult:
         """Press surfaces of the given depths into the pad.
 
         For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
 
         Args:
-            depth_mm: (n, size, size), how far each cell lies below the highest point, in [mm].
-            indentation_mm: how deep the highest point is pressed in, > 0, in [mm].
+            depth_mm: (n, size, size), how far each cell lies below the point of first contact, in [mm].
+            indentation_mm: how deep that point is pressed in, one for all or (n,), > 0, in [mm].
             tolerance: residual at which a pose is done.
+            start_mpa: pressures to start from, (n, size, size), if anything is known of them.
+            cover: share of each cell that the surface is over, (n, size, size), above 0 wherever a cell is reached; all
+                whole if None. Pressures are then means over cells.
 
         Raises:
-            ValueError: shapes or values do not fit.
+            ValueError: shapes or values do not fit, or no cell of a pose is reached.
         """
         if depth_mm.shape[1:] != (self.size, self.size):
             raise ValueError(f"depth images of shape {depth_mm.shape}, expected (n, {self.size}, {self.size})")
-        if not indentation_mm > 0:
-            raise ValueError(f"indentation is {indentation_mm} mm, expected a positive depth")
-        wanted = indentation_mm - torch.as_tensor(depth_mm, dtype=self._dtype)
-        reachable = wanted > 0
-        pressure = torch.where(reachable, wanted / self._compliance.mean(), 0.0)
-        direction = torch.zeros_like(pressure)
-        energy_before = torch.ones(len(pressure), 1, 1, dtype=self._dtype)
-        keep = torch.zeros(len(pressure), 1, 1, dtype=self._dtype)
-        residual = torch.full((len(pressure),), torch.inf, dtype=self._dtype)
+        if cover is not None and cover.shape != depth_mm.shape:
+            raise ValueError(f"cover of shape {cover.shape}, expected that of the depth images, {depth_mm.shape}")
+        indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
+        if not (indentation > 0).all():
+            raise ValueError(f"indentation is {indentation.min()} mm, expected a positive depth")
+        lowest = depth_mm.min(axis=(1, 2))
+        if (lowest >= indentation).any():
+            pose = int(np.argmax(lowest >= indentation))
+            raise ValueError(
+                f"depth image {pose} begins {lowest[pose]:.4g} mm down, pressed in by {indentation[pose]:.4g} mm: no "
+                "cell of the pad is reached; press deeper, or measure depth from first contact"
+            )
+        pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
+        residual = np.zeros(len(depth_mm), dtype=np.float32)
         steps = 0
-        while steps < _MAX_STEPS:
-            steps += 1
-            gap = torch.where(reachable, self.displace(pressure) - wanted, 0.0)
+        for (height, width), poses, top, left in self._boxes(depth_mm < REACH * indentation[:, None, None]):
+            rows = (top[:, None] + np.arange(height))[:, :, None]
+            columns = (left[:, None] + np.arange(width))[:, None, :]
+            place = (poses[:, None, None], rows, columns)
+            press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
+            depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
+            start = None if start_mpa is None else torch.as_tensor(start_mpa[place], dtype=self._dtype)
+            give = None if cover is None else self._give(torch.as_tensor(cover[place], dtype=self._dtype))
+            found, error, taken = self._conjugate_gradients(depth, press, tolerance, start, give)
+            pressure_mpa[place] = found.numpy()
+            residual[poses] = error.numpy()
+            steps = max(steps, taken)
+        return ContactResult(pressure_mpa, steps, residual, self)
+
+    def _boxes(
+        self, within: NDArray[np.bool_]
+    ) -> list[tuple[tuple[int, int], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
+        """Poses by shape of box: (shape, their indices, first row and first column of each one's box)."""
+        sides = np.array(self._sides)
+        shapes, starts = [], []
+        for axis in (1, 2):
+            used = np.asarray(within.any(axis=3 - axis))
+            first, last = used.argmax(axis=1), self.size - 1 - used[:, ::-1].argmax(axis=1)
+            side = sides[np.searchsorted(sides, last - first + 1)]
+            shapes.append(side)
+            starts.append(np.minimum(first, self.size - side))
+        kinds, kind = np.unique(np.stack(shapes, axis=1), axis=0, return_inverse=True)
+        groups = [np.flatnonzero(kind.reshape(-1) == i) for i in range(len(kinds))]
+        return [
+            ((int(height), int(width)), poses, starts[0][poses], starts[1][poses])
+            for (height, width), poses in zip(kinds, groups, strict=True)
+        ]
+
+    def _give(self, cover: torch.Tensor) -> torch.Tensor:
+        """How much further a cell sinks under its own pressure because a share of it alone carries that, in [mm/MPa].
+
+        The pressure on the covered share is 1 / cover times the cell's mean.
+        """
+        return self.cell_compliance_mm_per_mpa * torch.where(cover > 0, 1 / cover - 1, 0.0)
+
+    def _conjugate_gradients(
+        self,
+        depth: torch.Tensor,
+        press: torch.Tensor,
+        tolerance: float,
+        start: torch.Tensor | None,
+        give: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, torch.Tensor, int]:
+        """Pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1)."""
+        reachable = depth < REACH * press
+        wanted = torch.where(reachable, press - depth, 0.0)
+        if give is None:
+            give = torch.zeros(())
+        pressure = wanted.clamp_min(0) / (self.cell_compliance_mm_per_mpa + give)
+        give = give.expand_as(pressure)
+        if start is not None:
+            known = torch.where(reachable, start.clamp_min(0.0), 0.0)
+            pressure = torch.where(known.amax(dim=(1, 2), keepdim=True) > 0, known, pressure)
+        result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
+        working = torch.arange(len(pressure))
+        gap = torch.where(reachable, self._displace(pressure) + give * pressure - wanted, 0.0)
+        direction = torch.zeros_like(pressure)
+        energy_before = torch.ones_like(press)
+        keep = torch.zeros_like(press)
+        steps = 0
+        while True:
             touching = pressure > 0
             gap_touching = torch.where(touching, gap, 0.0)
-            residual = _rms(gap_touching, touching) / indentation_mm
-            if bool((residual < tolerance).all()):
-                break
+            wrong = touching | (gap < 0)
+            error = _rms(torch.where(wrong, gap, 0.0), wrong) / press[:, 0, 0]
+            done = error < tolerance
+            if steps == _MAX_STEPS:
+                done[:] = True
+            if bool(done.any()):
+                result[working[done]], residual[working[done]] = pressure[done], error[done]
+                if bool(done.all()):
+                    break
+                more = ~done
+                working, wanted, reachable, press = working[more], wanted[more], reachable[more], press[more]
+                give = give[more]
+                pressure, gap, direction, touching = pressure[more], gap[more], direction[more], touching[more]
+                gap_touching, energy_before, keep = gap_touching[more], energy_before[more], keep[more]
+            steps += 1
             energy = _total(gap_touching**2)
             direction = torch.where(touching, gap + keep * (energy / energy_before) * direction, 0.0)
             energy_before = energy.clamp_min(1e-30)
-            response = torch.where(touching, self.displace(direction), 0.0)
+            response = self._displace(direction) + give * direction
             length = _total(gap_touching * direction) / _total(response * direction).clamp_min(1e-30)
-            pressure = torch.where(touching, pressure - length * direction, 0.0).clamp_min(0.0)
+            stepped = pressure - length * direction
+            pressure = stepped.clamp_min(0.0)
             # A cell that lifted off although it would sink in comes back; the search then starts afresh.
             returning = (pressure <= 0) & (gap < 0) & reachable
             pressure = torch.where(returning, -length.abs() * gap, pressure)
             keep = (~returning.flatten(1).any(dim=1)).to(self._dtype)[:, None, None]
-        return ContactResult(
-            pressure.numpy().astype(np.float32),
-            self.displace(pressure).numpy().astype(np.float32),
-            steps,
-            residual.numpy().astype(np.float32),
-        )
+            # Where no cell lifted off or came back the step was straight, and so is the gap's.
+            bent = (returning | (stepped < 0)).flatten(1).any(dim=1)
+            gap = torch.where(reachable, gap - length * response, 0.0)
+            if bool(bent.any()):
+                again = self._displace(pressure[bent]) + give[bent] * pressure[bent] - wanted[bent]
+                gap[bent] = torch.where(reachable[bent], again, 0.0)
+        return result, residual, steps
+
+    def _displace(self, pressure: torch.Tensor) -> torch.Tensor:
+        """Displacement within boxes (n, height, width) under pressures in them."""
+        height, width = pressure.shape[1:]
+        padded = (2 * height, 2 * width)
+        if (height, width) not in self._spectra:
+            rows, columns = (np.fft.ifftshift(np.arange(-side, side)) for side in (height, width))
+            kernel = torch.as_tensor(self._kernel[np.ix_(rows, columns)], dtype=self._dtype)
+            self._spectra[height, width] = torch.fft.rfft2(kernel).real
+        spectrum = torch.fft.rfft2(pressure, s=padded) * self._spectra[height, width]
+        return torch.fft.irfft2(spectrum, s=padded)[:, :height, :width]
 
 
 def _total(maps: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,13 @@
-"""Depth images: how far below its highest point a surface lies under the sensor's footprint."""
+"""Depth images: how far below what it touches first a surface lies under the pad.
 
+A pose turns the surface's triangles into the pad's axes, and they are drawn straight onto the grid asked for: every
+pixel's depth is that of the surface at the pixel's centre, on flats, slopes and edges alike. Only triangles whose
+bounding box meets the footprint are drawn.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import cos, radians, sin
 from typing import Final
 
@@ -8,9 +15,15 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-MAP_CELL_MM: Final = 0.1
 NOTHING_MM: Final = 1e3
 """Depth where there is no surface at all: out of any press's reach."""
+_UNFELT_MM: Final = 0.05
+"""What stands out further than this from between the cells of the pad is a feature finer than they are."""
+SAMPLES: Final = 4
+"""Along a cell's side, by which is told how much of it is covered."""
+_TRIANGLES_AT_ONCE: Final = 2**17
+_ROUNDING_PX: Final = 1e-9
+"""Neighbours' common edge must hide no pixel that lies on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,63 +35,178 @@ class Pose:
     angle_deg: float
 
 
-@dataclass(frozen=True, slots=True)
-class DepthMap:
-    """A surface seen from above.
+class Relief:
+    """A surface to be looked down on.
 
-    Attributes:
-        depth_mm: (n, m) below the highest point, in [mm]; row = y, column = x; NOTHING_MM off the surface.
-        left_mm: x of the first column's centre.
-        bottom_mm: y of the first row's centre.
+    Args:
+        name: what errors call it.
+        mesh: the surface, in [mm], z up.
     """
 
-    depth_mm: NDArray[np.float32]
-    left_mm: float
-    bottom_mm: float
+    def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
+        self.name = name
+        triangles_mm = np.asarray(mesh.triangles, dtype=np.float64)
+        # In order of their left ends, those near a place are a slice, however large the mesh is.
+        self.triangles_mm = triangles_mm[np.argsort(triangles_mm[:, :, 0].min(axis=1), kind="stable")]
+        self._low_mm = self.triangles_mm[:, :, :2].min(axis=1)
+        self._high_mm = self.triangles_mm[:, :, :2].max(axis=1)
+        self._widest_mm = (self._high_mm - self._low_mm)[:, 0].max(initial=0.0)
+
+    def near(self, pose: Pose, reach_mm: float) -> NDArray[np.float64]:
+        """Triangles (t, 3, 3) whose bounding box comes within `reach_mm` of a pose's centre, in x and in y."""
+        place = np.array([pose.x_mm, pose.y_mm])
+        left, right = place[0] - reach_mm - self._widest_mm, place[0] + reach_mm
+        first, last = np.searchsorted(self._low_mm[:, 0], left), np.searchsorted(self._low_mm[:, 0], right, "right")
+        low_mm, high_mm = self._low_mm[first:last], self._high_mm[first:last]
+        meets = ((low_mm <= place + reach_mm) & (high_mm >= place - reach_mm)).all(axis=1)
+        return self.triangles_mm[first:last][meets]
 
 
-def depth_map(mesh: trimesh.Trimesh, cell_mm: float = MAP_CELL_MM) -> DepthMap:
-    """Look down on a mesh once, so that every pose is a look-up."""
-    triangles = np.asarray(mesh.triangles, dtype=np.float64)
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    width, height = (np.ceil((high[:2] - low[:2]) / cell_mm)).astype(int)
-    top_mm = np.full((height, width), -np.inf)
-    for corners in triangles:
-        _raise_to(top_mm, corners, low, cell_mm)
-    depth_mm = np.where(np.isfinite(top_mm), high[2] - top_mm, NOTHING_MM).astype(np.float32)
-    return DepthMap(depth_mm, float(low[0] + cell_mm / 2), float(low[1] + cell_mm / 2))
-
-
-def _raise_to(top_mm: NDArray[np.float64], corners: NDArray[np.float64], low: NDArray[np.float64], cell: float) -> None:
-    """Z-buffer one triangle (3, 3) into the map, over its own bounding box only."""
-    (x0, y0, z0), (x1, y1, z1), (x2, y2, z2) = corners
-    area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-    if abs(area) < 1e-12:  # seen edge-on
-        return
-    first = np.maximum(np.floor((corners[:, :2].min(axis=0) - low[:2]) / cell).astype(int), 0)
-    last = np.minimum(np.ceil((corners[:, :2].max(axis=0) - low[:2]) / cell).astype(int), top_mm.shape[::-1])
-    x = low[0] + (np.arange(first[0], last[0]) + 0.5) * cell
-    y = low[1] + (np.arange(first[1], last[1])[:, None] + 0.5) * cell
-    share1 = ((x - x0) * (y2 - y0) - (x2 - x0) * (y - y0)) / area
-    share2 = ((x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)) / area
-    inside = (share1 >= 0) & (share2 >= 0) & (share1 + share2 <= 1)
-    z = z0 + share1 * (z1 - z0) + share2 * (z2 - z0)
-    box = top_mm[first[1] : last[1], first[0] : last[0]]
-    np.maximum(box, np.where(inside, z, -np.inf), out=box)
-
-
-def depth_image(surface: DepthMap, pose: Pose, size: int, cell_mm: float) -> NDArray[np.float32]:
-    """Depth under the footprint, (size, size) in [mm], row-major from the top left, in the sensor's axes.
+@dataclass(frozen=True, slots=True)
+class Footprints:
+    """What lies under the pad at n poses.
 
     The sensor's y points down its rows, the surface's y up: the pad faces the surface.
+
+    Attributes:
+        triangles_mm: for each pose (t, 3, 3): x to the right, y down the rows, from the pad's centre; z as it is.
+        top_mm: (n,) height of what the pad touches first, in [mm].
+        depth_mm: (n, size, size) below `top_mm` on the pad's cells, in [mm], row-major from the top left; NOTHING_MM
+            off the surface.
     """
-    along_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
-    right_mm, down_mm = along_mm[None, :], along_mm[:, None]
+
+    triangles_mm: list[NDArray[np.float64]]
+    top_mm: NDArray[np.float64]
+    depth_mm: NDArray[np.float32]
+
+    def depth_on(self, size: int, pixel_mm: float, poses: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Depth at the given poses on another grid, `size` x `size` pixels centred on the pad, in [mm]."""
+        height_mm = _draw([self.triangles_mm[i] for i in poses], size, pixel_mm)
+        return _below(self.top_mm[poses], height_mm)
+
+    def cover_on(self, size: int, cell_mm: float, poses: NDArray[np.integer], level_mm: float) -> NDArray[np.float32]:
+        """Share of each cell that lies within `level_mm` of the top at the given poses, (k, size, size), 0 to 1."""
+        # Nothing further down is drawn: it hides nothing of the top.
+        tops = [
+            self.triangles_mm[i][self.triangles_mm[i][:, :, 2].min(axis=1) >= self.top_mm[i] - level_mm] for i in poses
+        ]
+        drawn = np.isfinite(_draw(tops, size * SAMPLES, cell_mm / SAMPLES))
+        return drawn.reshape(len(tops), size, SAMPLES, size, SAMPLES).mean(axis=(2, 4), dtype=np.float32)
+
+
+def footprints(reliefs: Sequence[Relief], poses: Sequence[Pose], size: int, cell_mm: float) -> Footprints:
+    """Look at surfaces from poses, one pose each, by a pad of `size` x `size` cells.
+
+    Depth counts from the highest point under the footprint, not under the mesh: indentation is measured from first
+    contact. Between the cells' centres that point is found on the triangles' edges; what stands out there by more
+    than _UNFELT_MM is finer than a cell and is not felt.
+
+    Raises:
+        ValueError: nothing lies under the pad at a pose.
+    """
+    width_mm = size * cell_mm
+    seen = [_under(relief, pose, width_mm) for relief, pose in zip(reliefs, poses, strict=True)]
+    height_mm = _draw(seen, size, cell_mm)
+    felt_mm = height_mm.max(axis=(1, 2))
+    if not np.isfinite(felt_mm).all():
+        first = int(np.argmin(np.isfinite(felt_mm)))
+        raise ValueError(
+            f"nothing of surface {reliefs[first].name!r} lies under the pad at {poses[first]}; expected a pose over it"
+        )
+    peak_mm = np.array([_highest(triangles, width_mm) for triangles in seen])
+    top_mm = np.where(peak_mm - felt_mm <= _UNFELT_MM, np.maximum(peak_mm, felt_mm), felt_mm)
+    return Footprints(seen, top_mm, _below(top_mm, height_mm))
+
+
+def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArray[np.float32]:
+    """Depth under one footprint of `size` x `size` cells, (size, size) in [mm]; see Footprints.
+
+    Raises:
+        ValueError: nothing lies under the pad.
+    """
+    return footprints([relief], [pose], size, cell_mm).depth_mm[0]
+
+
+def _below(top_mm: NDArray[np.float64], height_mm: NDArray[np.float64]) -> NDArray[np.float32]:
+    depth_mm = top_mm[:, None, None] - height_mm
+    return np.where(np.isfinite(depth_mm), depth_mm, NOTHING_MM).astype(np.float32)
+
+
+def _under(relief: Relief, pose: Pose, width_mm: float) -> NDArray[np.float64]:
+    """Triangles (t, 3, 3) in the pad's axes, those whose bounding box there meets the footprint."""
+    triangles_mm = relief.near(pose, width_mm / np.sqrt(2))
     cosine, sine = cos(radians(pose.angle_deg)), sin(radians(pose.angle_deg))
-    x_mm = pose.x_mm + cosine * right_mm + sine * down_mm
-    y_mm = pose.y_mm + sine * right_mm - cosine * down_mm
-    column = np.rint((x_mm - surface.left_mm) / MAP_CELL_MM).astype(int)
-    row = np.rint((y_mm - surface.bottom_mm) / MAP_CELL_MM).astype(int)
-    height, width = surface.depth_mm.shape
-    on_map = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    return np.where(on_map, surface.depth_mm[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], NOTHING_MM)
+    x_mm, y_mm = triangles_mm[:, :, 0] - pose.x_mm, triangles_mm[:, :, 1] - pose.y_mm
+    turned = np.stack([cosine * x_mm + sine * y_mm, sine * x_mm - cosine * y_mm, triangles_mm[:, :, 2]], axis=2)
+    flat = turned[:, :, :2]
+    return turned[((flat.min(axis=1) <= width_mm / 2) & (flat.max(axis=1) >= -width_mm / 2)).all(axis=1)]
+
+
+def _highest(triangles_mm: NDArray[np.float64], width_mm: float) -> float:
+    """Height of the highest point of the triangles' edges inside the footprint, in [mm]; -inf if there is none."""
+    start = triangles_mm
+    step = np.roll(triangles_mm, -1, axis=1) - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at_low = (-width_mm / 2 - start[:, :, :2]) / step[:, :, :2]
+        at_high = (width_mm / 2 - start[:, :, :2]) / step[:, :, :2]
+    # fmin and fmax pass over 0/0: an edge that runs along a side of the footprint.
+    enters = np.maximum(np.fmin(at_low, at_high).max(axis=2), 0)
+    leaves = np.minimum(np.fmax(at_low, at_high).min(axis=2), 1)
+    inside = enters <= leaves
+    rise_mm = step[inside, 2]
+    ends = start[inside, 2] + np.maximum(enters[inside] * rise_mm, leaves[inside] * rise_mm)
+    return float(np.max(ends, initial=-np.inf))
+
+
+def _draw(seen: list[NDArray[np.float64]], size: int, cell_mm: float) -> NDArray[np.float64]:
+    """Height of the topmost triangle at each pixel's centre, (n, size, size) in [mm]; -inf where there is none."""
+    height_mm = np.full((len(seen), size, size), -np.inf)
+    counts = np.array([len(triangles) for triangles in seen], dtype=np.int64)
+    block = (np.cumsum(counts) - counts) // _TRIANGLES_AT_ONCE
+    for start, stop in pairwise([*np.unique(block, return_index=True)[1], len(seen)]):
+        corners = np.concatenate(seen[start:stop])
+        image = np.repeat(np.arange(stop - start), counts[start:stop])
+        corners[:, :, :2] = corners[:, :, :2] / cell_mm + (size - 1) / 2
+        _raise_to(height_mm[start:stop], corners, image)
+    return height_mm
+
+
+def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], image: NDArray[np.integer]) -> None:
+    """Z-buffer triangles into images, row by row of each: corners (t, 3, 3) with x and y in pixels, image (t,)."""
+    size = height_mm.shape[1]
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = edge1[:, 0] * edge2[:, 1] - edge2[:, 0] * edge1[:, 1]
+    facing = np.abs(area) > 1e-12  # the others are seen edge-on
+    corners, image, edge1, edge2, area = corners[facing], image[facing], edge1[facing], edge2[facing], area[facing]
+    slope_x = (edge1[:, 2] * edge2[:, 1] - edge2[:, 2] * edge1[:, 1]) / area
+    slope_y = (edge2[:, 2] * edge1[:, 0] - edge1[:, 2] * edge2[:, 0]) / area
+    bottom_mm, top_mm = corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)
+
+    triangle, row = _spans(corners[:, :, 1].min(axis=1), corners[:, :, 1].max(axis=1), size)
+    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for start, stop in ((0, 1), (1, 2), (2, 0)):
+        x0, y0 = corners[triangle, start, 0], corners[triangle, start, 1]
+        x1, y1 = corners[triangle, stop, 0], corners[triangle, stop, 1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (row - y0) / (y1 - y0)  # not finite on a level edge, whose ends the two others have
+        crosses = (share >= -_ROUNDING_PX) & (share <= 1 + _ROUNDING_PX)
+        x = x0 + np.clip(share, 0, 1) * (x1 - x0)
+        left = np.where(crosses, np.minimum(left, x), left)
+        right = np.where(crosses, np.maximum(right, x), right)
+    strip, column = _spans(left, right, size)
+    x0, y0, z0 = corners[triangle, 0].T
+    z_mm = (z0 - slope_x[triangle] * x0 + slope_y[triangle] * (row - y0))[strip] + slope_x[triangle][strip] * column
+    # A nearly vertical wall's slope is too steep to be trusted beyond its own corners.
+    z_mm = np.clip(z_mm, bottom_mm[triangle][strip], top_mm[triangle][strip])
+    np.maximum.at(height_mm.reshape(-1), ((image[triangle] * size + row) * size)[strip] + column, z_mm)
+
+
+def _spans(
+    low_px: NDArray[np.float64], high_px: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """All whole numbers between bounds (t,), both within and 0 up to below size: (owner, number) of each."""
+    first = np.ceil(np.clip(low_px - _ROUNDING_PX, 0, size)).astype(np.int64)
+    last = np.floor(np.clip(high_px + _ROUNDING_PX, -1, size - 1)).astype(np.int64)
+    counts = np.maximum(last - first + 1, 0)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    return owner, np.arange(len(owner)) + np.repeat(first - np.cumsum(counts) + counts, counts)

@@ -23,7 +23,9 @@ class Layer:
 
     thickness_mm: float = 4.5
     shear_modulus_mpa: float = 0.12
-    poisson: float = 0.49
+    poisson: float = 0.45
+    """Effective: a 20 mm pad is free at its sides. Nearer to 0.5 the sum of z is not in proportion to the force (28 to
+    990 counts per newton over the 18 surfaces at 0.49, 670 to 1310 here), which on real skins it is to R^2 = .9997."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.poisson < 0.5:

@@ -1,0 +1,166 @@
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import Delaunay
+
+from train.depth import NOTHING_MM, Pose, Relief, depth_image, footprints
+from train.surfaces import FIGURE_HEIGHT_MM, SURFACES, surface_mesh
+
+SIZE, CELL_MM = 42, 0.47
+CENTRE = Pose(0, 0, 0)
+
+
+def along_mm(size=SIZE, cell_mm=CELL_MM):
+    return (np.arange(size) - (size - 1) / 2) * cell_mm
+
+
+def relief(name):
+    return Relief(name, surface_mesh(name))
+
+
+def field(height, x_mm, y_mm):
+    """A mesh of the function `height` over scattered points."""
+    faces = Delaunay(np.stack([x_mm, y_mm], axis=1)).simplices
+    return trimesh.Trimesh(np.stack([x_mm, y_mm, height(x_mm, y_mm)], axis=1), faces, process=False)
+
+
+def scattered(half_mm, count, seed=0):
+    rng = np.random.default_rng(seed)
+    corners = half_mm * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    return np.concatenate([corners, rng.uniform(-half_mm, half_mm, (count, 2))]).T
+
+
+def image(name, pose, size=41):
+    return depth_image(relief(name), pose, size, 0.5) < FIGURE_HEIGHT_MM / 2
+
+
+@pytest.mark.parametrize("angle_deg", [0, 37, 90])
+def test_a_slope_is_exact_at_every_pixel(angle_deg):
+    surface = Relief("slope", field(lambda x, y: 0.1 * x - 0.03 * y, *scattered(20, 500)))
+    pose = Pose(1.3, -2.1, angle_deg)
+    depth = depth_image(surface, pose, SIZE, CELL_MM)
+    right, down = along_mm()[None, :], along_mm()[:, None]
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    height = 0.1 * (cosine * right + sine * down) - 0.03 * (sine * right - cosine * down)
+    assert np.allclose(depth - depth.min(), height.max() - height, atol=1e-5)
+    # First contact is at the footprint's corner, half a cell beyond the highest pixel.
+    assert 0 <= depth.min() <= 0.13 * np.sqrt(2) * CELL_MM / 2
+
+
+def test_a_dome_is_as_deep_as_a_sphere_wherever_it_stands():
+    rng = np.random.default_rng(3)
+    poses = [Pose(*rng.uniform(-1, 1, 2), rng.uniform(0, 360)) for _ in range(20)]
+    seen = footprints([relief("sphere:8")] * 20, poses, SIZE, CELL_MM)
+    for pose, depth in zip(poses, seen.depth_mm, strict=True):
+        cosine, sine = np.cos(np.radians(pose.angle_deg)), np.sin(np.radians(pose.angle_deg))
+        x_mm = pose.x_mm + cosine * along_mm()[None, :] + sine * along_mm()[:, None]
+        y_mm = pose.y_mm + sine * along_mm()[None, :] - cosine * along_mm()[:, None]
+        expected = 8 - np.sqrt(np.maximum(64 - x_mm**2 - y_mm**2, 0))
+        cap = expected < 1
+        assert np.abs(depth - expected)[cap].max() < 2e-3  # facets
+
+
+def test_first_contact_is_found_between_the_cells():
+    half = CELL_MM / 2
+    for name, expected in (("sphere:5", 2 * half**2 / 10), ("cylinder:5", half**2 / 10)):
+        assert depth_image(relief(name), CENTRE, SIZE, CELL_MM).min() == pytest.approx(expected, rel=0.05)
+
+
+def test_what_is_finer_than_a_cell_is_not_felt():
+    slab = trimesh.creation.box([20, 20, 1])
+    needle = trimesh.creation.box([0.2, 0.2, 3])
+    seen = depth_image(Relief("needle", slab + needle), CENTRE, SIZE, CELL_MM)
+    assert np.allclose(seen, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_neighbours_leave_no_crack(seed):
+    x_mm, y_mm = scattered(15, 300, seed)
+    on_pixels = np.random.default_rng(seed).choice(along_mm(), (2, 200))
+    plane = field(lambda x, y: 0 * x, np.append(x_mm, on_pixels[0]), np.append(y_mm, on_pixels[1]))
+    for angle_deg in (0, 45, 90, 123.4):
+        assert not depth_image(Relief("plane", plane), Pose(0, 0, angle_deg), SIZE, CELL_MM).any()
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_the_image_shows_the_figures_area(name):
+    mesh = surface_mesh(name)
+    top = mesh.area_faces[(mesh.triangles[:, :, 2] > -1e-9).all(axis=1)].sum()
+    seen = depth_image(Relief(name, mesh), Pose(0.03, 0.02, 20), 200, 0.1)
+    assert (seen < FIGURE_HEIGHT_MM / 2).sum() * 0.1**2 == pytest.approx(top, rel=0.01)
+    assert set(np.unique(seen.round(5))) <= {0.0, FIGURE_HEIGHT_MM, NOTHING_MM}
+
+
+def test_a_wall_that_nearly_stands_rises_no_higher_than_its_corners():
+    # The top's edge passes a pixel's centre by less than rounding, on a wall that leans by 0.3 nm over 2 mm.
+    block = trimesh.creation.box([6.1, 6.1, 2])
+    outwards = np.where(block.vertices[:, 2:] > 0, 0.5e-10, 3e-10)
+    block = trimesh.Trimesh(block.vertices + np.sign(block.vertices) * [1, 1, 0] * outwards, block.faces, process=False)
+    seen = footprints([Relief("block", block)], [CENTRE], 64, 0.1)
+    assert seen.top_mm[0] == 1.0
+    assert set(np.unique(seen.depth_mm)) == {0.0, NOTHING_MM}
+
+
+def test_depth_counts_from_what_lies_under_this_footprint():
+    low = trimesh.creation.box([60, 30, 1])
+    high = trimesh.creation.box([5, 5, 4])
+    high.apply_translation([20, 0, 0])
+    surface = Relief("two", low + high)
+    assert not depth_image(surface, CENTRE, SIZE, CELL_MM).any()
+    edge = depth_image(surface, Pose(10, 0, 0), SIZE, CELL_MM)
+    assert edge.min() == edge[20, -1] == 0
+    assert edge[20, 0] == pytest.approx(1.5)
+
+
+def test_another_grid_counts_from_the_same_point():
+    seen = footprints([relief("sphere:6"), relief("T")], [CENTRE, Pose(1, 2, 30)], SIZE, CELL_MM)
+    fine = seen.depth_on(SIZE * 3, CELL_MM / 3, np.array([1, 0]))
+    assert np.allclose(fine[::-1, 1::3, 1::3], seen.depth_mm, atol=1e-5)
+
+
+def test_only_the_triangles_under_the_footprint_are_worked_on():
+    axis_mm = np.linspace(-100, 100, 126)
+    x_mm, y_mm = (grid.ravel() for grid in np.meshgrid(axis_mm, axis_mm))
+
+    def waves(x, y):
+        return np.sin(x / 7) * np.cos(y / 5)
+
+    mesh = field(waves, x_mm, y_mm)
+    large = Relief("waves", mesh)
+    poses = [Pose(60.3, -40.1, 25), Pose(-70, 80, 0)]
+    seen = footprints([large, large], poses, SIZE, CELL_MM)
+    for pose, triangles, depth in zip(poses, seen.triangles_mm, seen.depth_mm, strict=True):
+        assert len(triangles) < 2000  # of 31 250: two on 2.56 mm2, and those about a turned footprint
+        near = np.hypot(*(mesh.triangles_center[:, :2] - (pose.x_mm, pose.y_mm)).T) < 20
+        piece = Relief("piece", trimesh.Trimesh(mesh.vertices, mesh.faces[near], process=False))
+        assert (depth_image(piece, pose, SIZE, CELL_MM) == depth).all()
+
+
+def test_a_pose_beside_the_surface_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"surface 'I' lies under the pad at Pose\(x_mm=50"):
+        footprints([relief("T"), relief("I")], [CENTRE, Pose(50, 0, 0)], SIZE, CELL_MM)
+
+
+def test_off_the_surface_there_is_nothing():
+    depth = depth_image(relief("large square"), Pose(12, 0, 0), SIZE, CELL_MM)
+    assert (depth[:, -5:] == NOTHING_MM).all()
+    assert (depth[:, :5] < NOTHING_MM).all()
+
+
+def test_a_letter_stands_upright_as_seen_through_the_pad():
+    letter = image("F", CENTRE)
+    assert letter[:20].sum() > letter[21:].sum()
+    assert letter[:, :20].sum() > letter[:, 21:].sum()
+
+
+def test_moving_the_pad_right_moves_the_figure_left():
+    centre = np.argwhere(image("small circle", Pose(3, 0, 0))).mean(axis=0) - 20
+    assert centre == pytest.approx([0, -6], abs=0.1)
+    centre = np.argwhere(image("small circle", Pose(0, 3, 0))).mean(axis=0) - 20
+    assert centre == pytest.approx([6, 0], abs=0.1)  # up on the surface is towards lower rows, so it moves down
+
+
+def test_turning_the_pad_a_quarter_turns_the_figure_back():
+    upright, turned = image("L", CENTRE), image("L", Pose(0, 0, 90))
+    # Seen from above the pad turns counterclockwise, so the figure turns clockwise.
+    assert (np.rot90(upright, -1) == turned).mean() > 0.99
