@@ -1,69 +1,144 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from firmware_bridge.geometry import USPA44
 from train.layer import Layer
-from train.skin import NEWTONS_PER_COUNT_Z, Nuisances, Skin, draw_gains, draw_rest, read_counts
+from train.magnets import Magnet
+from train.skin import NEWTONS_PER_COUNT_Z, Skin
 
 SIZE, CELL_MM = 42, 0.47
 SKIN = Skin(USPA44, Layer(), SIZE, CELL_MM)
+RIGHT, BACK, DOWN, LEAN_X, LEAN_Y = range(5)
 
 
-def blob(x_mm, y_mm, radius_mm=2.0):
-    along = (np.arange(SIZE) - (SIZE - 1) / 2) * CELL_MM
-    inside = np.hypot(along[None, :] - x_mm, along[:, None] - y_mm) <= radius_mm
-    return inside.astype(np.float32)[None] * 0.05
+def radius_mm(x_mm, y_mm, size=SIZE, cell_mm=CELL_MM):
+    along = (np.arange(size) - (size - 1) / 2) * cell_mm
+    return np.hypot(along[None, :] - x_mm, along[:, None] - y_mm)
 
 
-def test_an_even_load_reads_as_its_force():
-    pressure = np.full((1, SIZE, SIZE), 0.01, dtype=np.float32)
-    newtons = float(pressure.sum()) * CELL_MM**2
-    assert SKIN.deform(pressure)[0, 2].sum() * NEWTONS_PER_COUNT_Z == pytest.approx(newtons, rel=1e-3)
+def blob(x_mm, y_mm, pressure_mpa=0.05):
+    """One tap of one frame: an even pressure on a circle of 2 mm."""
+    return ((radius_mm(x_mm, y_mm) <= 2.0) * pressure_mpa).astype(np.float32)[None, None]
+
+
+@pytest.mark.parametrize("field", ["dipole", "cylinder"])
+def test_an_even_load_reads_as_its_force(field):
+    skin = Skin(USPA44, Layer(), SIZE, CELL_MM, field=field)
+    for force_n, within in ((1.0, 1e-3), (7.35, 0.05)):  # the field is steeper near the chip
+        pressure = np.full((1, 1, SIZE, SIZE), force_n / (SIZE * CELL_MM) ** 2)
+        assert skin.frames(pressure)[0, 0, 2].sum() * NEWTONS_PER_COUNT_Z == pytest.approx(force_n, rel=within)
+
+
+def test_a_full_face_press_presses_every_taxel():
+    counts = SKIN.frames(np.full((1, 1, SIZE, SIZE), 0.02, dtype=np.float32))[0, 0]
+    assert counts[2].min() > 0.5 * counts[2].max() > 0
+    assert np.allclose(counts[0], -counts[0, :, ::-1], atol=0.05)
 
 
 @pytest.mark.parametrize("taxel", range(16))
 def test_a_press_is_read_by_the_taxel_under_it(taxel):
-    counts = SKIN.deform(blob(*USPA44.taxel_centres_mm()[taxel]))[0]
+    counts = SKIN.frames(blob(*USPA44.taxel_centres_mm()[taxel]))[0, 0]
     assert counts[2].ravel().argmax() == taxel
 
 
 def test_shear_points_away_from_the_press():
-    counts = SKIN.deform(blob(0.0, 0.0))[0]
+    counts = SKIN.frames(blob(0.0, 0.0))[0, 0]
     assert (counts[0, 1:3, 2] > 0).all()
     assert (counts[0, 1:3, 1] < 0).all()
     assert (counts[1, 2, 1:3] > 0).all()
     assert (counts[1, 1, 1:3] < 0).all()
 
 
-def test_readings_add_up_and_turn_with_the_load():
-    first, second = blob(3.0, 1.0), blob(-4.0, 5.0)
-    assert np.allclose(SKIN.deform(first + second), SKIN.deform(first) + SKIN.deform(second), atol=1e-2)
-    x, y, z = SKIN.deform(first)[0]
-    turned_x, turned_y, turned_z = SKIN.deform(np.rot90(first, axes=(1, 2)).copy())[0]
-    assert np.allclose(turned_z, np.rot90(z), atol=1e-2)
-    assert np.allclose(turned_x, np.rot90(y), atol=1e-2)
-    assert np.allclose(turned_y, -np.rot90(x), atol=1e-2)
+def test_readings_turn_with_the_load():
+    first = blob(3.0, 1.0)
+    x, y, z = SKIN.frames(first)[0, 0]
+    turned_x, turned_y, turned_z = SKIN.frames(np.rot90(first, axes=(2, 3)).copy())[0, 0]
+    assert np.allclose(turned_z, np.rot90(z), atol=0.05)
+    assert np.allclose(turned_x, np.rot90(y), atol=0.05)
+    assert np.allclose(turned_y, -np.rot90(x), atol=0.05)
 
 
-def test_nuisances_are_as_large_as_they_say_and_can_be_off():
+def test_light_loads_add_up_and_hard_ones_read_more_than_their_share():
+    light = SKIN.frames(blob(3.0, 1.0, 1e-3)) + SKIN.frames(blob(-4.0, 5.0, 1e-3))
+    both = SKIN.frames(blob(3.0, 1.0, 1e-3) + blob(-4.0, 5.0, 1e-3))
+    assert np.abs(both - light).max() < 2e-3 * np.abs(light).max()
+    # A field rises faster than the magnet comes near: (1 - down / gap)^-3 of it, less its neighbours' sideways.
+    under = USPA44.taxel_centres_mm()[5]
+    hard = SKIN.frames(blob(*under, 0.1))[0, 0, 2, 1, 1]
+    assert 1.05 < hard / (100 * SKIN.frames(blob(*under, 1e-3))[0, 0, 2, 1, 1]) < 1.5
+
+
+def test_flat_taps_are_their_frames_and_nothing_reads_nothing():
     rng = np.random.default_rng(0)
-    gains = draw_gains(rng, Nuisances(gain_spread=0.05, repeat_spread=0.0), USPA44, 400, 3)
-    assert gains.std() == pytest.approx(0.05, rel=0.1)  # the cut takes 4 % of it
-    assert np.abs(gains - 1).max() <= 0.1 + 1e-6
-    assert (gains[:, 0] == gains[:, 2]).all()
-    repeats = draw_gains(rng, Nuisances(gain_spread=0.0, repeat_spread=0.03), USPA44, 400, 3)
-    assert repeats.std() == pytest.approx(0.03, rel=0.1)
-    assert (repeats[:, 0] != repeats[:, 2]).any()
-    off = Nuisances(0.0, 0.0, 0.0)
-    assert (draw_gains(rng, off, USPA44, 5, 2) == 1).all()
-    exact = np.array([[10.4, -3.6]])
-    assert read_counts(rng, exact, off).tolist() == [[10.0, -4.0]]
-    noisy = read_counts(rng, np.zeros((1000, 48)), Nuisances())
-    assert noisy.std() == pytest.approx(np.sqrt(2.0**2 + 1 / 12), rel=0.05)
+    unit = np.concatenate([blob(2.0, -3.0)[0] * 5, blob(0.0, 0.0)[0] * 9, np.zeros_like(blob(0, 0)[0])])
+    indentation_mm = np.sort(rng.uniform(0.0, 0.5, (3, 7)), axis=1).astype(np.float32)
+    indentation_mm[:, 0] = 0.0
+    counts = SKIN.flat_frames(unit, indentation_mm)
+    assert counts.shape == (3, 7, 3, 4, 4)
+    assert counts.dtype == np.float32
+    assert np.abs(counts[0]).max() > 100
+    assert np.allclose(counts, SKIN.frames(unit[:, None] * indentation_mm[:, :, None, None]), atol=0.05)
+    assert not counts[:, 0].any()
+    assert not counts[2].any()
 
 
-def test_rest_levels_fit_sixteen_bits_and_differ_per_axis():
-    rest = draw_rest(np.random.default_rng(1), USPA44)
-    assert rest.min() > 20000
-    assert rest.max() < 50000
-    assert rest[2].mean() > rest[0].mean() + 2000
+def test_the_dipole_reads_as_the_cylinder_to_two_percent():
+    exact = Skin(USPA44, Layer(), SIZE, CELL_MM, field="cylinder")
+    for place in ((0.0, 0.0), (2.35, 2.35), (-6.0, 3.0)):
+        expected = exact.frames(blob(*place))
+        # Measured 1.0 %, once both are calibrated by the same load.
+        assert np.abs(SKIN.frames(blob(*place)) - expected).max() < 0.02 * np.abs(expected).max()
+
+
+class TestLean:
+    """A magnet turns with its surroundings, by its shape; on a coarser grid, under a wide smooth load."""
+
+    size, cell_mm = 21, 0.94
+    load = np.exp(-((radius_mm(1.0, -0.5, 21, 0.94) / 4.0) ** 2)) * 0.02
+
+    def movement(self, geometry=USPA44, **magnet):
+        skin = Skin(geometry, Layer(), self.size, self.cell_mm, Magnet(**magnet), in_plane_share=1.0)
+        return skin.movement(self.load)
+
+    def test_a_disc_follows_the_slope_of_its_plane(self):
+        leans = self.movement(thickness_mm=1e-6)[:, [LEAN_X, LEAN_Y]]
+        wide, narrow = (replace(USPA44, pitch_mm=pitch_mm) for pitch_mm in (4.71, 4.69))
+        # The taxels of a wider grid sit further out: the slope along the line from the middle.
+        steeper = (self.movement(wide, thickness_mm=1e-6) - self.movement(narrow, thickness_mm=1e-6))[:, DOWN] / 0.02
+        outward = (leans * USPA44.taxel_centres_mm() / USPA44.pitch_mm).sum(axis=1)
+        assert np.allclose(outward, steeper, atol=1e-3 * np.abs(steeper).max())
+
+    def test_a_needle_follows_the_material_along_it(self):
+        needle = {"diameter_mm": 1e-6, "thickness_mm": 0.5}
+        above = self.movement(height_mm=2.52, **needle)
+        below = self.movement(height_mm=2.48, **needle)
+        expected = (above - below)[:, [RIGHT, BACK]] / 0.04
+        leans = self.movement(**needle)[:, [LEAN_X, LEAN_Y]]
+        assert np.allclose(leans, expected, atol=0.01 * np.abs(expected).max())
+
+    def test_a_sphere_follows_half_the_curl(self):
+        disc = self.movement(thickness_mm=1e-6)
+        needle = self.movement(diameter_mm=1e-6)
+        sphere = self.movement(thickness_mm=1.0, diameter_mm=1.0)
+        assert np.allclose(sphere[:, LEAN_X:], (disc + needle)[:, LEAN_X:] / 2, atol=1e-7)
+        assert np.abs(disc - needle)[:, LEAN_X].max() > 1e-4
+
+
+def test_friction_takes_its_share_of_the_in_plane_movement_alone():
+    free, held = (
+        Skin(USPA44, Layer(), SIZE, CELL_MM, in_plane_share=share).movement(blob(1.0, 2.0)[0, 0])
+        for share in (1.0, 0.25)
+    )
+    assert np.allclose(held[:, [RIGHT, BACK]], 0.25 * free[:, [RIGHT, BACK]], rtol=1e-5)
+    assert np.array_equal(held[:, [DOWN, LEAN_X, LEAN_Y]], free[:, [DOWN, LEAN_X, LEAN_Y]])
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"shape \(1, 1, 40, 40\), expected \(..., 42, 42\)"):
+        SKIN.frames(np.zeros((1, 1, 40, 40), dtype=np.float32))
+    with pytest.raises(ValueError, match=r"does not fit into a layer of 2\.6 mm"):
+        Skin(USPA44, Layer(thickness_mm=2.6), SIZE, CELL_MM)
+    with pytest.raises(ValueError, match="press less hard"):
+        SKIN.frames(blob(2.35, 2.35, 5.0))

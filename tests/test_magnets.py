@@ -1,0 +1,153 @@
+import magpylib
+import numpy as np
+import pytest
+from magpylib.func import cylinder_field, dipole_field
+from scipy.spatial.transform import Rotation
+
+from firmware_bridge.geometry import USPA44, SensorGeometry
+from train.magnets import FIELDS, Magnet, MagnetArray, cylinder_mt, dipole_mt
+
+MAGNET = Magnet()
+ONE = SensorGeometry("one", rows=1, cols=1, pitch_mm=4.7, width_mm=4.7, height_mm=4.7)
+RIGHT, BACK, DOWN, LEAN_X, LEAN_Y = range(5)
+
+
+def rolls(rng, count):
+    return Rotation.from_rotvec(rng.normal(size=(count, 3)))
+
+
+def around(rng, count):
+    """Points 0.3 to 9 mm away, in every direction."""
+    way = rng.normal(size=(count, 3))
+    return way / np.linalg.norm(way, axis=1, keepdims=True) * rng.uniform(0.3, 9.0, (count, 1))
+
+
+def moved(taxel, part, by):
+    movement = np.zeros((16, 5))
+    movement[taxel, part] = by
+    return movement
+
+
+def test_the_dipole_is_magpylibs():
+    rng = np.random.default_rng(0)
+    away_mm, turn = around(rng, 200), rolls(rng, 200)
+    axis = turn.apply([0.0, 0.0, 1.0])
+    volume_m3 = np.pi / 4 * 1e-3**2 * 0.5e-3
+    moment = axis * MAGNET.remanence_t * volume_m3 / magpylib.mu_0
+    expected_mt = 1e3 * dipole_field("B", away_mm * 1e-3, moment)
+    assert np.allclose(np.stack(dipole_mt(MAGNET, tuple(away_mm.T), tuple(axis.T)), axis=1), expected_mt, rtol=1e-6)
+
+
+def test_the_cylinder_is_magpylibs_at_any_tilt_and_on_its_axis():
+    rng = np.random.default_rng(1)
+    away_mm, turn = around(rng, 200), rolls(rng, 200)
+    axis = turn.apply([0.0, 0.0, 1.0])
+    away_mm[:20] = axis[:20] * rng.uniform(0.3, 5.0, (20, 1))
+    expected_mt = 1e3 * cylinder_field("B", away_mm * 1e-3, (1e-3, 0.5e-3), (0, 0, 1.2), orientations=turn)
+    assert np.allclose(np.stack(cylinder_mt(MAGNET, tuple(away_mm.T), tuple(axis.T)), axis=1), expected_mt, atol=1e-6)
+
+
+def test_the_cylinders_axis_field_in_closed_form():
+    z = np.array([0.5, 2.0, 6.0])
+    near, far = z - 0.25, z + 0.25
+    expected_mt = 1200 / 2 * (far / np.hypot(far, 0.5) - near / np.hypot(near, 0.5))
+    zero, one = np.zeros(3), np.ones(3)
+    assert cylinder_mt(MAGNET, (zero, zero, z), (zero, zero, one))[2] == pytest.approx(expected_mt, rel=1e-9)
+
+
+def test_the_dipoles_error_falls_with_the_square_of_the_distance():
+    z, zero, one = np.array([4.0, 8.0]), np.zeros(2), np.ones(2)
+    exact = cylinder_mt(MAGNET, (zero, zero, z), (zero, zero, one))[2]
+    error = dipole_mt(MAGNET, (zero, zero, z), (zero, zero, one))[2] / exact - 1
+    assert error[0] / error[1] == pytest.approx(4.0, rel=0.05)
+    assert 0 < error[0] < 0.03
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_no_movement_changes_exactly_nothing(field, dtype):
+    change = MagnetArray(USPA44, MAGNET, field).change_mt(np.zeros((3, 5, 16, 5), dtype=dtype))
+    assert change.shape == (3, 5, 16, 3)
+    assert change.dtype == dtype
+    assert not change.any()
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_the_whole_array_is_magpylibs_sum_over_all_magnets(field):
+    rng = np.random.default_rng(2)
+    movement = rng.normal(size=(16, 5)) * [0.1, 0.1, 0.15, 0.3, 0.3]
+    source = magpylib.Collection()
+    for (x_mm, y_mm), (right, back, down, lean_x, lean_y) in zip(USPA44.taxel_centres_mm(), movement, strict=True):
+        place = np.array([x_mm + right, y_mm + back, 2.5 - down]) * 1e-3
+        upright, _ = Rotation.align_vectors([[lean_x, lean_y, 1.0]], [[0.0, 0.0, 1.0]])
+        if field == "cylinder":
+            source.add(
+                magpylib.magnet.Cylinder(
+                    place, upright, dimension=(1e-3, 0.5e-3), polarization=(0, 0, MAGNET.remanence_t)
+                )
+            )
+        else:
+            moment = MAGNET.remanence_t * np.pi / 4 * 1e-3**2 * 0.5e-3 / magpylib.mu_0
+            source.add(magpylib.misc.Dipole(place, upright, moment=(0, 0, moment)))
+    chips = np.column_stack([USPA44.taxel_centres_mm(), np.full(16, 0.5)]) * 1e-3
+    expected_mt = 1e3 * source.getB(chips)
+    assert np.allclose(MagnetArray(USPA44, MAGNET, field).flux_mt(movement), expected_mt, atol=1e-5)
+
+
+def test_one_magnet_moves_its_chip_as_the_series_of_a_dipole_says():
+    k, d = MAGNET.strength_mt_mm3, MAGNET.gap_mm
+    array, step = MagnetArray(ONE, MAGNET), 1e-5
+    slopes = array.change_mt(np.eye(5)[:, None] * step)[:, 0] / step
+    expected = np.zeros((5, 3))
+    expected[DOWN, 2] = 6 * k / d**4
+    expected[RIGHT, 0] = expected[BACK, 1] = 3 * k / d**4
+    expected[LEAN_X, 0] = expected[LEAN_Y, 1] = -k / d**3
+    assert np.allclose(slopes, expected, atol=1e-3 * k / d**4)
+
+
+def test_a_pressed_magnet_talks_across_to_its_neighbours_with_the_dipoles_sign():
+    k, d, rho = MAGNET.strength_mt_mm3, MAGNET.gap_mm, USPA44.pitch_mm
+    array, step = MagnetArray(USPA44, MAGNET), 1e-4
+    slope = (array.change_mt(moved(5, DOWN, step)) - array.change_mt(moved(5, DOWN, -step))) / (2 * step)
+    square = rho**2 + d**2
+    z_beside = -k * d * (9 * rho**2 - 6 * d**2) / square**3.5
+    x_beside = 3 * k * rho * (rho**2 - 4 * d**2) / square**3.5
+    assert slope[5, 2] > 0 > z_beside  # its own chip rises, those beside fall
+    for right_of, sign in ((6, 1), (4, -1)):
+        assert slope[right_of, 2] == pytest.approx(z_beside, rel=1e-3)
+        assert slope[right_of, 0] == pytest.approx(sign * x_beside, rel=1e-3)
+        assert slope[right_of, 1] == pytest.approx(0.0, abs=1e-6)
+    assert slope[9, 1] == pytest.approx(x_beside, rel=1e-3)
+
+
+def test_small_movements_of_many_magnets_add_up_and_large_ones_do_not():
+    rng = np.random.default_rng(3)
+    array = MagnetArray(USPA44, MAGNET)
+    first, second = rng.normal(size=(2, 16, 5))
+
+    def mismatch(scale):
+        apart = array.change_mt(first * scale) + array.change_mt(second * scale)
+        return np.abs(array.change_mt((first + second) * scale) - apart).max() / np.abs(apart).max()
+
+    assert mismatch(1e-4) < 1e-3
+    assert mismatch(1e-1) > 1e-2
+
+
+def test_single_precision_is_enough():
+    movement = np.random.default_rng(4).normal(size=(50, 16, 5)) * [0.1, 0.1, 0.15, 0.1, 0.1]
+    array = MagnetArray(USPA44, MAGNET)
+    assert np.abs(array.change_mt(movement.astype(np.float32)) - array.change_mt(movement)).max() < 2e-5
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match=r"touches its chip: height 2\.5 mm"):
+        Magnet(chip_height_mm=2.3)
+    with pytest.raises(ValueError, match="must be positive"):
+        Magnet(diameter_mm=0.0)
+    with pytest.raises(ValueError, match="no field 'exact', expected one of dipole, cylinder"):
+        MagnetArray(USPA44, MAGNET, "exact")
+    array = MagnetArray(USPA44, MAGNET)
+    assert np.isfinite(array.change_mt(moved(3, DOWN, 1.74))).all()
+    for through in (1.75, 9.0, np.nan):
+        with pytest.raises(ValueError, match=r"expected less than the 1\.75 mm"):
+            array.change_mt(moved(3, DOWN, through))
