@@ -1,0 +1,346 @@
+import json
+from dataclasses import asdict, replace
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from edge.taps import ON_COUNTS
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.xela import USPA44_MAP
+from train.depth import Pose
+from train.hysteresis import frame_weights, maxwell
+from train.nuisances import (
+    LARGEST_COUNTS,
+    NAMES,
+    NuisanceError,
+    Nuisances,
+    apply_nuisances,
+    draw_rest,
+    jitter_poses,
+    read_windows,
+)
+
+NONE = Nuisances.none()
+STRONG = Nuisances(
+    hysteresis=0.5,
+    cross_talk=0.3,
+    gain_spread=0.2,
+    thermal_drift_counts=3e4,
+    earth_field_counts=2e4,
+    noise_counts=1e4,
+    saturation_counts=(1e5, 1e5, 3e5),
+    stuck_taxels=0.1,
+    dead_taxels=0.1,
+    torn_scans=0.3,
+)
+"""Strong enough that another draw of any one is no rounding error."""
+ACTING = tuple(name for name in NAMES if not name.startswith("pose"))
+PAST_REACH = {"hysteresis", "cross_talk", "gain_spread"}
+ANGLES_DEG = np.array([0.0, 5.0, 90.0])
+
+
+def alone(nuisances, name):
+    return replace(NONE, **{name: getattr(nuisances, name)})
+
+
+def presses(n=5, taps=3, frames=8, counts=1e5):
+    peak = np.random.default_rng(1).uniform(-counts, 3 * counts, (n, taps, 1, 3, 4, 4))
+    return (peak * np.linspace(1 / frames, 1, frames)[:, None, None, None] ** 1.5).astype(np.float32)
+
+
+def zeros(n=5, taps=3, frames=8):
+    return np.zeros((n, taps, frames, 3, 4, 4), dtype=np.float32)
+
+
+@pytest.mark.parametrize("off", [None, *ACTING])
+def test_each_acts_by_itself_and_in_its_turn(off):
+    """All at once is one after the other, each run alone: so no draw depends on what else is on."""
+    nuisances = STRONG.without(off) if off else STRONG
+    together = apply_nuisances(presses(), nuisances, 7, angle_deg=ANGLES_DEG)
+    in_turn = presses()
+    for name in ACTING:
+        in_turn = apply_nuisances(in_turn, alone(nuisances, name), 7, angle_deg=ANGLES_DEG)
+    # Before the first frame a pad alone reads 0, one of all together noise and drift: torn scans may differ there.
+    assert np.abs(together - in_turn)[:, :, 1:].max() <= 4
+    changed = np.abs(together - apply_nuisances(presses(), STRONG, 7, angle_deg=ANGLES_DEG)).max()
+    assert (changed > 100) == (off is not None)
+
+
+@pytest.mark.parametrize("off", sorted(PAST_REACH))
+def test_a_free_pad_does_not_tell_whether_a_factor_is_on(off):
+    free = apply_nuisances(zeros(), STRONG, 3)
+    assert np.array_equal(free, apply_nuisances(zeros(), STRONG.without(off), 3))
+    assert free.std() > 1e4
+
+
+def test_the_seed_alone_decides():
+    def read(seed):
+        return apply_nuisances(presses(), STRONG, seed)
+
+    assert np.array_equal(read(4), read(np.random.SeedSequence(4)))
+    assert (read(4) != read(5)).any()
+    first, second = np.random.SeedSequence(4).spawn(2)
+    assert (read(first) != read(second)).any()
+    assert (read(first) != read(4)).any()
+
+
+def test_all_off_only_rounds_and_leaves_its_input_alone():
+    clean = presses(counts=40.0)
+    kept = clean.copy()
+    assert np.array_equal(apply_nuisances(clean, NONE, 0), np.rint(clean))
+    readings = apply_nuisances(clean, STRONG, 0)
+    assert np.array_equal(clean, kept)
+    assert readings.dtype == np.float32
+    assert np.array_equal(readings, np.rint(readings))
+
+
+def test_noise_is_as_large_as_it_says():
+    readings = apply_nuisances(zeros(50), alone(Nuisances(), "noise_counts"), 0)
+    assert readings.std() == pytest.approx(np.sqrt(2.0**2 + 1 / 12), rel=0.02)
+    assert abs(readings.mean()) < 0.05
+
+
+def test_gains_belong_to_a_sensor_and_are_cut():
+    clean = np.full_like(zeros(400, 2, 3), 1e6)
+    gains = apply_nuisances(clean, alone(Nuisances(), "gain_spread"), 0) / 1e6
+    assert (gains == gains[:, :1, :1]).all()
+    assert gains.std() == pytest.approx(0.075, rel=0.06)  # the cut takes 4 % of it
+    assert np.abs(gains - 1).max() == pytest.approx(0.15, abs=1e-5)
+    assert len(np.unique(gains[0, 0, 0])) > 40
+
+
+def test_cross_talk_shows_in_the_four_neighbours_and_nowhere_else():
+    clean = zeros(200)
+    clean[..., 2, 1, 2] = 1e5
+    readings = apply_nuisances(clean, alone(STRONG, "cross_talk"), 0)[..., 2, :, :]
+    share = (readings.sum(axis=(-2, -1)) - 1e5) / 1e5
+    assert (share == share[:, :1, :1]).all()
+    assert 0 <= share.min() < 0.01
+    assert 0.29 < share.max() <= 0.3
+    neighbours = np.array([(0, 2), (2, 2), (1, 1), (1, 3)])
+    quarter = readings[..., neighbours[:, 0], neighbours[:, 1]]
+    assert np.allclose(quarter, share[..., None] / 4 * 1e5, atol=1)
+    readings[..., neighbours[:, 0], neighbours[:, 1]] = 0
+    assert (readings[..., 1, 2] == 1e5).all()
+    assert np.count_nonzero(readings) == readings[..., 0, 0].size
+
+
+def test_drift_is_common_mostly_along_z_and_lasts():
+    drift = apply_nuisances(zeros(2000, 2, 2), alone(STRONG, "thermal_drift_counts"), 0)
+    assert (drift == drift[:, :1, :1]).all()
+    per_sensor = drift[:, 0, 0]
+    common = per_sensor.mean(axis=(-2, -1))
+    assert common.std(axis=0) == pytest.approx(3e4 * np.array([1 / 8, 1 / 8, 1.0]), rel=0.06)
+    within = (per_sensor / common[..., None, None])[np.abs(common) > 1000].std(axis=(-2, -1))
+    assert within.mean() == pytest.approx(0.25, rel=0.1)
+    assert np.abs(np.corrcoef(common.T)[np.triu_indices(3, 1)]).max() < 0.1
+
+
+def test_a_drift_of_two_deviations_is_no_contact():
+    assert 2 * Nuisances().thermal_drift_counts < ON_COUNTS / USPA44.taxel_count
+
+
+def test_the_earths_field_stands_still_while_the_pad_turns():
+    angles = np.array([0.0, 90.0, 180.0, 270.0, 37.0, 360.0])
+    earth = apply_nuisances(zeros(3000, 6, 2), alone(STRONG, "earth_field_counts"), 0, angle_deg=angles)
+    assert (earth == earth[:, :, :1, :, :1, :1]).all()  # every taxel feels the same
+    vector = earth[:, :, 0, :, 0, 0]
+    assert np.array_equal(vector[:, 0], vector[:, 5])
+    assert np.ptp(vector[..., 2], axis=1).max() == 0
+    field = vector[..., :2] - (vector[:, :1, :2] + vector[:, 2:3, :2]) / 2  # half a turn takes the field's sign
+    x, y = np.moveaxis(field, -1, 0)
+    assert np.allclose(np.hypot(x, y), np.hypot(x, y)[:, :1], atol=3)
+    # What lies to the pad's right, it finds below (along its rows) once it has turned to the left.
+    assert np.allclose((x[:, 1], y[:, 1]), (-y[:, 0], x[:, 0]), atol=3)
+    turn = np.angle((x + 1j * y)[:, 4] / (x + 1j * y)[:, 0], deg=True)
+    assert np.allclose(turn[np.hypot(x, y)[:, 0] > 2000], 37.0, atol=0.2)
+    # Two attitudes at random: mean square sqrt(2) times the field's length, nothing longer than twice it.
+    length = np.linalg.norm(vector[:, 0], axis=-1)
+    assert np.sqrt((length**2).mean()) == pytest.approx(2e4 * np.sqrt(2), rel=0.03)
+    assert length.max() <= 4e4 + 2
+
+
+def test_readings_end_where_the_range_ends():
+    clean = presses()
+    readings = apply_nuisances(clean, alone(Nuisances(), "saturation_counts"), 0)
+    for axis, limit in enumerate(LARGEST_COUNTS):
+        assert np.array_equal(readings[:, :, :, axis], np.rint(np.clip(clean[:, :, :, axis], -limit, limit)))
+    assert np.array_equal(np.unique(np.abs(readings).max(axis=(0, 1, 2, 4, 5))), np.unique(LARGEST_COUNTS))
+
+
+def test_dead_taxels_read_rest_for_as_long_as_the_sensor_lives():
+    readings = apply_nuisances(presses(400) + 1e6, alone(STRONG, "dead_taxels"), 0)
+    dead = readings == 0
+    assert (dead == dead[:, :1, :1, :1]).all()
+    assert dead.mean() == pytest.approx(0.1, abs=0.02)
+    assert len({sensor.tobytes() for sensor in dead[:, 0, 0, 0]}) > 100
+
+
+def test_more_dead_taxels_are_the_same_and_more():
+    few, many = (apply_nuisances(presses(50) + 1e6, replace(NONE, dead_taxels=chance), 0) == 0 for chance in (0.1, 0.4))
+    assert (many | ~few).all()
+    assert many.mean() > 3 * few.mean()
+
+
+def test_stuck_taxels_hold_a_constant_in_their_range():
+    clean = presses(400) + 1e6
+    readings = apply_nuisances(clean, alone(STRONG, "stuck_taxels"), 0)
+    stuck = readings != np.rint(clean)
+    assert (stuck == stuck[:, :1, :1, :1]).all()
+    assert stuck.mean() == pytest.approx(0.1, abs=0.02)
+    held = np.where(stuck, readings, nan)
+    assert (np.nan_to_num(held) == np.nan_to_num(held[:, :1, :1])).all()
+    low, high = np.nanmin(held, axis=(0, 1, 2, 4, 5)), np.nanmax(held, axis=(0, 1, 2, 4, 5))
+    assert np.allclose(low, (-1400, -1400, 0), atol=150)
+    assert np.allclose(high, LARGEST_COUNTS, atol=150)
+
+
+def test_torn_scans_keep_a_run_of_ids_of_the_frame_before():
+    clean = presses(60)
+    whole = apply_nuisances(clean, NONE, 0)
+    torn = apply_nuisances(clean, alone(STRONG, "torn_scans"), 0)
+    before = np.concatenate([np.zeros_like(whole[:, :, :1]), whole[:, :, :-1]], axis=2)
+    stale = (torn != whole).any(axis=3)
+    assert np.array_equal(torn, np.where(stale[:, :, :, None], before, whole))
+    assert stale.any(axis=(-2, -1)).mean() == pytest.approx(0.3, abs=0.03)
+    sensor = min(name for name, _ in USPA44_MAP.taxels.values())
+    by_id = stale.reshape(-1, 16)[:, [taxel for _, taxel in USPA44_MAP.wire_order(sensor)]]
+    edges = (by_id != np.roll(by_id, 1, axis=1)).sum(axis=1)
+    assert set(edges) == {0, 2}
+    assert set(by_id.sum(axis=1)) == set(range(16))
+
+
+def test_a_torn_scan_leaves_what_is_not_stale_as_it_was():
+    with_torn = apply_nuisances(presses(60), STRONG, 0)
+    without = apply_nuisances(presses(60), STRONG.without("torn_scans"), 0)
+    stale = (np.abs(with_torn - without) > 1).any(axis=3)
+    assert 0.05 < stale.mean() < 0.3
+    expected = np.where(stale[:, :, 1:, None], without[:, :, :-1], without[:, :, 1:])
+    assert np.abs(with_torn[:, :, 1:] - expected).max() <= 1
+
+
+@pytest.mark.parametrize("relaxation", [1e-9, 0.05, 1.0, 30.0, 1e9])
+def test_closed_form_and_steps_are_the_same_hysteresis(relaxation):
+    rng = np.random.default_rng(0)
+    frames, step_s, share = 16, 0.07, 0.3
+    press = rng.normal(size=(frames, 5))
+    moments = np.array([0.0, 0.25, 1.0, 1.5, 7.0, 15.9, 16.0])
+    weights = frame_weights(
+        moments[None, None], frames, np.array([[step_s]]), np.array([share]), np.array([relaxation])
+    )
+    times = np.union1d(np.arange(frames + 1.0), moments)
+    course = np.stack([np.interp(times, np.arange(frames + 1), np.concatenate([[0], p])) for p in press.T], axis=1)
+    stepped = maxwell(course, times * step_s, share, relaxation)
+    assert np.allclose(weights[0, 0] @ press, stepped[np.searchsorted(times, moments)], atol=1e-5)
+
+
+@pytest.mark.parametrize("ratio", [0.03, 0.3, 1.0, 5.0, 300.0])
+def test_the_loop_of_a_press_and_its_release_has_the_area_of_the_closed_form(ratio):
+    load_s, share = 2.0, 0.1
+    time_s = np.linspace(0, 2 * load_s, 4001)
+    load = 1 - np.abs(time_s / load_s - 1)
+    read = maxwell(load, time_s, share, ratio * load_s)
+    area = -np.trapezoid(read, load)
+    left = np.exp(-1 / ratio)
+    assert area == pytest.approx(share * (2 * ratio - ratio**2 * (1 - left) * (3 - left)), rel=1e-3, abs=1e-6)
+    assert area > 0  # the release reads higher
+
+
+def test_hysteresis_vanishes_when_fast_and_is_a_lesser_gain_when_slow():
+    time_s = np.linspace(0, 1, 50)
+    course = np.sin(3 * time_s)
+    assert np.allclose(maxwell(course, time_s, 0.2, 1e-12), course)
+    assert np.allclose(maxwell(course, time_s, 0.2, 1e12), 0.8 * course)
+    assert np.allclose(maxwell(course, time_s, 0.0, 0.1), course)
+    assert np.allclose(maxwell(np.full(50, 3.0), time_s, 0.2, 0.1), 3.0)
+
+
+def test_a_held_press_creeps_to_its_elastic_reading():
+    time_s = np.array([0.0, 1e-9, 0.5, 1.0, 100.0])
+    read = maxwell(np.array([0.0, 1, 1, 1, 1]), time_s, 0.2, 0.5)
+    assert read[2:] == pytest.approx([1 - 0.2 * np.exp(-1), 1 - 0.2 * np.exp(-2), 1.0], abs=1e-6)
+
+
+def test_sensors_differ_in_their_hysteresis():
+    clean = np.full_like(zeros(400, 1, 4), 1e6) * np.linspace(0.25, 1, 4, dtype=np.float32)[:, None, None, None]
+    only = alone(Nuisances(), "hysteresis")
+    slow = apply_nuisances(clean, only, 0, tap_s=1e4) / clean
+    assert np.allclose(slow, 1, atol=1e-3)
+    quick = 1 - apply_nuisances(clean, only, 0, tap_s=1e-6)[:, 0, -1] / 1e6
+    assert (quick == quick[:, :1, :1, :1]).all()
+    assert 0.01 <= quick.min() < 0.012
+    assert 0.108 < quick.max() <= 0.11 + 1e-6
+
+
+def test_a_window_holds_the_frames_asked_for():
+    clean = presses()
+    quiet = STRONG.without("noise_counts", "torn_scans")
+    every = apply_nuisances(clean, quiet, 5, angle_deg=ANGLES_DEG)
+    frame = np.random.default_rng(0).integers(8, size=(5, 3))
+    window = read_windows(clean, (frame + 1) / 8, quiet, 5, angle_deg=ANGLES_DEG)
+    picked = np.take_along_axis(every, frame[:, :, None, None, None, None], axis=2)[:, :, 0]
+    assert np.abs(window - picked).max() <= 1
+    halfway = read_windows(clean, 4.5 / 8, NONE, 5)
+    assert np.abs(halfway - (clean[:, :, 3] + clean[:, :, 4]) / 2).max() <= 0.51
+    assert not read_windows(clean, 0.0, NONE, 5).any()
+
+
+def test_a_torn_window_keeps_taxels_of_one_frame_earlier():
+    clean = presses(200)
+    whole, before = (read_windows(clean, share, NONE, 0) for share in (0.8, 0.8 - 1 / 8))
+    torn = read_windows(clean, 0.8, alone(STRONG, "torn_scans"), 0)
+    stale = (torn != whole).any(axis=2)
+    assert np.array_equal(torn, np.where(stale[:, :, None], before, whole))
+    assert stale.any(axis=(-2, -1)).mean() == pytest.approx(0.3, abs=0.06)
+    noisy = replace(NONE, noise_counts=1e4)
+    same = read_windows(zeros(200), 0.8, replace(noisy, torn_scans=0.3), 0) == read_windows(zeros(200), 0.8, noisy, 0)
+    assert same.mean() == pytest.approx(1 - stale.mean(), abs=0.03)
+
+
+def test_poses_are_missed_by_as_much_as_it_says():
+    poses = [Pose(1.0, -2.0, 30.0)] * 4000
+    hit = np.array([(p.x_mm, p.y_mm, p.angle_deg) for p in jitter_poses(np.random.default_rng(0), poses, Nuisances())])
+    assert hit.mean(axis=0) == pytest.approx((1.0, -2.0, 30.0), abs=0.05)
+    assert hit.std(axis=0) == pytest.approx((0.2, 0.2, 1.0), rel=0.07)
+    assert jitter_poses(np.random.default_rng(0), poses, NONE) == poses
+
+
+def test_rest_levels_fit_sixteen_bits_and_differ_per_axis():
+    rest = draw_rest(np.random.default_rng(1), USPA44)
+    assert rest.min() > 20000
+    assert rest.max() < 50000
+    assert rest[2].mean() > rest[0].mean() + 2000
+
+
+def test_nuisances_are_switched_by_name():
+    assert Nuisances().without("noise_counts", "saturation_counts") == Nuisances(
+        noise_counts=0.0, saturation_counts=(inf, inf, inf)
+    )
+    assert Nuisances.only("noise_counts") == replace(NONE, noise_counts=2.0)
+    assert Nuisances().without(*NAMES) == NONE == Nuisances.only()
+    assert Nuisances(**json.loads(json.dumps(asdict(NONE)))) == NONE
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (lambda: Nuisances().without("nose"), "'nose'.*noise_counts"),
+        (lambda: Nuisances.only("drift"), "'drift'.*thermal_drift_counts"),
+        (lambda: Nuisances.only("torn_scans"), "torn_scans is off by default"),
+        (lambda: Nuisances(noise_counts=-1.0), "noise_counts is -1"),
+        (lambda: Nuisances(noise_counts=nan), "noise_counts is nan"),
+        (lambda: Nuisances(dead_taxels=1.5), "dead_taxels is 1.5.*to 1"),
+        (lambda: Nuisances(saturation_counts=(1.0, 0.0, 1.0)), "saturation_counts.*above 0"),
+        (lambda: apply_nuisances(presses()[0], NONE, 0), r"shape \(3, 8, 3, 4, 4\), expected \(n, K, F"),
+        (lambda: apply_nuisances(presses(), NONE, 0, tap_s=0.0), "taps last 0 to 0 s"),
+        (lambda: apply_nuisances(presses(), NONE, 0, tap_s=[1.0, 2.0]), r"tap_s has shape \(2,\), .* \(5, 3\)"),
+        (lambda: read_windows(presses(), 1.1, NONE, 0), "1.1, expected 0 to 1"),
+        (lambda: maxwell(np.zeros(3), np.array([0.0, 1.0, 1.0]), 0.1, 1.0), "ascending"),
+        (lambda: maxwell(np.zeros(3), np.arange(3), 0.1, 0.0), "relaxation 0.0 s"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(mistake, words):
+    with pytest.raises(NuisanceError, match=words) as caught:
+        mistake()
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,86 @@
+"""Hysteresis: a share of every reading lags behind, as in a spring beside one Maxwell element.
+
+Two ways to the same readings: step by step over any course of time, and in closed form for any moment of a press.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.errors import TrainError
+
+_LEAST_SHARE: Final = 0.01
+_RELAXATION_S: Final = (0.2, 5.0)
+
+
+class NuisanceError(TrainError, ValueError):
+    """Nuisances that cannot be, or readings that they cannot act on."""
+
+
+def maxwell(
+    readings: NDArray[np.floating], time_s: NDArray[np.floating], share: float, relaxation_s: float
+) -> NDArray[np.float64]:
+    """Hysteresis over any course of time: (1 - share) c + share q, with dq/dt = (c - q) / relaxation_s.
+
+    The update is exact for readings that go along straight lines, so stable for any step; q starts in equilibrium.
+
+    Args:
+        readings: c, (t, ...).
+        time_s: of the readings, (t,), ascending, in [s].
+        share: that lags, 0 to 1.
+        relaxation_s: above 0, in [s].
+
+    Raises:
+        NuisanceError: one of these cannot be.
+
+    Source: the standard linear solid, a spring beside one Maxwell element.
+    """
+    step_s = np.diff(time_s)
+    if len(time_s) != len(readings) or not len(time_s) or not (step_s > 0).all():
+        raise NuisanceError(f"{len(time_s)} times for {len(readings)} readings: expected one each, ascending")
+    if not (0 <= share <= 1 and relaxation_s > 0):
+        raise NuisanceError(f"share is {share}, relaxation {relaxation_s} s: expected 0 to 1, and above 0")
+    steps = np.maximum(step_s / relaxation_s, 1e-12)
+    keep, mean = np.exp(-steps), -np.expm1(-steps) / steps
+    lagging = np.array(readings, dtype=np.float64)
+    for now in range(1, len(lagging)):
+        k, m = keep[now - 1], mean[now - 1]
+        lagging[now] = k * lagging[now - 1] + (m - k) * readings[now - 1] + (1 - m) * readings[now]
+    return (1 - share) * readings + share * lagging
+
+
+def frame_weights(
+    frame: NDArray[np.float64],
+    frames: int,
+    step_s: NDArray[np.float64],
+    share: NDArray[np.float64],
+    relaxation_s: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """`maxwell` in closed form: how much each frame of a press counts in a reading at any moment of it.
+
+    Readings between frames go along straight lines: a sum of ramps that start at the frames, so a frame's weight is
+    the second difference of the answers to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).
+
+    Args:
+        frame: moments of n sensors' K taps, (n, K, m), in frames since the pad was free.
+        frames: of a press; the first one is a step after the pad was free.
+        step_s: time from frame to frame, (n, K), in [s].
+        share: that lags, (n,).
+        relaxation_s: (n,), above 0 where a share lags, in [s].
+
+    Returns:
+        (n, K, m, frames).
+    """
+    ramp = np.maximum(frame[..., None] - np.arange(frames + 2), 0)
+    if share.any():
+        rate = (step_s / relaxation_s[:, None])[..., None, None]
+        ramp += share[:, None, None, None] * np.expm1(-rate * ramp) / rate
+    return np.diff(ramp, n=2).astype(np.float32)
+
+
+def draw_lag(rng: np.random.Generator, largest: float, n: int) -> NDArray[np.float64]:
+    """Share that lags, up to `largest`, and relaxation time in [s] of n sensors, (2, n)."""
+    share = rng.uniform(min(_LEAST_SHARE, largest), largest, n)
+    low, high = np.log(_RELAXATION_S)
+    return np.stack([share, np.exp(rng.uniform(low, high, n))])

@@ -1,0 +1,345 @@
+"""What real sensors add to the physics: named, seeded, each with a stream of its own, each to be switched off.
+
+The order is that of the signal's way. The pad lags (hysteresis), neighbours show through (cross-talk), the chip has
+its gain; a warming pad and the earth's field add to it; then noise, the end of the range, taxels that stick or are
+dead, scans torn on the bus, and rounding to whole counts. Cross-talk comes before gain: it is field, and the chip
+amplifies it with the rest.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from math import inf, isfinite
+from typing import Final, Self
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from firmware_bridge.geometry import AXES, SensorGeometry
+from train.depth import Pose
+from train.hysteresis import NuisanceError, draw_lag, frame_weights
+
+Seed = int | Sequence[int] | np.random.SeedSequence
+
+LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
+"""Largest readings known: the data sheet's range of x and y, and z seen in a grasp."""
+TAP_S: Final = (0.2, 2.5)
+"""Bounds of a press' duration: a quick robot, and the press of the paper's Fig. 15."""
+
+_OFF: Final = {"saturation_counts": (inf, inf, inf)}
+_DRIFT_OF_AXIS: Final = np.array([1 / 8, 1 / 8, 1.0])
+_DRIFT_OF_TAXEL: Final = 0.25
+_REST_COUNTS: Final = (32700.0, 32800.0, 37400.0)
+_REST_SPREAD_COUNTS: Final = 300.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nuisances:
+    """How strong each nuisance is, as seen on devices in the field; 0 is off, for saturation infinity.
+
+    What every sensor has is on. Spreads are cut at two standard deviations. One sensor reads all taps of a window.
+
+    Attributes:
+        pose_error_mm: standard deviation of a tap's x and y: a sensor on a hand-mounted gripper. The paper's robot
+            repeats to .03 mm.
+        pose_error_deg: the same of its angle.
+        hysteresis: largest share of a reading that lags behind (one Maxwell element), per sensor between .01 and
+            this: data sheet 1.1 %, skins in the field up to 11 %.
+        cross_talk: largest share of a reading that shows in its four neighbours beyond what the nominal magnets do,
+            per sensor: 5 % is what half a millimetre of magnet height makes, by the dipole's law.
+        gain_spread: standard deviation of a chip axis' gain about 1, per sensor: +-15 % seen.
+        thermal_drift_counts: standard deviation of z's drift since the last zeroing; x and y an eighth of it; common
+            to all taxels but for a quarter (the rests of one sensor moved by 8 to 32 counts, 25 in the mean). Warming
+            up is 120 counts per 3.5 K; a drift of 94 reads as a contact, and two deviations stay below it: who zeroes
+            again after warming up, and whenever a free pad shows a contact, sees no more.
+        earth_field_counts: length of the earth's field, which stands still in space while the pad turns; zeroed at
+            another attitude. The rests of one sensor differed by 25 counts in two attitudes, sqrt(2) times the field.
+        noise_counts: standard deviation of a reading at rest: 1.7 to 2.6 measured.
+        saturation_counts: largest |reading| of x, y, z.
+        stuck_taxels: chance of a taxel to hold a constant from somewhere in its range, per sensor.
+        dead_taxels: chance of a taxel to read its rest level whatever happens, per sensor: about 5 %.
+        torn_scans: chance of a scan to be torn: a run of taxels, in order of their CAN ids, keeps the reading of the
+            frame before. A third of the rows of real recordings.
+    """
+
+    pose_error_mm: float = 0.2
+    pose_error_deg: float = 1.0
+    hysteresis: float = 0.11
+    cross_talk: float = 0.05
+    gain_spread: float = 0.075
+    thermal_drift_counts: float = 45.0
+    earth_field_counts: float = 18.0
+    noise_counts: float = 2.0
+    saturation_counts: tuple[float, float, float] = LARGEST_COUNTS
+    stuck_taxels: float = 0.0
+    dead_taxels: float = 0.0
+    torn_scans: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "saturation_counts", tuple(self.saturation_counts))  # a list, if it comes from JSON
+        for name in NAMES:
+            value = getattr(self, name)
+            if name == "saturation_counts":
+                if len(value) != len(AXES) or not all(limit > 0 for limit in value):
+                    raise NuisanceError(f"{name} is {value}, expected three numbers above 0 for x, y, z; inf is off")
+                continue
+            largest = _LARGEST.get(name, inf)
+            if not (isfinite(value) and 0 <= value <= largest):
+                raise NuisanceError(f"{name} is {value}, expected 0 (off) to {largest:g}, finite")
+
+    @classmethod
+    def none(cls) -> Self:
+        """All switched off: readings are only rounded."""
+        return cls().without(*NAMES)
+
+    @classmethod
+    def only(cls, *names: str) -> Self:
+        """The named ones as they are by default, all others off.
+
+        Raises:
+            NuisanceError: a name is unknown, or off by default and so needs a strength.
+        """
+        default = cls()
+        for name in _known(names):
+            if not getattr(default, name):
+                raise NuisanceError(f"{name} is off by default: set it, replace(Nuisances.none(), {name}=...)")
+        return default.without(*(name for name in NAMES if name not in names))
+
+    def without(self, *names: str) -> Self:
+        """These, with the named ones off.
+
+        Raises:
+            NuisanceError: a name is unknown.
+        """
+        return replace(self, **{name: _OFF.get(name, 0.0) for name in _known(names)})
+
+
+NAMES: Final = tuple(field.name for field in fields(Nuisances))
+"""All nuisances in the order in which they act."""
+
+_LARGEST: Final = {
+    "hysteresis": 1.0,
+    "cross_talk": 1.0,
+    "gain_spread": 0.5,  # more, and a gain could be negative
+    "stuck_taxels": 1.0,
+    "dead_taxels": 1.0,
+    "torn_scans": 1.0,
+}
+
+
+def _known(names: tuple[str, ...]) -> tuple[str, ...]:
+    for name in names:
+        if name not in NAMES:
+            raise NuisanceError(f"no nuisance is called {name!r}: expected one of {', '.join(NAMES)}")
+    return names
+
+
+def apply_nuisances(
+    clean: NDArray[np.float32],
+    nuisances: Nuisances,
+    seed: Seed,
+    tap_s: ArrayLike | None = None,
+    angle_deg: ArrayLike = 0.0,
+) -> NDArray[np.float32]:
+    """What n sensors read in every frame of their K taps.
+
+    Args:
+        clean: (n, K, F, 3, rows, cols) zeroed counts, newest tap first; frames evenly spaced in time, the first one
+            a step after the pad was free.
+        nuisances: of these sensors.
+        seed: every nuisance draws from a stream of its own under it: switching one off changes no other.
+        tap_s: durations, broadcast to (n, K), in [s]; None draws them between the bounds of TAP_S.
+        angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.depth.Pose.
+
+    Returns:
+        Whole zeroed counts, shape of `clean`.
+
+    Raises:
+        NuisanceError: shapes do not fit, or a duration is not positive.
+    """
+    _check_clean(clean)
+    frame = np.broadcast_to(np.arange(1.0, clean.shape[2] + 1), clean.shape[:3])
+    return _read(clean, frame, nuisances, seed, tap_s, angle_deg)
+
+
+def read_windows(
+    clean: NDArray[np.float32],
+    share: ArrayLike,
+    nuisances: Nuisances,
+    seed: Seed,
+    tap_s: ArrayLike | None = None,
+    angle_deg: ArrayLike = 0.0,
+) -> NDArray[np.float32]:
+    """What n sensors read in one scan of each of their K taps, at any moment of the press.
+
+    Args:
+        clean: as in `apply_nuisances`; between frames readings go along straight lines.
+        share: how much of each press is over, 0 to 1, broadcast to (n, K).
+        nuisances: as in `apply_nuisances`.
+        seed: as in `apply_nuisances`.
+        tap_s: as in `apply_nuisances`, of the whole press.
+        angle_deg: as in `apply_nuisances`.
+
+    Returns:
+        (n, K, 3, rows, cols) whole zeroed counts.
+
+    Raises:
+        NuisanceError: as `apply_nuisances`, or a share is outside 0 to 1.
+    """
+    _check_clean(clean)
+    shares = _per_tap("share", share, clean)
+    if not ((shares >= 0) & (shares <= 1)).all():
+        raise NuisanceError(f"shares of a press are {shares.min():g} to {shares.max():g}, expected 0 to 1")
+    return _read(clean, shares[..., None] * clean.shape[2], nuisances, seed, tap_s, angle_deg)[:, :, 0]
+
+
+def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nuisances) -> list[Pose]:
+    """Where a sensor sent to these poses really taps."""
+    off = _cut_normal(rng, (len(poses), 3))
+    off *= (nuisances.pose_error_mm, nuisances.pose_error_mm, nuisances.pose_error_deg)
+    return [
+        Pose(pose.x_mm + float(x_mm), pose.y_mm + float(y_mm), pose.angle_deg + float(turn_deg))
+        for pose, (x_mm, y_mm, turn_deg) in zip(poses, off, strict=True)
+    ]
+
+
+def draw_rest(rng: np.random.Generator, geometry: SensorGeometry) -> NDArray[np.float32]:
+    """Rest level of one sensor, (3, rows, cols) in raw counts: differs per axis and per taxel, as on real ones."""
+    spread = rng.standard_normal(geometry.scan_shape) * _REST_SPREAD_COUNTS
+    return (np.array(_REST_COUNTS)[:, None, None] + spread).astype(np.float32)
+
+
+def _read(
+    clean: NDArray[np.float32],
+    frame: NDArray[np.float64],
+    nuisances: Nuisances,
+    seed: Seed,
+    tap_s: ArrayLike | None,
+    angle_deg: ArrayLike,
+) -> NDArray[np.float32]:
+    """Readings (n, K, m, 3, rows, cols) at the moments `frame` (n, K, m), in frames since the pad was free."""
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    n, taps, frames, *scan = clean.shape
+
+    def stream(name: str) -> np.random.Generator:
+        key = (*root.spawn_key, crc32(name.encode()))
+        return np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=key))
+
+    torn = nuisances.torn_scans > 0
+    if torn:  # what its taxels may keep: the frame before the first one asked for
+        frame = np.concatenate([np.maximum(frame[..., :1] - 1, 0), frame], axis=-1)
+    lag = np.zeros((2, n))
+    if nuisances.hysteresis:
+        lag = draw_lag(stream("hysteresis"), nuisances.hysteresis, n)
+    weights = frame_weights(frame, frames, _durations_s(tap_s, clean, stream) / frames, *lag)
+    flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)
+    counts = (weights @ flat).reshape(n, taps, -1, *scan)
+
+    if nuisances.cross_talk:
+        largest = stream("cross_talk").random((n, 1, 1, 1, 1), dtype=np.float32) * np.float32(nuisances.cross_talk)
+        flat = counts.reshape(n, taps, -1, len(AXES), scan[1] * scan[2])
+        counts = (flat + largest * (flat @ _neighbours(scan[1], scan[2]))).reshape(counts.shape)
+    if nuisances.gain_spread:
+        counts *= 1 + np.float32(nuisances.gain_spread) * _cut_normal(stream("gain_spread"), (n, 1, 1, *scan))
+    if nuisances.thermal_drift_counts:
+        drift = nuisances.thermal_drift_counts * _draw_drift(stream("thermal_drift_counts"), n, scan)
+        counts += drift[:, None, None]
+    if nuisances.earth_field_counts:
+        turn = np.radians(_per_tap("angle_deg", angle_deg, clean))
+        earth = nuisances.earth_field_counts * _draw_earth(stream("earth_field_counts"), turn)
+        counts += earth[:, :, None, :, None, None]
+    if nuisances.noise_counts:
+        shape = (n, taps, frame.shape[2] - torn, *scan)
+        noise = stream("noise_counts").standard_normal(shape, dtype=np.float32)
+        if torn:  # drawn apart, so that torn scans leave the noise of the others as it is
+            before = stream("noise_before").standard_normal((n, taps, 1, *scan), dtype=np.float32)
+            noise = np.concatenate([before, noise], axis=2)
+        counts += np.float32(nuisances.noise_counts) * noise
+    limit = np.array(nuisances.saturation_counts, dtype=np.float32)[:, None, None]
+    np.clip(counts, -limit, limit, out=counts)
+    if nuisances.stuck_taxels:
+        stuck, held = _draw_stuck(stream("stuck_taxels"), nuisances.stuck_taxels, n, scan)
+        counts = np.where(stuck[:, None, None], held[:, None, None], counts)
+    if nuisances.dead_taxels:
+        dead = stream("dead_taxels").random((n, 1, 1, 1, *scan[1:])) < nuisances.dead_taxels
+        counts = np.where(dead, np.float32(0), counts)
+    if torn:
+        stale = _draw_torn(stream("torn_scans"), nuisances.torn_scans, counts[:, :, 1:].shape)
+        counts = np.where(stale, counts[:, :, :-1], counts[:, :, 1:])
+    return np.rint(counts)
+
+
+def _draw_drift(rng: np.random.Generator, n: int, scan: Sequence[int]) -> NDArray[np.float32]:
+    """(n, 3, rows, cols) in deviations of z."""
+    common = _cut_normal(rng, (n, len(AXES), 1, 1)) * _DRIFT_OF_AXIS[:, None, None]
+    return (common * (1 + _DRIFT_OF_TAXEL * _cut_normal(rng, (n, *scan)))).astype(np.float32)
+
+
+def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Change of a field of length 1 since zeroing at any attitude, (n, K, 3) in the pad's axes; `turn` in [rad]."""
+    field, zeroed = rng.standard_normal((2, len(turn), 3))
+    field /= np.linalg.norm(field, axis=-1, keepdims=True)
+    zeroed /= np.linalg.norm(zeroed, axis=-1, keepdims=True)
+    along_x, along_y, along_z = field.T[..., None]
+    # The pad faces the surface: seen from above its x turns with the pose, its y points to the right of its x.
+    x = along_x * np.cos(turn) + along_y * np.sin(turn)
+    y = along_x * np.sin(turn) - along_y * np.cos(turn)
+    z = np.broadcast_to(-along_z, turn.shape)
+    return (np.stack([x, y, z], axis=-1) - zeroed[:, None]).astype(np.float32)
+
+
+def _draw_stuck(
+    rng: np.random.Generator, chance: float, n: int, scan: Sequence[int]
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which taxels stick, (n, 1, rows, cols), and the constants they hold, (n, 3, rows, cols)."""
+    stuck = rng.random((n, 1, *scan[1:])) < chance
+    high = np.array(LARGEST_COUNTS)[:, None, None]
+    low = high * np.array([-1.0, -1.0, 0.0])[:, None, None]  # pressed, z only rises
+    return stuck, rng.uniform(low, high, (n, *scan)).astype(np.float32)
+
+
+def _draw_torn(rng: np.random.Generator, chance: float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Readings of the frame before, (n, K, m, 1, rows, cols): a run of ids, which come round and round."""
+    *scans, _, rows, cols = shape
+    torn = rng.random(scans) < chance
+    first = rng.integers(rows * cols, size=scans)
+    length = rng.integers(1, rows * cols, size=scans)
+    # Ids grow with the rows, and against the columns (layout C).
+    place = np.arange(rows * cols).reshape(rows, cols)[:, ::-1]
+    after_first = (place - first[..., None, None]) % (rows * cols)
+    return (torn[..., None, None] & (after_first < length[..., None, None]))[..., None, :, :]
+
+
+def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    return np.clip(rng.standard_normal(shape, dtype=np.float32), -2, 2)
+
+
+def _neighbours(rows: int, cols: int) -> NDArray[np.float32]:
+    """Share of a taxel's outflow that reaches another, (taxels, taxels): a quarter over each edge."""
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    return ((abs(row[:, None] - row) + abs(col[:, None] - col)) == 1).astype(np.float32) / 4
+
+
+def _durations_s(
+    tap_s: ArrayLike | None, clean: NDArray, stream: Callable[[str], np.random.Generator]
+) -> NDArray[np.float64]:
+    if tap_s is None:
+        low, high = np.log(TAP_S)
+        return np.exp(stream("tap_s").uniform(low, high, clean.shape[:2]))
+    durations_s = _per_tap("tap_s", tap_s, clean)
+    if not ((durations_s > 0) & np.isfinite(durations_s)).all():
+        raise NuisanceError(f"taps last {durations_s.min():g} to {durations_s.max():g} s, expected more than 0, finite")
+    return durations_s
+
+
+def _per_tap(name: str, values: ArrayLike, clean: NDArray) -> NDArray[np.float64]:
+    given = np.asarray(values, dtype=np.float64)
+    try:
+        return np.broadcast_to(given, clean.shape[:2])
+    except ValueError:
+        raise NuisanceError(f"{name} has shape {given.shape}, expected one for each tap, {clean.shape[:2]}") from None
+
+
+def _check_clean(clean: NDArray) -> None:
+    if clean.ndim != 6 or clean.shape[3] != len(AXES):
+        raise NuisanceError(f"readings have shape {clean.shape}, expected (n, K, F, {len(AXES)}, rows, cols)")

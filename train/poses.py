@@ -1,0 +1,128 @@
+"""Where and how often a surface is tapped: the paper's schedule, and poses drawn at random.
+
+The paper taps each surface at nine positions, turned nine ways: record = position * 9 + rotation. A target is a
+tap whose pattern is asked for; the taps before it were made at the same place, each turned back one more angle
+step. Targets are split by position, and every K has the same ones: 504 to train on, 72 to validate, 72 to test.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.depth import Pose
+from train.surfaces import SURFACES
+
+ANGLE_STEP_DEG: Final = 5.0
+MAX_TAPS: Final = 7
+POSITIONS: Final = 9
+PAPER_ANGLES_DEG: Final = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 60.0, 90.0)
+TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
+POSITION_STEP_MM: Final = 2.5
+TEST_POSITION: Final = 0
+VALIDATION_POSITION: Final = 1
+HELD_OUT_RADIUS_MM: Final = 1.0
+"""Poses drawn at random keep this far from the two positions that nothing is trained on.
+
+Only C, F, L, P, T and U are new there in every sense: the other surfaces are symmetric, and look as they do at another
+position to a pad turned by 90, 120 or 180 degrees. It makes no difference that shows, see docs/log.md.
+"""
+REACH_MM: Final = 3.5
+"""Poses drawn at random lie this far from the surface's centre at most, along x and along y."""
+
+Split = Literal["train", "validation", "test"]
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """Taps whose patterns are asked for.
+
+    Attributes:
+        surfaces: n names.
+        poses: n poses.
+    """
+
+    surfaces: list[str]
+    poses: list[Pose]
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+
+def position_mm(index: int) -> tuple[float, float]:
+    """One of the nine positions, a 3 x 3 grid, x and y in [mm].
+
+    Raises:
+        ValueError: not one of the nine.
+    """
+    if not 0 <= index < POSITIONS:
+        raise ValueError(f"position {index}: expected 0 to {POSITIONS - 1}")
+    return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
+
+
+def position_and_angle(record: int) -> tuple[int, float]:
+    """Position and angle in [deg] of one of the paper's 81 records of a surface.
+
+    Raises:
+        ValueError: not one of the 81.
+
+    Source: Wu and Liu 2024, Fig. 1 and the order of the records in their files.
+    """
+    if not 0 <= record < POSITIONS * len(PAPER_ANGLES_DEG):
+        raise ValueError(f"record {record}: expected 0 to {POSITIONS * len(PAPER_ANGLES_DEG) - 1}")
+    position, rotation = divmod(record, len(PAPER_ANGLES_DEG))
+    return position, PAPER_ANGLES_DEG[rotation]
+
+
+def positions_of(split: Split) -> tuple[int, ...]:
+    """The positions of a split: 0 to test, 1 to validate, the other seven to train on."""
+    held_out = {"test": TEST_POSITION, "validation": VALIDATION_POSITION}
+    if split in held_out:
+        return (held_out[split],)
+    return tuple(index for index in range(POSITIONS) if index not in held_out.values())
+
+
+def paper_targets(positions: Sequence[int], surfaces: Sequence[str] = SURFACES) -> Targets:
+    """Every surface at the four target angles of each position; surfaces change slowest, angles fastest."""
+    taps = [
+        (name, Pose(*position_mm(position), angle_deg))
+        for name in surfaces
+        for position in positions
+        for angle_deg in TARGET_ANGLES_DEG
+    ]
+    return Targets([name for name, _ in taps], [pose for _, pose in taps])
+
+
+def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str] = SURFACES, first: int = 0) -> Targets:
+    """Surfaces in turn from the `first` on, places and angles at random, none near the held-out positions."""
+    held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
+    poses: list[Pose] = []
+    while len(poses) < count:
+        x_mm, y_mm = rng.uniform(-REACH_MM, REACH_MM, 2)
+        angle_deg = rng.uniform(0, 360)
+        if np.hypot(*(held_out_mm - (x_mm, y_mm)).T).min() > HELD_OUT_RADIUS_MM:
+            poses.append(Pose(float(x_mm), float(y_mm), float(angle_deg)))
+    return Targets([surfaces[(first + i) % len(surfaces)] for i in range(count)], poses)
+
+
+def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_DEG) -> NDArray[np.float64]:
+    """Poses (n, taps, 3) of the taps that end in each target, newest first: x, y in [mm], angle in [deg].
+
+    Raises:
+        ValueError: taps or angle_step_deg out of bounds.
+    """
+    if not 1 <= taps <= MAX_TAPS:
+        raise ValueError(f"{taps} taps in a sequence: expected 1 to {MAX_TAPS}")
+    if not 0 <= angle_step_deg <= 180:
+        raise ValueError(f"angle step of {angle_step_deg} deg: expected 0 to 180")
+    newest = np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in targets.poses]).reshape(-1, 1, 3)
+    back = np.zeros((1, taps, 3))
+    back[..., 2] = angle_step_deg * np.arange(taps)[None]
+    return newest - back
+
+
+def as_poses(array: NDArray[np.floating]) -> list[Pose]:
+    """The poses of an array (..., 3), in order."""
+    return [Pose(*(float(value) for value in row)) for row in array.reshape(-1, 3)]
