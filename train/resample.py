@@ -1,0 +1,63 @@
+"""Patterns at another scale: a pixel is the mean over its area, so edges stay where they are and volume is kept.
+
+Averaging over the pixel is the anti-aliasing. Against torch's and scikit-image's resizing it keeps the mean of any
+map exactly, at ratios that are not whole numbers too.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def resample(
+    patterns: NDArray[np.floating] | NDArray[np.bool_], from_scale: float, to_scale: float
+) -> NDArray[np.float32]:
+    """Maps (n, H, W) drawn at `from_scale` pixels per pitch, at `to_scale`: (n, H', W'), in the same unit.
+
+    Towards a finer scale a pixel is repeated: nothing is added to what the coarse map knows.
+
+    Args:
+        patterns: (n, H, W); of a mask, the share of each pixel that is set.
+        from_scale: pixels per pitch of the maps.
+        to_scale: pixels per pitch wanted; it must leave a whole number of pixels.
+
+    Raises:
+        ValueError: shapes or scales do not fit.
+    """
+    if patterns.ndim != 3:
+        raise ValueError(f"patterns of shape {patterns.shape}, expected (n, H, W)")
+    maps = np.asarray(patterns, dtype=np.float32)
+    if from_scale == to_scale:
+        return maps.copy()
+    down, right = (_shares(length, from_scale, to_scale) for length in maps.shape[1:])
+    return np.matmul(down, maps @ right.T)
+
+
+def resample_touching(touching: NDArray[np.bool_], from_scale: float, to_scale: float) -> NDArray[np.bool_]:
+    """Masks (n, H, W) at another scale: a pixel touches if at least half of its area does.
+
+    Raises:
+        ValueError: shapes or scales do not fit.
+    """
+    # Shares are sums of rounded thirds and the like: half an area may come out a rounding below 0.5.
+    return resample(touching, from_scale, to_scale) >= 0.5 - 1e-5
+
+
+@lru_cache
+def _shares(length: int, from_scale: float, to_scale: float) -> NDArray[np.float32]:
+    """Share of each old pixel in each new one along a line, (new, old); rows sum to 1."""
+    if not (from_scale > 0 and to_scale > 0):
+        raise ValueError(f"scales {from_scale} and {to_scale}, expected positive numbers of pixels per pitch")
+    ratio = to_scale / from_scale
+    count = round(length * ratio)
+    if abs(count - length * ratio) > 1e-6 * length or count == 0:
+        raise ValueError(
+            f"{length} pixels at x{from_scale:g} are {length * ratio:g} at x{to_scale:g}, expected a whole number"
+        )
+    new = np.arange(count + 1) / count
+    old = np.arange(length + 1) / length
+    overlap = np.minimum(new[1:, None], old[None, 1:]) - np.maximum(new[:-1, None], old[None, :-1])
+    shares = (np.maximum(overlap, 0.0) * count).astype(np.float32)
+    shares.setflags(write=False)
+    return shares
