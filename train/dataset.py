@@ -1,173 +1,257 @@
-"""Sequences of taps to learn from and to be judged on: poses, splits, and windows with nuisances.
+"""Sequences of taps to learn from and to be judged on, as one npz file with a schema, a seed and a hash.
 
-A sequence is K taps on one surface by one sensor at one place, each turned ANGLE_STEP_DEG from the last; the newest
-tap is the target. Training poses are drawn at random; the frozen test and validation sets sit at two positions
-around which training draws no pose.
+A sequence is K taps on one surface, newest first; the newest is the target. Every tap is stored as a whole press,
+FRAMES frames to its end, so that readings and truth are there at any force below: frame i lies at (i + 1) / FRAMES
+of the press, nothing is felt at 0, and between frames all goes along straight lines.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Final
+import hashlib
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from edge.frozen import FrozenSet
-from firmware_bridge.geometry import SensorGeometry
-from train.depth import Pose
-from train.simulation import MAX_INDENTATION_MM, SimulatedSensor, UnitTaps
-from train.skin import Nuisances, draw_gains, read_counts
-from train.surfaces import SURFACES
+from train.errors import DatasetError
+from train.nuisances import Nuisances, Seed, read_windows
+from train.resample import resample, resample_touching
+from train.simulation import FINE_SCALE, FRAMES
 
-ANGLE_STEP_DEG: Final = 5.0
-MAX_TAPS: Final = 4
-FRAMES: Final = 16
-"""Frames of a tap in the test set, from FIRST_SHARE of its set force to all of it."""
-FIRST_SHARE: Final = 0.3
-TEST_FORCE_N: Final = 5.0
-SET_FORCE_N: Final = (1.5, 8.0)
-"""Bounds of the set forces of training taps."""
-TEST_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
-POSITION_STEP_MM: Final = 2.5
-TEST_POSITION: Final = 0
-VALIDATION_POSITION: Final = 1
-_HELD_OUT_RADIUS_MM: Final = 1.0
-_REACH_MM: Final = 3.5
-_BATCH: Final = 96
-_SET_FORCE_SPREAD: Final = (0.85, 1.15)
-"""A robot does not end every tap at the same force."""
+SCHEMA: Final = "tactile-edge-sr sequences"
+VERSION: Final = 1
 
-
-def position_mm(index: int) -> tuple[float, float]:
-    """One of the nine positions, a 3 x 3 grid, x and y in [mm]."""
-    return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
+_RESAMPLED_AT_ONCE: Final = 256
+_AXES: Final[Mapping[str, tuple[str, str]]] = {
+    "surfaces": ("U", "n"),
+    "poses": ("float64", "nk3"),
+    "counts": ("float32", "nkf3rc"),
+    "force_n": ("float32", "nkf"),
+    "indentation_mm": ("float32", "nkf"),
+    "unit_patterns": ("float16", "nlhw"),
+    "touching": ("bool", "nlhw"),
+}
+"""Type and axes of each array; a letter is the same length everywhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sequences:
-    """Solved sequences of taps, newest tap first.
+    """Sequences of K clean taps, newest first.
 
     Attributes:
-        surface: (n,) index into SURFACES.
-        readings: (n, MAX_TAPS, 3, rows, cols) counts per mm of indentation.
-        force_n_per_mm: (n, MAX_TAPS), in [N/mm].
-        patterns: (n, H, W) of the newest tap, mm per mm.
+        surfaces: (n,) names.
+        poses: (n, K, 3) float64, where the pad truly was: x, y in [mm], angle in [deg].
+        counts: (n, K, FRAMES, 3, rows, cols) float32, zeroed, without nuisances.
+        force_n: (n, K, FRAMES) float32, in [N].
+        indentation_mm: (n, K, FRAMES) float32, in [mm], even steps.
+        unit_patterns: (n, L, H, W) float16 of the newest tap, deformation per indentation; L = 1 where all surfaces
+            are flat and one map times the indentation is every frame's pattern; else L = FRAMES.
+        touching: (n, L, H, W) bool, pixels that the surface touches.
+        scale: pattern pixels per taxel pitch.
+        seed: that they were drawn from.
+        config: what they were made with, as JSON gives it back.
     """
 
-    surface: NDArray[np.int64]
-    readings: NDArray[np.float32]
-    force_n_per_mm: NDArray[np.float32]
-    patterns: NDArray[np.float32]
+    surfaces: NDArray[np.str_]
+    poses: NDArray[np.float64]
+    counts: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    indentation_mm: NDArray[np.float32]
+    unit_patterns: NDArray[np.float16]
+    touching: NDArray[np.bool_]
+    scale: int = FINE_SCALE
+    seed: int = 0
+    config: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(self.surface)
+        return len(self.surfaces)
 
-    def pick(self, index: NDArray[np.int64]) -> "Sequences":
+    @property
+    def taps(self) -> int:
+        """K."""
+        return self.counts.shape[1]
+
+    def newest(self, taps: int) -> "Sequences":
+        """The same with the newest `taps` taps alone.
+
+        Raises:
+            DatasetError: there are not as many.
+        """
+        if not 1 <= taps <= self.taps:
+            raise DatasetError(f"{taps} taps asked for, but these sequences have {self.taps}: make others with --taps")
+        several = ("poses", "counts", "force_n", "indentation_mm")
+        return replace(self, **{name: getattr(self, name)[:, :taps] for name in several})
+
+    def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "Sequences":
         """The sequences of the given indices."""
-        return Sequences(self.surface[index], self.readings[index], self.force_n_per_mm[index], self.patterns[index])
+        return replace(self, **{name: getattr(self, name)[index] for name in _AXES})
 
-    def end_mm(self, force_n: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Indentation (n, MAX_TAPS) at which taps of set forces (n, MAX_TAPS) end, in [mm]."""
-        flat = UnitTaps(self.readings, self.force_n_per_mm, self.patterns)
-        return flat.indentation_mm(force_n)
+    def at_scale(self, scale: int) -> "Sequences":
+        """The same with the truth resampled to another scale: once after loading, not for every batch."""
+        if scale == self.scale:
+            return self
+        patterns, touching = [], []
+        for start in range(0, len(self), _RESAMPLED_AT_ONCE):  # in parts, as resampling works in float32
+            fine = self.unit_patterns[start : start + _RESAMPLED_AT_ONCE]
+            touched = self.touching[start : start + _RESAMPLED_AT_ONCE]
+            maps = resample(fine.reshape(-1, *fine.shape[2:]), self.scale, scale).astype(np.float16)
+            masks = resample_touching(touched.reshape(-1, *touched.shape[2:]), self.scale, scale)
+            patterns.append(maps.reshape(*fine.shape[:2], *maps.shape[1:]))
+            touching.append(masks.reshape(*fine.shape[:2], *masks.shape[1:]))
+        return replace(self, unit_patterns=np.concatenate(patterns), touching=np.concatenate(touching), scale=scale)
+
+    def share_at_force(self, index: NDArray[np.integer], force_n: ArrayLike) -> NDArray[np.float64]:
+        """Shares (B, K) of the presses at which they reach their set forces; 1 where a press ends before.
+
+        Args:
+            index: (B,) sequences.
+            force_n: broadcast to (B, K), above 0, in [N].
+        """
+        force = self.force_n[index].astype(np.float64)
+        wanted = np.broadcast_to(np.asarray(force_n, dtype=np.float64), force.shape[:2])[..., None]
+        force = np.concatenate([np.zeros_like(force[..., :1]), force], axis=-1)
+        below = np.minimum((force[..., 1:] < wanted).sum(axis=-1, keepdims=True), FRAMES - 1)
+        low, high = (np.take_along_axis(force, below + step, axis=-1) for step in (0, 1))
+        return np.minimum((below + (wanted - low) / (high - low))[..., 0] / FRAMES, 1.0)
+
+    def presses(
+        self, index: NDArray[np.integer], share: NDArray[np.floating], frames: int = FRAMES
+    ) -> NDArray[np.float32]:
+        """Clean readings (B, K, frames, 3, rows, cols) of presses that end at shares (B, K) of the stored ones."""
+        counts = self.counts[index]
+        moments = share[..., None] * np.arange(1, frames + 1) / frames
+        readings = between_frames(counts.reshape(-1, *counts.shape[2:]), moments.reshape(-1, frames))
+        return readings.reshape(*moments.shape, *counts.shape[3:])
+
+    def force_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Force of the newest tap, (B, m) in [N], at shares (B, m) of its press."""
+        return between_frames(self.force_n[index, 0], share)
+
+    def indentation_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Indentation of the newest tap, (B, m) in [mm], at shares (B, m) of its press."""
+        return between_frames(self.indentation_mm[index, 0], share)
+
+    def patterns_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Truth of the newest tap, (B, H, W) in [mm], at shares (B,) of its press."""
+        unit, end_mm = self.unit_patterns[index].astype(np.float32), self.indentation_mm[index, 0]
+        if unit.shape[1] == 1:
+            depth_mm = (end_mm[:, -1] * share).astype(np.float32)
+            return unit[:, 0] * depth_mm[:, None, None]
+        return between_frames(unit * end_mm[..., None, None], share[:, None])[:, 0]
+
+    def touching_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Pixels touched by the newest tap, (B, H, W), in the frame nearest to shares (B,) of its press."""
+        nearest = np.clip(np.rint(share * FRAMES).astype(int) - 1, 0, self.touching.shape[1] - 1)
+        return self.touching[index, nearest]
+
+    def sha256(self) -> str:
+        """Hash over all that is here, whatever file it lies in."""
+        digest = hashlib.sha256(json.dumps([self.scale, self.seed, self.config], sort_keys=True).encode())
+        for name in _AXES:
+            array = np.ascontiguousarray(getattr(self, name))
+            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+            digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
+        return digest.hexdigest()
+
+    def save(self, path: Path) -> None:
+        """Write as one npz, whole or not at all.
+
+        Raises:
+            DatasetError: the file cannot be written.
+        """
+        arrays = {name: getattr(self, name) for name in _AXES}
+        arrays["touching"] = np.packbits(self.touching, axis=-1)
+        facts = {"scale": self.scale, "seed": self.seed, "config": self.config, "sha256": self.sha256()}
+        draft = path.with_name(path.name + ".draft")
+        try:
+            with draft.open("wb") as file:
+                np.savez(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=json.dumps(facts), **arrays)
+            draft.replace(path)
+        except OSError as error:
+            draft.unlink(missing_ok=True)
+            raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def solve_sequences(
-    sensor: SimulatedSensor,
-    surfaces: list[str],
-    newest: list[Pose],
-    progress: Callable[[int], object] = lambda count: None,
-) -> Sequences:
-    """Tap each surface MAX_TAPS times, ending at the pose given; earlier taps are turned back step by step."""
-    poses = [
-        Pose(pose.x_mm, pose.y_mm, pose.angle_deg - back * ANGLE_STEP_DEG)
-        for pose in newest
-        for back in range(MAX_TAPS)
-    ]
-    names = [name for name in surfaces for _ in range(MAX_TAPS)]
-    parts: list[UnitTaps] = []
-    edges = [*range(0, len(poses), _BATCH), len(poses)]
-    for start, stop in pairwise(edges):
-        parts.append(sensor.tap(names[start:stop], poses[start:stop]))
-        progress(stop - start)
-    count = len(newest)
-    readings = np.concatenate([part.readings for part in parts])
-    force = np.concatenate([part.force_n_per_mm for part in parts])
-    patterns = np.concatenate([part.patterns[::MAX_TAPS] for part in parts])
-    return Sequences(
-        np.array([SURFACES.index(name) for name in surfaces]),
-        readings.reshape(count, MAX_TAPS, *readings.shape[1:]),
-        force.reshape(count, MAX_TAPS),
-        patterns,
-    )
+def load_sequences(path: Path) -> Sequences:
+    """Read a file that `Sequences.save` has written.
 
-
-def random_poses(rng: np.random.Generator, count: int) -> tuple[list[str], list[Pose]]:
-    """Surfaces in turn, places and angles at random, none near the held-out positions."""
-    held_out = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
-    poses: list[Pose] = []
-    while len(poses) < count:
-        x_mm, y_mm = rng.uniform(-_REACH_MM, _REACH_MM, 2)
-        angle_deg = rng.uniform(0, 360)
-        if np.hypot(*(held_out - (x_mm, y_mm)).T).min() > _HELD_OUT_RADIUS_MM:
-            poses.append(Pose(float(x_mm), float(y_mm), float(angle_deg)))
-    return [SURFACES[i % len(SURFACES)] for i in range(count)], poses
-
-
-def held_out_poses(position: int) -> tuple[list[str], list[Pose]]:
-    """Every surface at the four test angles of one held-out position."""
-    x_mm, y_mm = position_mm(position)
-    pairs = [(name, Pose(x_mm, y_mm, angle)) for name in SURFACES for angle in TEST_ANGLES_DEG]
-    return [name for name, _ in pairs], [pose for _, pose in pairs]
-
-
-def freeze(sensor: SimulatedSensor, position: int, nuisances: Nuisances, seed: int) -> FrozenSet:
-    """The frames of one held-out position; each sequence is tapped by another sensor (gains)."""
-    rng = np.random.default_rng([seed, position])
-    surfaces, poses = held_out_poses(position)
-    solved = solve_sequences(sensor, surfaces, poses)
-    count = len(solved)
-    end_mm = solved.end_mm(np.full((count, MAX_TAPS), TEST_FORCE_N))
-    gains = draw_gains(rng, nuisances, sensor.geometry, count, MAX_TAPS)
-    newest_mm = end_mm[:, :1] * np.linspace(FIRST_SHARE, 1.0, FRAMES)
-    newest = read_counts(rng, solved.readings[:, :1] * gains[:, :1] * newest_mm[..., None, None, None], nuisances)
-    earlier = read_counts(rng, solved.readings[:, 1:] * gains[:, 1:] * end_mm[:, 1:, None, None, None], nuisances)
-    return FrozenSet(
-        newest=newest.reshape(-1, *sensor.geometry.scan_shape).astype(np.int16),
-        earlier=earlier.astype(np.int16),
-        tap=np.repeat(np.arange(count), FRAMES).astype(np.int16),
-        indentation_mm=newest_mm.ravel().astype(np.float32),
-        force_n=(newest_mm * solved.force_n_per_mm[:, :1]).ravel().astype(np.float32),
-        unit_patterns=solved.patterns.astype(np.float16),
-        surface=np.array(surfaces),
-        angle_deg=np.array([pose.angle_deg for pose in poses], dtype=np.float32),
-        full_scale_mm=MAX_INDENTATION_MM,
-    )
-
-
-def training_batches(
-    solved: Sequences,
-    rng: np.random.Generator,
-    nuisances: Nuisances,
-    geometry: SensorGeometry,
-    batch: int,
-    force_n: tuple[float, float],
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """One epoch of windows (batch, MAX_TAPS, 3, rows, cols) in zeroed counts and patterns (batch, H, W) in [mm].
-
-    Set forces are drawn per tap between the bounds of `force_n`, the newest tap is anywhere between first touch and
-    its end, and every window is read by another sensor.
+    Raises:
+        DatasetError: absent, not ours, of a newer schema, incomplete, or damaged.
     """
-    order = rng.permutation(len(solved))
-    for start in range(0, len(order) - batch + 1, batch):
-        part = solved.pick(order[start : start + batch])
-        force = rng.uniform(*force_n, (batch, 1)) * rng.uniform(*_SET_FORCE_SPREAD, (batch, MAX_TAPS))
-        depth_mm = part.end_mm(force)
-        depth_mm[:, 0] *= rng.uniform(FIRST_SHARE, 1.0, batch)
-        gains = draw_gains(rng, nuisances, geometry, batch, MAX_TAPS)
-        windows = read_counts(rng, part.readings * gains * depth_mm[..., None, None, None], nuisances)
-        yield quarter_turns(windows, part.patterns * depth_mm[:, 0, None, None], int(rng.integers(4)))
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not isinstance(file, np.lib.npyio.NpzFile) or "schema" not in file or str(file["schema"]) != SCHEMA:
+                raise DatasetError(f"{path} is no file of sequences: make one with 'python -m train.generate'")
+            if (version := int(file["version"])) > VERSION:
+                raise DatasetError(f"{path} has schema version {version}, newer than {VERSION}: update this program")
+            facts = json.loads(str(file["facts"]))
+            arrays = {name: file[name] for name in _AXES}
+            arrays["touching"] = _unpacked(arrays["touching"], arrays["unit_patterns"])
+    except DatasetError:
+        raise
+    except FileNotFoundError:
+        raise DatasetError(f"{path}: no such file; make one with 'python -m train.generate {path}'") from None
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise DatasetError(f"{path} is no file of sequences, or a damaged one ({error}): make it again") from error
+    _check_axes(path, arrays)
+    loaded = Sequences(**arrays, **{name: facts.get(name) for name in ("scale", "seed", "config")})
+    if (found := loaded.sha256()) != facts.get("sha256"):
+        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it says {facts.get('sha256')}: make it again")
+    return loaded
+
+
+def join(parts: Sequence[Sequences]) -> Sequences:
+    """Sequences one after the other, with the first part's scale, seed and configuration.
+
+    Where some parts have one map for a press and others one for each frame, the one is repeated.
+
+    Raises:
+        DatasetError: they have different numbers of taps.
+    """
+    taps = {part.taps for part in parts}
+    if len(taps) > 1:
+        raise DatasetError(
+            f"files of {' and '.join(map(str, sorted(taps)))} taps a sequence: make them with one --taps"
+        )
+    maps = max(part.unit_patterns.shape[1] for part in parts)
+    arrays = {name: [getattr(part, name) for part in parts] for name in _AXES}
+    for name in ("unit_patterns", "touching"):
+        arrays[name] = [np.repeat(array, maps // array.shape[1], axis=1) for array in arrays[name]]
+    return replace(parts[0], **{name: np.concatenate(several) for name, several in arrays.items()})
+
+
+def windows(
+    sequences: Sequences,
+    index: NDArray[np.integer],
+    depth_share: ArrayLike,
+    force_n: ArrayLike,
+    nuisances: Nuisances,
+    seed: Seed,
+    tap_s: ArrayLike | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What as many sensors read, and the truth: the newest tap is on its way, the earlier ones have come to their ends.
+
+    Args:
+        sequences: with the truth at the scale asked for.
+        index: (B,) sequences.
+        depth_share: how much of the newest press is over, above 0 to 1, broadcast to (B,).
+        force_n: set force of every tap, broadcast to (B, K), in [N].
+        nuisances: of these sensors.
+        seed: of the nuisances.
+        tap_s: time that the stored presses take, broadcast to (B, K), or None to draw it.
+
+    Returns:
+        Windows (B, K, 3, rows, cols) in whole zeroed counts, and patterns (B, H, W) in [mm].
+    """
+    share = sequences.share_at_force(index, force_n)
+    share[:, 0] *= np.asarray(depth_share, dtype=np.float64)
+    angle_deg = sequences.poses[index, :, 2]
+    readings = read_windows(sequences.counts[index], share, nuisances, seed, tap_s, angle_deg)
+    return readings, sequences.patterns_at(index, share[:, 0])
 
 
 def quarter_turns(
@@ -175,7 +259,35 @@ def quarter_turns(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The same contacts felt by a pad turned clockwise: maps turn, and the shear (x, y) turns with them."""
     turned, maps = windows, np.rot90(patterns, quarters, axes=(-2, -1))
-    for _ in range(quarters):
+    for _ in range(quarters % 4):
         x, y, z = np.moveaxis(np.rot90(turned, 1, axes=(-2, -1)), -3, 0)
         turned = np.stack([y, -x, z], axis=-3)
     return turned, maps
+
+
+def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Values (b, m, ...) at shares (b, m) of presses whose frames (b, FRAMES, ...) are known, and 0 at their start."""
+    away = np.abs(share[..., None] * FRAMES - np.arange(1, FRAMES + 1))
+    weights = np.maximum(1 - away, 0).astype(np.float32)
+    return (weights @ frames.reshape(*frames.shape[:2], -1)).reshape(*share.shape, *frames.shape[2:])
+
+
+def _unpacked(touching: NDArray[np.uint8], patterns: NDArray[np.float16]) -> NDArray[np.bool_]:
+    """Masks that a file keeps as bits, along the last axis."""
+    if not patterns.ndim:
+        raise ValueError("unit_patterns has no axes")
+    return np.unpackbits(touching, axis=-1, count=patterns.shape[-1]).astype(bool)
+
+
+def _check_axes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    lengths = {"f": FRAMES, "3": 3}
+    for name, (kind, axes) in _AXES.items():
+        array = arrays[name]
+        fits = array.ndim == len(axes) and (array.dtype.kind == kind if kind == "U" else array.dtype == kind)
+        if not fits or any(
+            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
+        ):
+            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
+            raise DatasetError(f"{path}: {name} is {array.dtype} {array.shape}, expected {kind} ({expected})")
+    if lengths["l"] not in (1, FRAMES):
+        raise DatasetError(f"{path}: {lengths['l']} maps for a press, expected 1 or {FRAMES}")

@@ -1,0 +1,187 @@
+"""Make a dataset of taps on all cores, or on a cluster; a run that was cut short goes on where it was.
+
+    python -m train.generate data/train.npz --glyphs 2000 --polygons 2000 --count 9000
+
+Chunks of sequences are solved by joblib's workers and written beside the file as they come, in `data/train.npz.parts`;
+at the end they are joined and removed. The arrays are the same, to the bit, however often a run was cut short.
+
+A cluster that is already there takes the work through joblib's own backends. With Dask:
+
+    import joblib
+    from distributed import Client
+    from train.generate import generate
+    from train.generation import Generation
+
+    with Client("tcp://scheduler:8786"), joblib.parallel_config(backend="dask"):
+        generate(Generation(count=100_000), Path("train.npz"))
+
+and with Ray, after `from ray.util.joblib import register_ray; register_ray()`, the same with backend="ray". Workers
+need this package installed, and users' meshes at the same path. Only the caller writes files.
+"""
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Final, cast
+
+import joblib
+from tqdm import tqdm
+
+from train.dataset import Sequences, join, load_sequences
+from train.errors import DatasetError, TrainError
+from train.generation import FORCE_N, Generation, one_thread, random_figures, solve_chunk
+from train.poses import ANGLE_STEP_DEG, MAX_TAPS
+from train.surfaces import PLATES, SURFACES, surface_mesh
+
+_INTERRUPTED: Final = 130
+_NAMED: Final = {"all": SURFACES, "plate1": PLATES[0], "plate2": PLATES[1], "none": ()}
+
+
+def generate(
+    config: Generation, path: Path, jobs: int = -1, progress: Callable[[int], object] = lambda poses: None
+) -> Sequences:
+    """Solve what a configuration asks for, and write it; called again after a kill, go on.
+
+    Args:
+        config: what.
+        path: of the npz.
+        jobs: processes, -1 for one on each core; joblib's configured backend may have its own number.
+        progress: called with the number of poses that have become ready.
+
+    Raises:
+        DatasetError: what lies at `path` or beside it was made with another configuration, or cannot be written.
+        SurfaceError: a surface's name means nothing.
+        MeshError: a user's mesh cannot be used.
+    """
+    if path.exists():
+        if (there := load_sequences(path)).config != config.facts():
+            raise DatasetError(f"{path} is there and was made otherwise: delete it, or write to another file")
+        progress(len(there) * there.taps)
+        return there
+    if jobs == 0:
+        raise DatasetError("jobs is 0, expected 1 or more, or -1 for one on each core")
+    for name in config.surfaces:
+        if name.startswith("mesh:"):  # before any work: the likeliest to fail
+            surface_mesh(name)
+    folder = path.with_name(path.name + ".parts")
+    missing = _missing_chunks(config, folder, progress)
+    with one_thread():  # workers may be threads of this process
+        for chunk, part in _solved(config, missing, jobs):
+            part.save(_part_path(folder, chunk))
+            progress(len(part) * part.taps)
+    made = join([load_sequences(_part_path(folder, chunk)) for chunk in range(config.chunks)])
+    made.save(path)
+    shutil.rmtree(folder)
+    return made
+
+
+def _part_path(folder: Path, chunk: int) -> Path:
+    return folder / f"{chunk:06d}.npz"
+
+
+def _missing_chunks(config: Generation, folder: Path, progress: Callable[[int], object]) -> list[int]:
+    """Numbers of the chunks that an earlier run has not left; damaged ones are solved anew."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
+    missing: list[int] = []
+    for chunk in range(config.chunks):
+        path = _part_path(folder, chunk)
+        try:
+            part = load_sequences(path)
+        except DatasetError:
+            missing.append(chunk)
+            continue
+        if part.config != config.facts():
+            raise DatasetError(f"{folder} holds parts of another run: delete it, or write to another file")
+        progress(len(part) * part.taps)
+    return missing
+
+
+def _solved(config: Generation, chunks: Sequence[int], jobs: int) -> Iterator[tuple[int, Sequences]]:
+    """Chunks and their numbers, as they become ready."""
+    tasks = [joblib.delayed(_numbered)(config, chunk) for chunk in chunks]
+    try:
+        pool, at_once = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered"), len(tasks)
+    except ValueError:  # a backend without generators, such as Ray's: in rounds, so that parts are kept all the same
+        pool, at_once = joblib.Parallel(n_jobs=jobs), 4 * joblib.effective_n_jobs(jobs)
+    for start in range(0, len(tasks), max(at_once, 1)):
+        yield from cast("Iterable[tuple[int, Sequences]]", pool(tasks[start : start + at_once]))
+
+
+def _numbered(config: Generation, chunk: int) -> tuple[int, Sequences]:
+    return chunk, solve_chunk(config, chunk)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
+    options = _parser().parse_args(arguments)
+    started_s = time.monotonic()
+    try:
+        config = _config(options)
+        total = config.sequences * config.taps
+        with tqdm(total=total, desc="poses", unit="pose", disable=not sys.stderr.isatty()) as bar:
+            made = generate(config, options.out, options.jobs, bar.update)
+    except TrainError as error:
+        sys.stderr.write(f"train.generate: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("train.generate: interrupted; the same command goes on from here\n")
+        return _INTERRUPTED
+    rate = total / (time.monotonic() - started_s)
+    sys.stdout.write(
+        f"{options.out}: {len(made)} sequences, {total} poses, {rate:.0f} poses/s, sha256 {made.sha256()}\n"
+    )
+    return 0
+
+
+def _config(options: argparse.Namespace) -> Generation:
+    named = _NAMED.get(options.surfaces)
+    if named is None:
+        named = tuple(name.strip() for name in options.surfaces.split(","))
+        for name in named:
+            surface_mesh(name)
+    figures = random_figures(options.glyphs, options.polygons, options.seed)
+    meshes = tuple(f"mesh:{path.resolve()}" for path in options.mesh)
+    return Generation(
+        surfaces=(*named, *figures, *meshes),
+        poses=options.poses,
+        split=options.split,
+        count=options.count,
+        taps=options.taps,
+        angle_step_deg=options.angle_step_deg,
+        force_n=options.force_n,
+        seed=options.seed,
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m train.generate", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", type=Path, metavar="OUT.npz")
+    parser.add_argument(
+        "--surfaces", default="all", help="all, plate1, plate2, none, or names with commas between them (all)"
+    )
+    parser.add_argument("--glyphs", type=int, default=0, help="random stroke figures to add (0)")
+    parser.add_argument("--polygons", type=int, default=0, help="random polygons to add (0)")
+    parser.add_argument(
+        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="an STL, OBJ or PLY to add"
+    )
+    parser.add_argument("--poses", choices=("random", "paper"), default="random", help="how they are chosen (random)")
+    parser.add_argument(
+        "--split", choices=("train", "validation", "test"), default="train", help="of the paper's positions (train)"
+    )
+    parser.add_argument("--count", type=int, default=9000, help="sequences with random poses (9000)")
+    parser.add_argument("--taps", type=int, default=MAX_TAPS, help=f"in a sequence ({MAX_TAPS})")
+    parser.add_argument("--angle-step-deg", type=float, default=ANGLE_STEP_DEG, help="turn between taps (5)")
+    parser.add_argument("--force-n", type=float, default=FORCE_N, help="at which presses end (9.2)")
+    parser.add_argument("--seed", type=int, default=1, help="of poses and random figures (1)")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes, -1 for one on each core (-1)")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

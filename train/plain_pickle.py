@@ -1,0 +1,159 @@
+"""Pickles of numpy arrays, dicts, lists, numbers and strings, read without running anything in them.
+
+A pickle names functions and has them called. Here no name is looked up at all: the handful that a pickled array
+needs stand for classes of our own, which check what they are given and know only bytes, shapes and plain number
+types. numpy's own ones are not used, as they trust their input. Any other name ends the reading before anything
+was called with it.
+"""
+
+import pickle
+import re
+from collections.abc import Callable, Mapping
+from math import prod
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+BROKEN: Final = (
+    pickle.UnpicklingError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    EOFError,
+    MemoryError,
+    RecursionError,
+)
+"""What a broken pickle makes the unpickler raise."""
+
+_PLAIN_CODE: Final = re.compile(r"[biuf][0-9]{1,2}|U[1-9][0-9]{0,5}|O8?")
+
+
+def load_plain(file: BinaryIO) -> Any:
+    """The object pickled next in a file; arrays in it are to be taken with `plain_value`.
+
+    Raises:
+        pickle.UnpicklingError: a name that no array needs, or an array that is none; broken ones raise any of BROKEN.
+    """
+    return plain_value(_PlainUnpickler(file).load())
+
+
+def plain_value(value: Any) -> Any:
+    """An array itself, a list for an array of objects, and all else as it is."""
+    return value.value if isinstance(value, _Array) else value
+
+
+class _Dtype:
+    """What stands for a `numpy.dtype`: numbers, strings and objects, in either byte order."""
+
+    def __init__(self, code: object, *_: object) -> None:
+        if not isinstance(code, str) or not _PLAIN_CODE.fullmatch(code):
+            raise pickle.UnpicklingError(f"an array of type {code!r}, expected plain numbers")
+        self.type = np.dtype(object) if code.startswith("O") else np.dtype(code)
+
+    def __setstate__(self, state: object) -> None:
+        # Version, byte order, then what only compound types have, sizes and flags; numpy believes all of it.
+        if not isinstance(state, tuple) or len(state) != 8 or any(part is not None for part in state[2:5]):
+            raise pickle.UnpicklingError("an array of a compound type, expected plain numbers")
+        if state[1] in ("<", ">"):
+            self.type = self.type.newbyteorder(state[1])
+
+
+class _Array:
+    """What stands for a `numpy.ndarray`: an array of its own numbers, or the list of its objects."""
+
+    def __init__(self) -> None:
+        self.value: NDArray[Any] | list[Any] | None = None
+
+    def __setstate__(self, state: object) -> None:
+        if not isinstance(state, tuple) or len(state) != 5:
+            raise pickle.UnpicklingError("an array in an unknown state")
+        _, shape, dtype, fortran, content = state
+        self.fill(content, dtype, shape, "F" if fortran else "C")
+
+    def fill(self, content: object, dtype: object, shape: object, order: object) -> "_Array":
+        """Take the bytes, or the list of objects, of an array of this type and shape."""
+        if not isinstance(dtype, _Dtype) or not isinstance(shape, tuple) or order not in ("C", "F"):
+            raise pickle.UnpicklingError("an array without type, shape and order")
+        if not all(isinstance(length, int) and length >= 0 for length in shape):
+            raise pickle.UnpicklingError(f"an array of shape {shape}")
+        objects = dtype.type == np.dtype(object)
+        if not isinstance(content, list if objects else (bytes, bytearray)):
+            raise pickle.UnpicklingError(f"an array of {dtype.type} made of a {type(content).__name__}")
+        found = len(content) if objects else len(content) / dtype.type.itemsize
+        if found != prod(shape):
+            raise pickle.UnpicklingError(f"an array of shape {shape} made of {found:g} values")
+        self.value = (
+            content if isinstance(content, list) else np.ndarray(shape, dtype.type, bytes(content), order=order)
+        )
+        return self
+
+
+def _reconstruct(kind: object, *_: object) -> _Array:
+    if kind is not _NDARRAY:
+        raise pickle.UnpicklingError(f"an array of class {kind!r}")
+    return _Array()
+
+
+def _from_buffer(content: object, dtype: object, shape: object, order: object) -> _Array:
+    return _Array().fill(content, dtype, shape, order)
+
+
+def _scalar(dtype: object, content: object) -> int | float | bool | str:
+    made = _Array().fill(content, dtype, (1,), "C").value
+    if not isinstance(made, np.ndarray):
+        raise pickle.UnpicklingError("a number made of an object")
+    return made[0].item()
+
+
+def _encode(text: object, codec: object) -> bytes:
+    """Bytes as protocols before 3 write them; of all codecs this one alone."""
+    if codec != "latin1" or not isinstance(text, str):
+        raise pickle.UnpicklingError(f"bytes in {codec!r}, expected latin1")
+    return text.encode("latin1")
+
+
+class _Name:
+    """What a name in a pickle gives: it can be called, and nothing else can be done to it."""
+
+    __slots__ = ("_make",)
+
+    def __init__(self, make: Callable[..., object]) -> None:
+        self._make = make
+
+    def __call__(self, *arguments: object) -> object:
+        return self._make(*arguments)
+
+    def __setstate__(self, state: object) -> None:
+        raise pickle.UnpicklingError("a function with a state")
+
+
+def _not_called(*_: object) -> None:
+    raise pickle.UnpicklingError("numpy.ndarray called by name")
+
+
+_NDARRAY: Final = _Name(_not_called)
+_NAMES: Final[Mapping[tuple[str, str], _Name]] = {
+    ("numpy", "ndarray"): _NDARRAY,
+    ("numpy", "dtype"): _Name(_Dtype),
+    ("_codecs", "encode"): _Name(_encode),
+    # numpy's inner package was called core before numpy 2.
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _Name(_reconstruct) for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): _Name(_scalar) for core in ("core", "_core")},
+    **{(f"numpy.{core}.numeric", "_frombuffer"): _Name(_from_buffer) for core in ("core", "_core")},
+}
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    """Knows the names above and no others, and imports nothing."""
+
+    def find_class(self, module_name: str, global_name: str) -> Any:
+        try:
+            return _NAMES[module_name, global_name]
+        except KeyError:
+            raise pickle.UnpicklingError(
+                f"its pickle names {module_name}.{global_name}, which no array needs; nothing of it was run"
+            ) from None
