@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install 'tactile-edge-sr[fem]'")
+
+from firmware_bridge.geometry import USPA44
+from train.contact import ContactSolver
+from train.fem import FemPad, NoEquilibriumError
+from train.layer import Layer
+from train.mooney_rivlin import MooneyRivlin
+
+NOTHING_MM = 1e3
+
+
+def disc(along_mm, radius_mm):
+    return np.where(np.hypot(along_mm[:, None], along_mm[None, :]) <= radius_mm, 0.0, NOTHING_MM)
+
+
+def bowl(along_mm, radius_mm):
+    return (along_mm[:, None] ** 2 + along_mm[None, :] ** 2) / (2 * radius_mm)
+
+
+@pytest.mark.parametrize("scale", [5, 7, 10])
+def test_nodes_lie_on_the_patterns_pixels_and_reach_the_rim(scale):
+    pad = FemPad(scale, 1)
+    pixels = (np.arange(4 * scale) - (4 * scale - 1) / 2) * USPA44.pixel_pitch_mm(scale)
+    inner = slice((pad.size - 4 * scale) // 2, (pad.size + 4 * scale) // 2)
+    assert np.allclose(pad.nodes_mm[inner], pixels)
+    assert pad.nodes_mm[[0, -1]].tolist() == [-10.0, 10.0]
+    assert np.diff(pad.nodes_mm).min() > 0.5 * pad.cell_mm
+    assert np.diff(pad.nodes_mm).max() < 1.5 * pad.cell_mm
+
+
+@pytest.mark.parametrize("c2_share", [0.0, 0.6])
+def test_a_plate_on_a_thin_slab_presses_as_in_closed_form_at_large_strain(c2_share):
+    # Far from the rim a bonded slab only gets thinner: F = diag(1, 1, s), whose stress is d psi / ds.
+    layer = Layer(thickness_mm=1.0, poisson=0.3)
+    rubber = MooneyRivlin.of_layer(layer, c2_share)
+    pad = FemPad(2, 2, layer, c2_share)
+    steps_mm = np.array([0.001, 0.1, 0.25])
+    presses = pad.press(np.zeros((pad.size, pad.size)), steps_mm)
+    middle = pad.size // 2
+
+    def stored(stretch):
+        thinner = np.eye(3)
+        thinner[2, 2] = stretch
+        return rubber.energy(thinner) + rubber.bulk_mpa / 2 * (stretch - 1) ** 2
+
+    for step_mm, push_n in zip(steps_mm, presses.push_n, strict=True):
+        stretch = 1 - step_mm
+        expected_mpa = -(stored(stretch + 1e-5) - stored(stretch - 1e-5)) / 2e-5
+        assert push_n[middle, middle] / pad.cell_mm**2 == pytest.approx(expected_mpa, rel=1e-3)
+    assert (presses.residual < 1e-6).all()
+
+
+@pytest.mark.parametrize(("thickness_mm", "poisson"), [(4.5, 0.3), (2.0, 0.49)])
+def test_at_small_strain_it_is_the_layer(thickness_mm, poisson):
+    # The layer has no sides: 2 mm at 0.49 and 4.5 mm at 0.3 are the pads that do not feel theirs.
+    layer, indentation_mm = Layer(thickness_mm, poisson=poisson), 0.06
+    pad = FemPad(5, 3, layer)
+    presses = pad.press(bowl(pad.nodes_mm, 150.0), np.array([indentation_mm]))
+    size, cell_mm = 84, 20 / 84
+    cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+    solver = ContactSolver(layer, size, cell_mm)
+    expected = solver.solve(bowl(cells_mm, 150.0)[None].astype(np.float32), indentation_mm, 1e-4)
+    # Measured: force 0.4 % and 1.2 % off, surface 1.2 % and 2.9 % of the indentation.
+    assert presses.force_n[0] == pytest.approx(expected.force_n[0], rel=0.02)
+    middle = pad.size // 2
+    near = pad.nodes_mm[np.abs(pad.nodes_mm) < 7]
+    surface = np.interp(near, cells_mm, expected.displacement_mm[0, size // 2])
+    found = presses.displacement_mm[0, middle][np.abs(pad.nodes_mm) < 7]
+    assert np.abs(found - surface).max() < 0.04 * indentation_mm
+
+
+def test_nothing_pulls_nothing_sinks_in_and_contact_grows():
+    pad = FemPad(4, 2, Layer(poisson=0.3))
+    depth_mm = bowl(pad.nodes_mm, 60.0)
+    steps_mm = np.array([0.05, 0.15, 0.3])
+    presses = pad.press(depth_mm, steps_mm)
+    gap_mm = presses.displacement_mm - (steps_mm[:, None, None] - depth_mm)
+    assert presses.push_n.min() > -1e-3 * presses.push_n.max()
+    assert (presses.push_n[~presses.touching] == 0).all()
+    assert (gap_mm > -1e-3 * steps_mm[:, None, None]).all()
+    assert np.abs(gap_mm[presses.touching]).max() < 1e-9
+    assert (np.diff(presses.touching.sum(axis=(1, 2))) > 0).all()
+    # A node that the surface would cover if the pad did not give way is not touched for that alone.
+    assert presses.touching[-1].sum() < (depth_mm < 0.3).sum()
+
+
+def test_a_press_has_the_figures_symmetry_and_grows_stiffer():
+    pad = FemPad(4, 2)
+    presses = pad.press(disc(pad.nodes_mm, 3.5), np.array([0.1, 0.5]))
+    surface = presses.displacement_mm[-1]
+    assert np.allclose(surface, surface[::-1], atol=1e-6)
+    assert np.allclose(surface, surface.T, atol=1e-6)
+    assert surface.min() < -0.01  # rubber makes way upwards
+    assert presses.force_n[1] > 5.2 * presses.force_n[0]
+
+
+def test_steps_lead_where_one_leap_leads():
+    pad = FemPad(3, 2)
+    depth_mm = bowl(pad.nodes_mm - 1.0, 15.0)  # off the middle
+    stepped = pad.press(depth_mm, np.array([0.1, 0.2, 0.3]))
+    leap = pad.press(depth_mm, np.array([0.3]))
+    assert np.allclose(stepped.displacement_mm[-1], leap.displacement_mm[-1], atol=1e-6)
+    assert stepped.force_n[-1] == pytest.approx(leap.force_n[-1], rel=1e-5)
+
+
+def test_patterns_are_the_nodes_or_lie_straight_between_them():
+    pad = FemPad(5, 1)
+    slope = 0.3 + 0.01 * pad.nodes_mm[:, None] - 0.02 * pad.nodes_mm[None, :]
+    fine_mm = (np.arange(40) - 19.5) * 0.47
+    expected = 0.3 + 0.01 * fine_mm[:, None] - 0.02 * fine_mm[None, :]
+    assert np.allclose(pad.pattern(slope[None], 10)[0], expected, atol=1e-6)
+    assert np.allclose(pad.pattern(slope[None], 5)[0], slope[1:-1, 1:-1], atol=1e-6)
+
+
+def test_a_leap_too_far_is_named():
+    pad = FemPad(3, 2)
+    with pytest.raises(NoEquilibriumError, match=r"step 2 of 2, indentation 4\.4 mm.*smaller steps"):
+        pad.press(disc(pad.nodes_mm, 3.0), np.array([0.1, 4.4]))
+
+
+def test_wrong_input_is_refused():
+    pad = FemPad(3, 1)
+    flat = np.zeros((pad.size, pad.size))
+    with pytest.raises(ValueError, match=r"shape \(5, 5\), expected"):
+        pad.press(np.zeros((5, 5)), np.array([0.1]))
+    for steps in ([0.0, 0.1], [0.2, 0.1], []):
+        with pytest.raises(ValueError, match="rising from above 0"):
+            pad.press(flat, np.array(steps))
+    with pytest.raises(ValueError, match=r"nothing lies within 0\.1 mm"):
+        pad.press(flat + NOTHING_MM, np.array([0.1]))

@@ -1,0 +1,261 @@
+"""The referee: the pad as a Mooney-Rivlin solid under a rigid surface, by finite elements at large strain.
+
+Hexahedra in the mixed formulation (displacement, pressure and volume ratio, the latter two constant in each cell
+and condensed), so that nothing locks as the rubber becomes incompressible. Contact is frictionless and of small
+slope: a node that touches stays at the height that the surface has above the node's place before the press, and is
+free in the plane. Which nodes touch is found by an active set: none may be pulled, none may be sunk in.
+
+Needs FElupe, which is GPL and therefore an extra of its own; nothing but this module imports it.
+"""
+
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+
+from firmware_bridge.geometry import USPA44, SensorGeometry
+from train.errors import TrainError
+from train.layer import Layer
+from train.mooney_rivlin import C2_SHARE, MooneyRivlin
+
+try:
+    import felupe
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "the FEM referee needs felupe (GPL): pip install 'tactile-edge-sr[fem]'", name="felupe"
+    ) from error
+
+_RESIDUAL: Final = 1e-6
+"""Forces out of balance, as a share of the reactions, at which a step is done."""
+_MAX_NEWTON: Final = 12
+_MAX_SETS: Final = 20
+_SLACK: Final = 1e-4
+"""Pull and overlap that count as none: shares of the mean push of a touching node, and of the indentation."""
+_SOLVER_RESIDUAL: Final = 1e-6
+_SOLVER_STEPS: Final = 30
+
+
+class NoEquilibriumError(TrainError, ArithmeticError):
+    """The elements found no equilibrium; the message names step and indentation."""
+
+
+@dataclass(frozen=True, slots=True)
+class FemPresses:
+    """Equilibria of one press, step by step.
+
+    Attributes:
+        indentation_mm: (s,), in [mm].
+        push_n: (s, size, size), what each node is pushed down with, in [N]; 0 where nothing touches.
+        displacement_mm: (s, size, size), of the surface's nodes, downwards, in [mm]; row = y, column = x.
+        touching: (s, size, size), the nodes that touch.
+        newton_steps: (s,), linear systems solved, over all active sets.
+        residual: (s,), force out of balance as a share of the reactions.
+        run_s: (s,), in [s].
+    """
+
+    indentation_mm: NDArray[np.float64]
+    push_n: NDArray[np.float64]
+    displacement_mm: NDArray[np.float64]
+    touching: NDArray[np.bool_]
+    newton_steps: NDArray[np.int64]
+    residual: NDArray[np.float64]
+    run_s: NDArray[np.float64]
+
+    @property
+    def force_n(self) -> NDArray[np.float64]:
+        """(s,), contact force in [N]."""
+        return self.push_n.sum(axis=(1, 2))
+
+
+class FemPad:
+    """The pad, bonded to its board, its sides free.
+
+    Args:
+        scale: nodes per taxel pitch: they lie on the pixels of the pattern at this scale, and on the pad's rim.
+        cells_high: elements over the thickness.
+        layer: thickness, and the material at small strain.
+        c2_share: C2 / (C1 + C2).
+        geometry: of a square sensor.
+
+    Attributes:
+        nodes_mm: (size,), where the nodes lie along a side, from the centre, in [mm].
+        cell_mm: distance of two of them, but for the last before the rim, in [mm].
+    """
+
+    def __init__(
+        self,
+        scale: int = 10,
+        cells_high: int = 8,
+        layer: Layer = Layer(),  # noqa: B008 - frozen
+        c2_share: float = C2_SHARE,
+        geometry: SensorGeometry = USPA44,
+    ) -> None:
+        self.cell_mm = geometry.pixel_pitch_mm(scale)
+        self.nodes_mm = _nodes_mm(geometry, scale)
+        self._geometry = geometry
+        self._rubber = MooneyRivlin.of_layer(layer, c2_share)
+        heights_mm = np.linspace(0, layer.thickness_mm, cells_high + 1)
+        self._mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, heights_mm)
+        self._region = felupe.RegionHexahedron(self._mesh)
+
+    @property
+    def size(self) -> int:
+        """Nodes along a side."""
+        return len(self.nodes_mm)
+
+    def press(self, depth_mm: NDArray[np.floating], indentation_mm: NDArray[np.floating]) -> FemPresses:
+        """Press a surface in, each step from the last one's equilibrium.
+
+        Args:
+            depth_mm: (size, size), how far the surface lies below its highest point over each node, in [mm]; the
+                image of size x size cells of cell_mm serves, for its rim is the pad's to a fraction of a cell.
+            indentation_mm: (s,), rising, in [mm].
+
+        Raises:
+            ValueError: shapes do not fit, indentations do not rise from above 0, or nothing lies within reach.
+            NoEquilibriumError: a step did not converge.
+        """
+        steps_mm = np.asarray(indentation_mm, dtype=np.float64)
+        self._check(depth_mm, steps_mm)
+        press = _Press(self._region, self._rubber, self.size)
+        found = [
+            press.advance(step_mm, step_mm - depth_mm, f"step {i + 1} of {len(steps_mm)}, indentation {step_mm:.3g} mm")
+            for i, step_mm in enumerate(steps_mm)
+        ]
+        return FemPresses(steps_mm, *map(np.array, zip(*found, strict=True)))
+
+    def pattern(self, displacement_mm: NDArray[np.floating], scale: int = 10) -> NDArray[np.float32]:
+        """Node displacements (s, size, size) at the pixels of the pattern at x`scale`, linear between nodes."""
+        rows, cols = self._geometry.pattern_shape(scale)
+        pixel_mm = self._geometry.pixel_pitch_mm(scale)
+        y_mm, x_mm = ((np.arange(count) - (count - 1) / 2) * pixel_mm for count in (rows, cols))
+        surface = RegularGridInterpolator((self.nodes_mm, self.nodes_mm), np.moveaxis(displacement_mm, 0, -1))
+        return np.moveaxis(surface(tuple(np.meshgrid(y_mm, x_mm, indexing="ij"))), -1, 0).astype(np.float32)
+
+    def _check(self, depth_mm: NDArray[np.floating], steps_mm: NDArray[np.float64]) -> None:
+        if depth_mm.shape != (self.size, self.size):
+            raise ValueError(f"a depth image of shape {depth_mm.shape}, expected {(self.size, self.size)}")
+        if steps_mm.ndim != 1 or not len(steps_mm) or not (np.diff(steps_mm, prepend=0.0) > 0).all():
+            raise ValueError(f"indentations {steps_mm.tolist()} mm, expected one or more, rising from above 0")
+        if not (depth_mm < steps_mm[0]).any():
+            raise ValueError(f"nothing lies within {steps_mm[0]:.3g} mm of the pad, the first indentation")
+
+
+class _Press:
+    """One press under way: the equilibrium so far, and what touches."""
+
+    def __init__(self, region: Any, rubber: MooneyRivlin, size: int) -> None:
+        self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
+        material = felupe.Material(
+            stress=lambda x: [rubber.stress(x[0]), x[-1]],
+            elasticity=lambda x: [rubber.stiffness(x[0])],
+        )
+        self._body = felupe.SolidBodyNearlyIncompressible(material, self._field, bulk=rubber.bulk_mpa)
+        self._solver = _TangentSolver()
+        self._touching = np.zeros((size, size), dtype=bool)
+        self._indentation_mm = 0.0
+        points = region.mesh.npoints
+        self._top = np.arange(points - size**2, points)
+        self._board = np.arange(size**2)
+
+    def advance(self, indentation_mm: float, wanted_mm: NDArray[np.floating], name: str) -> tuple[Any, ...]:
+        """Go on to where the surface lies at `wanted_mm` below the pad's face, (size, size)."""
+        start = perf_counter()
+        moved = self._field[0].values
+        if self._indentation_mm:
+            # Nearly linear: the last step's field, grown in proportion, is nearly the next one's.
+            moved *= indentation_mm / self._indentation_mm
+        down_mm = self._down_mm()
+        self._touch(self._touching | (wanted_mm > down_mm))
+        newton_steps = 0
+        for _ in range(_MAX_SETS):
+            result = self._balance(wanted_mm, name)
+            newton_steps += result.iterations
+            out_of_balance_n = result.fun.reshape(-1, 3)[self._top, 2].reshape(self._touching.shape)
+            push_n = np.where(self._touching, -out_of_balance_n, 0.0)
+            down_mm = self._down_mm()
+            pulled = push_n < -_SLACK * push_n.sum() / self._touching.sum()
+            sunk = ~self._touching & (wanted_mm - down_mm > _SLACK * indentation_mm)
+            if not (pulled | sunk).any():
+                break
+            self._touch(self._touching & ~pulled | sunk)
+        else:
+            raise NoEquilibriumError(
+                f"{name}: what touches still changes after {_MAX_SETS} rounds; press in smaller steps"
+            )
+        self._indentation_mm = indentation_mm
+        residual = float(result.fnorms[-1])
+        return push_n, down_mm, self._touching.copy(), newton_steps, residual, perf_counter() - start
+
+    def _down_mm(self) -> NDArray[np.float64]:
+        return -self._field[0].values[self._top, 2].reshape(self._touching.shape)
+
+    def _touch(self, touching: NDArray[np.bool_]) -> None:
+        if (touching != self._touching).any():
+            self._solver.forget()
+        self._touching = touching
+
+    def _balance(self, wanted_mm: NDArray[np.floating], name: str) -> Any:
+        """Newton's iterations with the touching nodes held at their height."""
+        pressed = self._top[self._touching.ravel()]
+        held = np.full(self._field[0].values.shape, np.nan)
+        held[self._board] = 0.0
+        held[pressed, 2] = -wanted_mm[self._touching]
+        fixed = ~np.isnan(held.ravel())
+        try:
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+                return felupe.newtonraphson(
+                    items=[self._body],
+                    dof0=np.flatnonzero(fixed),
+                    dof1=np.flatnonzero(~fixed),
+                    ext0=held.ravel()[fixed],
+                    solver=self._solver,
+                    tol=_RESIDUAL,
+                    maxiter=_MAX_NEWTON,
+                    verbose=False,
+                )
+        except felupe.NewtonConvergenceError as error:
+            raise NoEquilibriumError(
+                f"{name}: no equilibrium within {_MAX_NEWTON} Newton steps; press in smaller steps"
+            ) from error
+
+
+class _TangentSolver:
+    """Conjugate gradients behind the last factors: a tangent changes little from step to step."""
+
+    def __init__(self) -> None:
+        self._factors: SuperLU | None = None
+
+    def forget(self) -> None:
+        """Other nodes touch: the system is another one."""
+        self._factors = None
+
+    def __call__(self, tangent: csr_matrix, load: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._factors is not None:
+            before = LinearOperator(tangent.shape, self._factors.solve)  # pyright: ignore[reportCallIssue] - its __new__ differs
+            solution, unfinished = cg(tangent, load, rtol=_SOLVER_RESIDUAL, maxiter=_SOLVER_STEPS, M=before)
+            if not unfinished:
+                return solution
+        try:
+            # Ordered for a symmetric matrix and never pivoted: half the fill and the time of the default.
+            options = {"SymmetricMode": True}
+            factors = splu(tangent.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError as error:
+            raise felupe.NewtonConvergenceError("the tangent is singular") from error
+        self._factors = factors
+        return factors.solve(load)
+
+
+def _nodes_mm(geometry: SensorGeometry, scale: int) -> NDArray[np.float64]:
+    """Pixels of the pattern, on to the pad's rim in the same steps, the last of them half a step or more."""
+    cell_mm = geometry.pixel_pitch_mm(scale)
+    pixels = geometry.cols * scale
+    margin = int((geometry.width_mm / cell_mm - pixels) // 2)
+    inner = pixels + 2 * margin
+    places_mm = (np.arange(inner) - (inner - 1) / 2) * cell_mm
+    return np.concatenate([[-geometry.width_mm / 2], places_mm, [geometry.width_mm / 2]])
