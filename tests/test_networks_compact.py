@@ -1,0 +1,207 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from train.networks.compact import CompactNet, HeteroscedasticError, heteroscedastic_loss
+from train.objectives import relative_error
+
+
+@pytest.fixture(scope="module")
+def net():
+    torch.manual_seed(0)
+    return CompactNet(4, 10, channels=16, blocks=2).eval()
+
+
+def window(count=3, taps=4, seed=0):
+    return torch.randn(count, 3 * taps, 4, 4, generator=torch.Generator().manual_seed(seed))
+
+
+def truth_like(pattern, seed=5):
+    return 0.3 * torch.rand(pattern.shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(("taps", "scale"), [(1, 4), (7, 6), (4, 8), (4, 10), (2, 20)])
+def test_shapes_follow_taps_and_scale(taps, scale):
+    small = CompactNet(taps, scale, 8, 1)
+    for output in small(window(taps=taps)):
+        assert output.shape == (3, 4 * scale, 4 * scale)
+    assert (small.taps, small.scale) == (taps, scale)
+
+
+@pytest.mark.parametrize(("taps", "scale", "said"), [(1, 5, "even"), (1, 0, "even"), (0, 4, "at least 1")])
+def test_taps_and_scales_out_of_range_are_refused(taps, scale, said):
+    with pytest.raises(ValueError, match=said):
+        CompactNet(taps, scale)
+
+
+def test_absent_taps_are_the_same_as_fewer_taps(net):
+    for taps in (1, 2, 3):
+        given = window()
+        given[:, 3 * taps :] = 0
+        fewer = net.with_fewer_taps(taps).eval()(given[:, : 3 * taps])
+        for output, expected in zip(net(given), fewer, strict=True):
+            assert torch.allclose(output, expected, atol=1e-6)
+
+
+def test_fewer_taps_have_weights_and_calibration_of_their_own():
+    torch.manual_seed(1)
+    net = CompactNet(4, 4, 8, 1)
+    net.deviation_scale.fill_(1.5)
+    before = net.enter.weight.clone()
+    fewer = net.with_fewer_taps(2)
+    assert fewer.deviation_scale == 1.5
+    with torch.no_grad():
+        for value in (*fewer.parameters(), fewer.deviation_scale):
+            value.zero_()
+    assert (net.enter.weight == before).all()
+    assert net.deviation_scale == 1.5
+    with pytest.raises(ValueError, match="expected 1 to 4"):
+        net.with_fewer_taps(5)
+
+
+def test_patterns_are_cut_at_zero_in_use_alone(net):
+    assert net(window())[0].min() == 0
+    assert net.train()(window())[0].min() < 0
+    net.eval()
+
+
+def test_a_firm_tap_scales_pattern_and_deviation(net):
+    with torch.inference_mode():
+        for firm, firmer in zip(net(20 * window()), net(200 * window()), strict=True):
+            assert torch.allclose(firmer, 10 * firm, rtol=0.05, atol=0.05 * float(firmer.max()))
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-40, 1e-6, 1e3, 1e6])
+def test_extreme_windows_give_finite_patterns_and_deviations_above_zero(net, factor):
+    pattern, deviation = net(factor * window())
+    assert torch.isfinite(pattern).all()
+    assert torch.isfinite(deviation).all()
+    assert (deviation > 0).all()
+
+
+def test_no_tap_at_all_gives_next_to_nothing(net):
+    for nothing, something in zip(net(torch.zeros(1, 12, 4, 4)), net(window()), strict=True):
+        assert nothing.max() < 0.03 * something.max()
+
+
+def test_the_scale_of_deviations_changes_nothing_else(net):
+    pattern, deviation = net(window())
+    net.deviation_scale.fill_(1.7)
+    again, wider = net(window())
+    net.deviation_scale.fill_(1.0)
+    assert torch.equal(pattern, again)
+    assert torch.allclose(wider, 1.7 * deviation)
+    assert "deviation_scale" in net.state_dict()
+
+
+def test_the_pattern_learns_as_if_there_were_no_deviation():
+    torch.manual_seed(2)
+    net = CompactNet(2, 4, 8, 1).train()
+    pattern, deviation = net(window(taps=2))
+    truth = truth_like(pattern)
+    of_both = torch.autograd.grad(heteroscedastic_loss(pattern, deviation, truth), list(net.parameters()))
+    names = [name for name, _ in net.named_parameters()]
+    pattern, _ = net(window(taps=2))
+    alone = torch.autograd.grad(relative_error(pattern, truth), list(net.parameters()), allow_unused=True)
+    for name, both, one in zip(names, of_both, alone, strict=True):
+        if name.startswith("doubt"):
+            assert one is None
+            assert both.abs().max() > 0
+        else:
+            assert torch.equal(both, one)
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
+def test_the_best_deviation_is_that_of_a_laplace_density_with_the_mean_error(beta):
+    torch.manual_seed(6)
+    errors = torch.distributions.Laplace(0.0, 0.02).sample((1, 100, 100))
+    truth = torch.full_like(errors, 0.2)
+    best_mm = math.sqrt(2) * (float(errors.abs().mean()) - 1e-3 * 0.2)  # the share that the loss adds
+
+    def slope(deviation_mm):
+        deviation = torch.full_like(truth, deviation_mm, requires_grad=True)
+        heteroscedastic_loss(truth + errors, deviation, truth, beta).backward()
+        assert deviation.grad is not None
+        return float(deviation.grad.sum())
+
+    assert slope(0.98 * best_mm) < 0 < slope(1.02 * best_mm)
+    assert slope(0.1 * best_mm) < 0 < slope(10 * best_mm)
+    assert math.sqrt(float((errors**2).mean())) == pytest.approx(best_mm, rel=0.05)
+
+
+def test_light_contacts_count_as_much_as_firm_ones():
+    truth = truth_like(torch.zeros(4, 6, 6))
+    pattern, deviation = truth + 0.01, torch.full_like(truth, 0.02)
+    firm = heteroscedastic_loss(pattern, deviation, truth)
+    light = heteroscedastic_loss(0.05 * pattern, 0.05 * deviation, 0.05 * truth)
+    assert float(firm) == pytest.approx(float(light), rel=1e-5)
+
+
+@pytest.mark.parametrize("deviation_mm", [1e-30, 1e-12, 1e-3, 1e6])
+@pytest.mark.parametrize("error_mm", [0.0, 1e-6, 1.0, 1e6])
+def test_slopes_are_finite_and_no_steeper_than_the_error(deviation_mm, error_mm):
+    truth = truth_like(torch.zeros(2, 6, 6)) + 0.01
+    log_deviation = torch.full_like(truth, math.log(deviation_mm), requires_grad=True)
+    loss = heteroscedastic_loss(truth + error_mm, log_deviation.exp(), truth)
+    loss.backward()
+    assert torch.isfinite(loss)
+    slope = log_deviation.grad
+    assert slope is not None
+    assert torch.isfinite(slope).all()
+    size = truth.square().mean(dim=(1, 2)).sqrt().min()
+    assert slope.sum() <= (deviation_mm + error_mm) / size
+    assert slope.sum() >= -error_mm / size - 1e-6
+
+
+def test_deviations_learn_where_errors_are():
+    # Two kinds of windows: one tells its pattern, the other leaves a coin to be thrown for a third of the pixels.
+    torch.manual_seed(3)
+    generator = torch.Generator().manual_seed(4)
+    net, objective = CompactNet(1, 2, 16, 1).train(), HeteroscedasticError()
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
+    sure, unsure = window(1, taps=1, seed=1), window(1, taps=1, seed=2)
+    windows = torch.cat([sure, unsure]).repeat(16, 1, 1, 1)
+    for _ in range(400):
+        truth = torch.full((32, 8, 8), 0.2)
+        truth[1::2, :, :3] += 0.1 * torch.randn(16, 8, 3, generator=generator)
+        optimizer.zero_grad()
+        objective.loss(net, windows, truth).backward()
+        optimizer.step()
+    deviation = net.eval()(torch.cat([sure, unsure]))[1]
+    assert deviation[1, :, :3].mean() > 3 * deviation[1, :, 4:].mean()
+    assert deviation[1, :, :3].mean() > 3 * deviation[0].mean()
+    assert 0.05 < deviation[1, :, :3].mean() < 0.2
+
+
+def test_low_precision_gives_nearly_the_same(net):
+    with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
+        low = net(window())
+    for coarse, fine in zip(low, net(window()), strict=True):
+        assert coarse.dtype == torch.float32
+        assert torch.allclose(coarse, fine, atol=0.05 * float(fine.detach().max()))
+
+
+def test_the_graph_holds_both_outputs(net):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    program = torch.onnx.export(
+        net, (window(1),), dynamo=True, opset_version=18, input_names=["window"], output_names=["p", "d"], verbose=False
+    )
+    assert program is not None
+    session = onnxruntime.InferenceSession(program.model_proto.SerializeToString())
+    got = session.run(["p", "d"], {"window": window(1, seed=9).numpy()})
+    for output, expected in zip(got, net(window(1, seed=9)), strict=True):
+        assert np.allclose(output, expected.detach().numpy(), atol=1e-6)
+
+
+def test_with_more_taps_the_function_is_the_same_until_it_is_trained():
+    torch.manual_seed(0)
+    net = CompactNet(2, 10, channels=8, blocks=1).eval()
+    larger = net.with_more_taps(4).eval()
+    window = torch.randn(3, 12, 4, 4)
+    for ours, theirs in zip(larger(window), net(window[:, :6]), strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-6)
+    with pytest.raises(ValueError, match="expected 2 or more"):
+        net.with_more_taps(1)

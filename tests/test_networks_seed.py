@@ -1,0 +1,196 @@
+import pytest
+import torch
+
+from train.networks.blocks import PatternNet
+from train.networks.cost import macs, parameters_count
+from train.networks.registry import build, grown
+from train.networks.seed import SeedNet
+
+PUBLISHED = {
+    "srcnn": (4.36, 6.96),
+    "srgan": (4.36, 6.96),
+    "stsr": (4.584, 7.32),
+    "mtsr2": (4.659, 7.44),
+    "mtsr4": (4.811, 7.68),
+    "mtsr5": (4.886, 7.81),
+    "mtsr7": (5.038, 8.05),
+}
+
+
+def window(taps, count=2, seed=0):
+    return torch.randn(count, 3 * taps, 4, 4, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(scope="module")
+def stsr():
+    torch.manual_seed(0)
+    return SeedNet(1, 2)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_parameters_and_macs_are_the_published_ones(name):
+    millions, giga_macs = PUBLISHED[name]
+    net = build(name, 10)
+    digits = 2 if name.startswith("sr") else 3
+    assert round(parameters_count(net) / 1e6, digits) == millions
+    assert macs(net) / 1e9 == pytest.approx(giga_macs, abs=0.007)
+
+
+def test_counting_leaves_the_network_as_it_was(stsr):
+    before = {name: value.clone() for name, value in stsr.train().state_dict().items()}
+    macs(stsr)
+    assert stsr.training
+    assert all(torch.equal(value, before[name]) for name, value in stsr.state_dict().items())
+    assert not any(module._forward_hooks for module in stsr.modules())
+
+
+def test_macs_of_a_layer_by_hand():
+    class Small(PatternNet):
+        taps = 1
+
+        def __init__(self):
+            super().__init__()
+            self.conv = torch.nn.Conv2d(3, 5, 3, padding=1, stride=2)
+            self.norm = torch.nn.BatchNorm2d(5)
+            self.dense = torch.nn.Linear(5 * 2 * 2, 7)
+
+        def forward(self, x):
+            return self.dense(self.norm(self.conv(x)).flatten(1))
+
+    assert macs(Small()) == 5 * 2 * 2 * (3 * 9) + 7 * 20
+    assert parameters_count(Small()) == 5 * 27 + 5 + 10 + 7 * 20 + 7
+
+
+@pytest.mark.parametrize(("name", "scale"), [("stsr", 4), ("mtsr3", 2), ("srcnn", 3), ("srgan", 2), ("mtsr7", 1)])
+def test_patterns_have_the_pattern_size_at_any_scale(name, scale):
+    net = build(name, scale).eval()
+    assert net.scale == scale
+    with torch.inference_mode():
+        pattern = net(window(net.taps))
+    assert pattern.shape == (2, 4 * scale, 4 * scale)
+    assert pattern.min() >= 0
+
+
+def test_mtsr_starts_as_the_stsr_it_comes_from(stsr):
+    # Batch statistics too: a few batches in training mode first, so that they are no longer 0 and 1.
+    with torch.no_grad():
+        for seed in range(3):
+            stsr.train()(3 * window(1, 4, seed))
+    mtsr = SeedNet.from_stsr(stsr, 3)
+    for mode in (True, False):
+        given = window(3, 4, seed=9)
+        with torch.no_grad():
+            assert torch.allclose(mtsr.train(mode)(given), stsr.train(mode)(given[:, :3]), atol=3e-6)
+
+
+def test_all_of_an_mtsr_trains_and_nothing_of_its_stsr(stsr):
+    before = {name: value.clone() for name, value in stsr.state_dict().items()}
+    mtsr = SeedNet.from_stsr(stsr, 2).train()
+    start = {name: value.clone() for name, value in mtsr.named_parameters()}
+    optimizer = torch.optim.Adam(mtsr.parameters(), lr=1e-2)
+    for seed in range(2):
+        optimizer.zero_grad()
+        (mtsr(window(2, 4, seed)) - 0.2).square().mean().backward()
+        optimizer.step()
+    assert {name for name, value in mtsr.named_parameters() if torch.equal(value, start[name])} == set()
+    assert all(torch.equal(value, before[name]) for name, value in stsr.state_dict().items())
+
+
+def test_the_force_branch_passes_amplitudes_that_the_norm_takes_out(stsr):
+    light, firm = window(1), 10 * window(1)
+    stsr.train()
+    shapes = [stsr.stems[0](torch.nn.functional.interpolate(tap, scale_factor=2)) for tap in (light, firm)]
+    assert torch.allclose(*shapes, atol=0.05 * float(shapes[0].abs().max()))
+    quiet, loud = (stsr.force[0](tap) for tap in (light, firm))
+    assert torch.allclose(loud, 10 * quiet, rtol=1e-4, atol=1e-4)
+
+
+def test_older_taps_matter_once_they_have_weight():
+    torch.manual_seed(1)
+    net = SeedNet(2, 2).eval()
+    given = window(2)
+    other = given.clone()
+    other[:, 3:] += 1
+    with torch.inference_mode():
+        assert not torch.allclose(net(given), net(other), atol=1e-5)
+
+
+@pytest.mark.parametrize(("taps", "scale", "said"), [(0, 2, "1 to 7"), (8, 2, "1 to 7"), (1, 0, "at least 1")])
+def test_what_is_out_of_range_is_refused(taps, scale, said):
+    with pytest.raises(ValueError, match=said):
+        SeedNet(taps, scale)
+
+
+def test_mtsr_comes_from_nothing_but_an_stsr(stsr):
+    with pytest.raises(ValueError, match="expected an STSR"):
+        SeedNet.from_stsr(SeedNet.from_stsr(stsr, 2), 3)
+
+
+@pytest.mark.parametrize("name", ["stsr", "mtsr2", "srcnn", "srgan", "compact-stsr"])
+def test_every_network_learns_in_low_precision(name):
+    torch.manual_seed(2)
+    net = build(name, 2).train()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        output = net(window(net.taps, 3))
+        patterns = output[0] if isinstance(output, tuple) else output
+        assert patterns.dtype == torch.float32
+        (patterns - 0.1).abs().mean().backward()
+    # The deviation of a compact network teaches nothing else, and was not asked for.
+    gradients = [value.grad for key, value in net.named_parameters() if not key.startswith("doubt")]
+    assert all(gradient is not None and torch.isfinite(gradient).all() for gradient in gradients)
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"no network 'mtsr8', expected one of srcnn, .*compact-mtsr7"):
+        build("mtsr8", 10)
+
+
+def test_options_reach_the_network():
+    assert parameters_count(build("compact-mtsr2", 4, channels=8, blocks=1)) < 12_000
+
+
+@pytest.mark.parametrize(
+    ("start", "name", "scale"),
+    [("stsr", "mtsr3", 3), ("mtsr2", "mtsr2", 2), ("srcnn", "srgan", 2), ("stsr", "stsr", 1)],
+)
+def test_a_network_grown_from_another_computes_the_same(start, name, scale):
+    torch.manual_seed(4)
+    old = build(start, scale).eval()
+    net = grown(old, name, scale).eval()
+    given = window(net.taps)
+    with torch.inference_mode():
+        assert torch.allclose(net(given), old(given[:, : 3 * old.taps]), atol=1e-6)
+        next(net.parameters()).zero_()
+    assert next(old.parameters()).abs().max() > 0
+
+
+def test_a_compact_network_grown_from_one_of_more_taps_is_that_with_fewer():
+    torch.manual_seed(5)
+    old = build("compact-mtsr4", 4, channels=8, blocks=1).eval()
+    net = grown(old, "compact-mtsr2", 4, channels=8, blocks=1).eval()
+    absent = torch.cat([window(2), torch.zeros(2, 6, 4, 4)], dim=1)
+    with torch.inference_mode():
+        for ours, theirs in zip(net(window(2)), old(absent), strict=True):
+            assert torch.allclose(ours, theirs, atol=1e-6)
+
+
+def test_at_another_scale_a_compact_network_keeps_all_but_what_makes_pixels():
+    torch.manual_seed(6)
+    old = build("compact-mtsr2", 4, channels=8, blocks=1)
+    net = grown(old, "compact-mtsr2", 10, channels=8, blocks=1)
+    assert net(window(2))[0].shape == (2, 40, 40)
+    before = old.state_dict()
+    changed = {key for key, value in net.state_dict().items() if not torch.equal(value, before[key])}
+    assert changed == {"leave.2.weight", "leave.2.bias", "doubt.2.weight", "doubt.2.bias"}
+
+
+@pytest.mark.parametrize(
+    ("start", "name", "scale"),
+    [
+        ("stsr", "srcnn", 2),
+        ("mtsr2", "mtsr3", 2),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(start, name, scale):
+    with pytest.raises(ValueError, match=r"cannot start from a|taps asked for"):
+        grown(build(start, 2), name, scale)

@@ -1,0 +1,41 @@
+"""What a network costs."""
+
+from typing import Final
+
+import torch
+from torch import nn
+
+from train.networks.blocks import PatternNet
+
+_TAXEL_AXES: Final = 3
+
+
+def parameters_count(net: nn.Module) -> int:
+    """Numbers that are learnt."""
+    return sum(parameter.numel() for parameter in net.parameters())
+
+
+def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
+    """Multiply-accumulates of one window in all convolutions and linear layers; norms and interpolation do not count.
+
+    Args:
+        net: is left as it was.
+        rows: of taxels.
+        cols: of taxels.
+    """
+    counted: list[int] = []
+
+    def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
+        # Every output value is the sum of as many products as one row of the weights has numbers.
+        counted.append(output[0].numel() * layer.get_parameter("weight")[0].numel())
+
+    hooks = [layer.register_forward_hook(count) for layer in net.modules() if isinstance(layer, (nn.Conv2d, nn.Linear))]
+    like, training = next(net.parameters()), net.training
+    try:
+        with torch.inference_mode():
+            net.eval()(torch.zeros(1, _TAXEL_AXES * net.taps, rows, cols, device=like.device, dtype=like.dtype))
+    finally:
+        for hook in hooks:
+            hook.remove()
+        net.train(training)
+    return sum(counted)

@@ -1,0 +1,40 @@
+"""TactileSRCNN: the seed's network before it had a force branch and more than one tap.
+
+Source: Wu, Liu and Zhang 2022 ([20] of Wu and Liu 2024). Parameters (4.36 M) and MACs (6.96 G at 40 x 40) of the later
+paper's table are those of three 3 x 3 convolutions, six multi-scale blocks and a last convolution; the 2022 code has a
+single convolution before the blocks, which would be 4.29 M.
+"""
+
+from torch import Tensor, nn
+
+from train.networks.blocks import MultiScaleResidual, PatternNet, initialise, normed_conv, to_pattern, upsample
+from train.networks.seed import BLOCKS, CHANNELS
+
+
+class TactileSRCNN(PatternNet):
+    """Window of one tap to pattern, everything batch-normalised.
+
+    Args:
+        scale: pattern pixels per taxel pitch.
+
+    Raises:
+        ValueError: scale is not positive.
+    """
+
+    def __init__(self, scale: int) -> None:
+        super().__init__()
+        if scale < 1:
+            raise ValueError(f"scale is {scale}, expected at least 1")
+        self.taps, self.scale = 1, scale
+        self.net = nn.Sequential(
+            normed_conv(3, CHANNELS, 3),
+            normed_conv(CHANNELS, CHANNELS, 3),
+            normed_conv(CHANNELS, CHANNELS, 3),
+            *(MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)),
+            nn.Conv2d(CHANNELS, 1, 3, padding=1, bias=False),
+        )
+        initialise(self)
+
+    def forward(self, window: Tensor) -> Tensor:
+        """Patterns (n, H, W) in [mm], of windows (n, 3, rows, cols) in network units."""
+        return to_pattern(self.net(upsample(window, self.scale)), training=self.training)

@@ -1,0 +1,129 @@
+"""TactileSRGAN: TactileSRCNN trained against a discriminator.
+
+The paper gives no more than the name and that the generator is TactileSRCNN's. From the authors' code: a Wasserstein
+loss with gradient penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss
+beside the error. Ours: the discriminator's layers, which follow SRGAN's but judge patches and take any scale; no batch
+normalisation in it, since the penalty is of one pattern at a time (Gulrajani et al. 2017, Section 4); and that it sees
+patterns relative to their truth's size, as the error does.
+"""
+
+from typing import Any, Final
+
+import torch
+from torch import Tensor, distributed, nn
+
+from train.networks.srcnn import TactileSRCNN
+from train.objectives import relative_error, truth_size
+
+_CHANNELS: Final = (32, 64, 128)
+_SLOPE: Final = 0.2
+_TINY: Final = 1e-12
+
+
+class TactileSRGAN(TactileSRCNN):
+    """The generator: TactileSRCNN by another training."""
+
+
+class Discriminator(nn.Module):
+    """How true patterns look: a number without unit, higher for truer ones."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for inputs, outputs in zip((1, *_CHANNELS), _CHANNELS, strict=False):
+            layers += [
+                nn.Conv2d(inputs, outputs, 3, padding=1),
+                nn.LeakyReLU(_SLOPE),
+                nn.Conv2d(outputs, outputs, 3, stride=2, padding=1),
+                nn.LeakyReLU(_SLOPE),
+            ]
+        self.net = nn.Sequential(*layers, nn.Conv2d(_CHANNELS[-1], 1, 1))
+
+    def forward(self, patterns: Tensor) -> Tensor:
+        """(n,), mean over patches of patterns (n, H, W)."""
+        return self.net(patterns[:, None]).mean(dim=(1, 2, 3))
+
+
+class SrganObjective:
+    """Error of the patterns, and how false they look to a discriminator that is trained alongside.
+
+    Args:
+        device: of the network.
+        adversarial_share: weight of the discriminator's view beside the error.
+        penalty: weight of the discriminator's gradient penalty.
+        critic_steps: steps of the discriminator to one of the network.
+        learning_rate: of the discriminator's Adam.
+        seed: of the discriminator's weights and of where the penalty is taken.
+
+    Source: Gulrajani et al. 2017, Algorithm 1.
+    """
+
+    def __init__(
+        self,
+        device: torch.device | str = "cpu",
+        adversarial_share: float = 1e-3,
+        penalty: float = 10.0,
+        critic_steps: int = 2,
+        learning_rate: float = 1e-4,
+        seed: int = 0,
+    ) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.critic = Discriminator().to(device)
+        self._optimizer = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, betas=(0.0, 0.9))
+        self._adversarial_share, self._penalty, self._critic_steps = adversarial_share, penalty, critic_steps
+        self._rng = torch.Generator().manual_seed(seed)
+        self._seen: tuple[Tensor, Tensor] | None = None
+
+    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
+        """Relative error, less a share of what the discriminator thinks of the patterns."""
+        patterns = net(window).float()
+        size = truth_size(truth)
+        self._seen = (patterns.detach() / size, truth / size)
+        self.critic.requires_grad_(False)
+        return relative_error(patterns, truth) - self._adversarial_share * self.critic(patterns / size).mean()
+
+    def after_step(self) -> None:
+        """Train the discriminator on what `loss` saw last."""
+        if self._seen is None:
+            return
+        self.critic.requires_grad_(True)
+        for _ in range(self._critic_steps):
+            self._optimizer.zero_grad()
+            self.critic_loss(*self._seen).backward()
+            _average_gradients(self.critic)
+            self._optimizer.step()
+        self._seen = None
+
+    def critic_loss(self, false: Tensor, true: Tensor) -> Tensor:
+        """What the discriminator descends, of patterns (n, H, W) relative to their truth's size."""
+        mix = torch.rand(len(true), 1, 1, generator=self._rng).to(true.device)
+        between = (mix * true + (1 - mix) * false).requires_grad_(True)
+        (slope,) = torch.autograd.grad(self.critic(between).sum(), between, create_graph=True)
+        steepness = (slope.square().sum(dim=(1, 2)) + _TINY).sqrt()  # a root has no slope at 0
+        penalty = (steepness - 1).square().mean()
+        return self.critic(false).mean() - self.critic(true).mean() + self._penalty * penalty
+
+    def state_dict(self) -> dict[str, Any]:
+        """Discriminator, its optimizer, and the state of the draws."""
+        return {
+            "critic": self.critic.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "rng": self._rng.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.critic.load_state_dict(state["critic"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._rng.set_state(state["rng"].cpu())
+
+
+def _average_gradients(net: nn.Module) -> None:
+    """Over the processes of a run, so that they keep one discriminator: DDP allows no gradient of a gradient."""
+    if not distributed.is_initialized():
+        return
+    for parameter in net.parameters():
+        if parameter.grad is not None:
+            distributed.all_reduce(parameter.grad)
+            parameter.grad /= distributed.get_world_size()

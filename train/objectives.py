@@ -1,0 +1,36 @@
+"""What networks are trained for: error relative to each pattern's size, so that light contacts count as firm ones."""
+
+from typing import Any, Final
+
+from torch import Tensor, nn
+
+_LEAST_TRUTH_MM: Final = 1e-4
+"""RMS below which a truth counts as this large: a micrometre's contact is no contact."""
+
+
+def relative_error(patterns: Tensor, truth: Tensor) -> Tensor:
+    """Mean over (n, H, W) of each pattern's mean absolute error as a share of its truth's RMS."""
+    return ((patterns - truth).abs() / truth_size(truth)).mean()
+
+
+def truth_size(truth: Tensor) -> Tensor:
+    """RMS of each pattern of (n, H, W), or the least that counts, as (n, 1, 1) in [mm]."""
+    return truth.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp_min(_LEAST_TRUTH_MM)
+
+
+class RelativeError:
+    """Objective of a network that gives a pattern alone."""
+
+    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
+        """Relative error of the patterns."""
+        return relative_error(net(window).float(), truth)
+
+    def after_step(self) -> None:
+        """Nothing of its own to train."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing learnt."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing to load."""
