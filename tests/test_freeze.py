@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+
+from edge.classical import fitted_methods
+from edge.judge import judge
+from edge.taps import ON_COUNTS
+from firmware_bridge.recording import load_recording
+from train.dataset import Sequences
+from train.freeze import SEED, TEST_FORCE_N, demo_recording, fit_classical, freeze, held_out, main
+from train.generation import Generation, solve_all
+from train.nuisances import Nuisances
+from train.simulation import FRAMES, MAX_INDENTATION_MM
+
+
+@pytest.fixture(scope="module")
+def sequences() -> Sequences:
+    return held_out("test", ("O", "small circle"), taps=3)
+
+
+@pytest.fixture(scope="module")
+def frozen(sequences):
+    return freeze(sequences, Nuisances(), SEED)
+
+
+def test_frames_rise_to_the_set_force_and_share_their_earlier_taps(frozen):
+    assert len(frozen) == 2 * 4 * FRAMES and frozen.newest.shape[1:] == (3, 4, 4) and frozen.earlier.shape[:2] == (8, 2)
+    force, depth = frozen.force_n.reshape(8, FRAMES), frozen.indentation_mm.reshape(8, FRAMES)
+    assert np.all(np.diff(force) > 0) and np.allclose(np.diff(depth, n=2), 0, atol=1e-6)
+    assert np.allclose(depth[:, 0] / depth[:, -1], 7 / 22)
+    ended = np.isclose(force[:, -1], TEST_FORCE_N, rtol=0.01) | np.isclose(depth[:, -1], MAX_INDENTATION_MM)
+    assert ended.all()
+    z = frozen.newest[:, 2].sum(axis=(1, 2)).reshape(8, FRAMES)
+    assert np.all(z[:, -1] > 1.8 * z[:, 0])
+
+
+def test_the_truth_is_the_press(frozen):
+    patterns = frozen.patterns()
+    assert patterns.max(axis=(1, 2)) == pytest.approx(frozen.indentation_mm, rel=2e-3)
+    inside = frozen.touching()
+    assert patterns[inside].mean() > 4 * patterns[~inside].mean()
+
+
+def test_one_seed_freezes_the_same_and_another_reads_by_other_sensors(sequences, frozen):
+    assert freeze(sequences, Nuisances(), SEED).sha256() == frozen.sha256()
+    other = freeze(sequences, Nuisances(), SEED + 1)
+    assert other.sha256() != frozen.sha256() and np.array_equal(other.unit_patterns, frozen.unit_patterns)
+    assert not np.array_equal(other.newest, frozen.newest)
+
+
+def test_frames_of_a_tap_are_read_by_one_sensor(sequences):
+    """Gains stay from frame to frame: without other nuisances each taxel's readings are in one proportion."""
+    clean, gained = (freeze(sequences, n, SEED) for n in (Nuisances.none(), Nuisances.only("gain_spread")))
+    strong = np.abs(clean.newest[:FRAMES]).min(axis=0) > 100
+    ratio = gained.newest[:FRAMES, strong] / clean.newest[:FRAMES, strong]
+    assert np.abs(ratio - ratio.mean(axis=0)).max() < 0.02 and ratio.mean(axis=0).std() > 0.03
+
+
+def test_another_scale_is_the_same_tap(sequences, frozen):
+    coarse = freeze(sequences, Nuisances(), SEED, scale=4)
+    assert coarse.unit_patterns.shape[1:] == (16, 16) and np.array_equal(coarse.newest, frozen.newest)
+    assert coarse.patterns().mean() == pytest.approx(frozen.patterns().mean(), rel=0.01)
+
+
+def test_classical_methods_beat_nothing_and_are_in_order(frozen, tmp_path):
+    data = solve_all(Generation(surfaces=("O", "small circle"), count=96, taps=1, seed=9))
+    np.savez(tmp_path / "classical.npz", allow_pickle=False, **fit_classical(data, windows=2000))
+    methods = fitted_methods(tmp_path / "classical.npz", frozen.scale)
+    newest = frozen.newest.astype(np.float32)
+    psnr = {name: judge(method(newest), frozen, 0.5)["psnr_db"].mean() for name, method in methods.items()}
+    nothing = judge(np.zeros_like(frozen.patterns()), frozen, 0.5)["psnr_db"].mean()
+    assert set(psnr) == {"bilinear", "bicubic", "linear map"}
+    assert nothing < psnr["bilinear"] < psnr["linear map"]
+
+
+def test_the_demo_presses_holds_and_lifts_four_times(tmp_path):
+    arrays = demo_recording()
+    again = demo_recording()
+    assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
+    np.savez(tmp_path / "demo.npz", allow_pickle=False, **arrays)
+    series = load_recording(tmp_path / "demo.npz")
+    assert series
+    rest = np.median(arrays["counts"][arrays["tap"] < 0][:100], axis=0)
+    force = (arrays["counts"] - rest)[:, 2].sum(axis=(1, 2))
+    pressed = force > ON_COUNTS
+    assert np.sum(np.diff(pressed.astype(int)) == 1) == 4
+    assert np.all(force[arrays["tap"] < 0] < ON_COUNTS)
+    assert arrays["unit_patterns"].max(axis=(1, 2)) == pytest.approx(1, abs=2e-3)
+
+
+def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
+    with pytest.raises(SystemExit, match=r"^freeze: .*no such file"):
+        main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])

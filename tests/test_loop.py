@@ -1,0 +1,201 @@
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from edge_samples import ROOT
+
+from train import loop
+from train.loop import DivergedError, NotResumableError, Recipe, learning_rate_share, train
+from train.networks.blocks import PatternNet
+from train.objectives import RelativeError
+
+RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)
+
+
+class Map(PatternNet):
+    """The least network: a linear map with something random in training."""
+
+    def __init__(self):
+        super().__init__()
+        self.taps, self.scale = 1, 1
+        self.matrix = torch.nn.Linear(48, 16)
+        self.dropout = torch.nn.Dropout(0.0)
+
+    def forward(self, window):
+        return self.matrix(window.flatten(1)).view(-1, 4, 4)
+
+
+def new_net():
+    torch.manual_seed(0)
+    return Map()
+
+
+def batches(number):
+    rng = np.random.default_rng(number)
+    window = torch.from_numpy(rng.standard_normal((4, 3, 4, 4)).astype(np.float32))
+    return window, window[:, 2] * 0.1 + 1
+
+
+def weights(net):
+    return torch.cat([value.flatten() for value in net.state_dict().values()])
+
+
+def trained(tmp_path, recipe=RECIPE, **options):
+    net = new_net()
+    done = train(net, RelativeError(), batches, recipe, tmp_path / "net.resume", **options)
+    return net, done
+
+
+def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
+    shares = [learning_rate_share(progress) for progress in np.linspace(0, 1, 101)]
+    assert shares[0] == pytest.approx(1 / 25) and max(shares) == pytest.approx(shares[10]) == pytest.approx(1)
+    assert np.all(np.diff(shares[:11]) > 0) and np.all(np.diff(shares[10:]) < 0) and shares[-1] < 1e-4
+
+
+def test_training_lowers_the_loss(tmp_path):
+    net, done = trained(tmp_path, replace(RECIPE, steps=200))
+    window, truth = batches(999)
+    assert done.steps == 200 and done.loss < 0.3
+    assert RelativeError().loss(net, window, truth) < 0.3 * RelativeError().loss(new_net(), window, truth)
+    assert not net.training
+
+
+def test_one_seed_gives_the_same_weights(tmp_path):
+    assert torch.equal(weights(trained(tmp_path)[0]), weights(trained(tmp_path)[0]))
+
+
+@pytest.mark.parametrize("killed_at", [1, 7, 11])
+def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, monkeypatch, killed_at):
+    whole, _ = trained(tmp_path)
+    monkeypatch.setattr(loop, "_KEEP_EVERY_S", -1.0)
+
+    class KilledError(Exception):
+        pass
+
+    def until_killed(number):
+        if number == killed_at:
+            raise KilledError
+        return batches(number)
+
+    with pytest.raises(KilledError):
+        train(new_net(), RelativeError(), until_killed, RECIPE, tmp_path / "net.resume")
+    seen = []
+
+    def recorded(number):
+        seen.append(number)
+        return batches(number)
+
+    torch.manual_seed(99)
+    resumed = Map()
+    train(resumed, RelativeError(), recorded, RECIPE, tmp_path / "net.resume")
+    assert seen == list(range(killed_at, 12))
+    assert torch.equal(weights(whole), weights(resumed))
+
+
+@pytest.mark.parametrize(("steps", "identity"), [(13, "these data"), (12, "others")])
+def test_a_run_with_another_recipe_or_on_other_data_is_not_gone_on_with(tmp_path, monkeypatch, steps, identity):
+    monkeypatch.setattr(loop, "_KEEP_EVERY_S", -1.0)
+    trained(tmp_path, identity="these data")
+    trained(tmp_path, identity="these data")
+    with pytest.raises(NotResumableError, match="delete it"):
+        trained(tmp_path, replace(RECIPE, steps=steps), identity=identity)
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"batch": 0}, {"learning_rate": -1.0}, {"minutes": 0.0}])
+def test_recipes_that_cannot_be_are_refused_by_name(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, expected more than 0"):
+        replace(RECIPE, **wrong)
+
+
+def test_bfloat16_is_for_devices_that_have_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": False})
+    fine, asked = trained(tmp_path)[0], trained(tmp_path / "asked", replace(RECIPE, bf16=True))[0]
+    assert torch.equal(weights(fine), weights(asked))
+
+
+def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
+    net = new_net()
+    before = weights(net)
+
+    def poisoned(number):
+        window, truth = batches(number)
+        return window * torch.nan, truth
+
+    with pytest.raises(DivergedError, match="step 0: lower the learning rate"):
+        train(net, RelativeError(), poisoned, RECIPE, tmp_path / "net.resume")
+    assert torch.equal(before, weights(net))
+
+
+def test_the_clock_ends_a_run_too(tmp_path):
+    _, done = trained(tmp_path, replace(RECIPE, steps=10**9, minutes=1e-3))
+    assert 0 < done.steps < 10**6
+
+
+def test_bfloat16_multiplies_coarsely_and_learns_all_the_same(tmp_path):
+    recipe = replace(RECIPE, steps=200)
+    (fine, _), (coarse, done) = trained(tmp_path, recipe), trained(tmp_path, replace(recipe, bf16=True))
+    assert coarse.matrix.weight.dtype == torch.float32 and not torch.equal(weights(fine), weights(coarse))
+    assert done.loss < 0.35
+
+
+def test_figures_go_to_tensorboard(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    trained(
+        tmp_path,
+        replace(RECIPE, steps=100),
+        log_folder=tmp_path / "logs",
+        validate=lambda net: {"PSNR": float(net.taps)},
+    )
+    events = accumulator.EventAccumulator(str(tmp_path / "logs")).Reload()
+    assert [event.step for event in events.Scalars("loss")] == [50, 100]
+    assert [event.step for event in events.Scalars("PSNR")] == [20, 40, 60, 80, 100]
+
+
+WORKER = """
+import sys, json, torch
+sys.path.insert(0, "tests")
+from pathlib import Path
+from test_loop import batches, new_net, weights, RECIPE
+from train.loop import leave_group, rank_and_world, train
+from train.objectives import RelativeError
+net, used = new_net(), []
+def recorded(number):
+    used.append(number)
+    return batches(number)
+train(net, RelativeError(), recorded, RECIPE, Path(sys.argv[1]) / "net.resume")
+rank, world = rank_and_world()
+print(json.dumps([rank, world, used, weights(net).tolist()]), file=open(f"{sys.argv[1]}/rank{rank}.json", "w"))
+leave_group()
+"""
+
+
+def test_two_processes_share_every_batch_and_end_where_one_does(tmp_path):
+    (tmp_path / "worker.py").write_text(WORKER)
+    command = ["torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0", "--rdzv-backend", "c10d"]
+    command += ["--rdzv-endpoint", "localhost:0", str(tmp_path / "worker.py"), str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-m", *command], cwd=ROOT, env=_environment(), capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
+    assert (first[0], second[0], first[1]) == (0, 1, 2)
+    assert first[2] == second[2] == list(range(12))
+    assert first[3] == second[3]
+    alone, _ = trained(tmp_path)
+    assert first[3] == pytest.approx(weights(alone).tolist(), abs=1e-5)
+
+
+def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "rank_and_world", lambda: (0, 3))
+    with pytest.raises(ValueError, match="4 windows is shared by 3 processes"):
+        trained(tmp_path)
+
+
+def _environment():
+    import os
+
+    return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}

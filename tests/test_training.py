@@ -1,0 +1,169 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from edge.metrics import psnr_db
+from train.calibration import interval_coverage
+from train.errors import CheckpointError
+from train.fit import BASE, BUNDLED, given_taps, main
+from train.freeze import SEED, freeze, held_out
+from train.generation import Generation, solve_all
+from train.loop import Recipe
+from train.networks.compact import CompactNet
+from train.nuisances import Nuisances
+from train.training import Training, best_contact_level, fit_network, infer, load_network
+
+SMALL = {"channels": 8, "blocks": 1}
+TRAINING = Training(
+    "small", "compact-mtsr2", Recipe(steps=150, batch=16, learning_rate=5e-3, given=(0.5, 0.5)), options=SMALL
+)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return solve_all(Generation(surfaces=("O", "small square"), count=48, taps=2, seed=5))
+
+
+@pytest.fixture(scope="module")
+def validation():
+    return freeze(held_out("validation", ("O", "small square"), taps=2), Nuisances(), SEED)
+
+
+@pytest.fixture(scope="module")
+def folder(data, validation, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("checkpoints")
+    fit_network(TRAINING, data, validation, folder)
+    return folder
+
+
+def test_a_run_is_repeatable_and_its_configuration_lies_beside_the_weights(folder, data, validation, tmp_path):
+    report = fit_network(TRAINING, data, validation, tmp_path)
+    first, second = (torch.load(path / "small.pt", weights_only=True) for path in (folder, tmp_path))
+    assert all(torch.equal(first[key], second[key]) for key in first)
+    kept = json.loads((folder / "small.json").read_text())
+    assert kept["training_sha256"] == report["training_sha256"] == TRAINING.sha256(data.sha256())
+    assert kept["config"]["recipe"]["steps"] == 150 and kept["config"]["draw"]["nuisances"]["noise_counts"] == 2.0
+    assert not (folder / "small.resume").exists()
+
+
+def test_what_a_checkpoint_says_of_the_validation_set_is_what_it_does_there(folder, validation):
+    net, report = load_network(folder / "small.pt")
+    patterns, deviations = infer(net, validation.windows(2))
+    truth = validation.patterns()
+    assert psnr_db(patterns, truth, validation.full_scale_mm).mean() == pytest.approx(report["validation_psnr_db"])
+    assert interval_coverage(truth, patterns, deviations) == pytest.approx(0.9, abs=1e-3)
+    assert report["validation_coverage"] == pytest.approx(0.9, abs=1e-3)
+
+
+def test_a_network_that_is_there_and_was_trained_alike_is_not_trained_again(folder, data, validation, tmp_path):
+    for suffix in (".pt", ".json"):
+        (tmp_path / f"small{suffix}").write_bytes((folder / f"small{suffix}").read_bytes())
+    first = (tmp_path / "small.pt").stat().st_mtime_ns
+    fit_network(TRAINING, data, validation, tmp_path)
+    assert (tmp_path / "small.pt").stat().st_mtime_ns == first
+    fit_network(TRAINING, data, replace(validation, full_scale_mm=1.0), tmp_path)  # its deviations are set on that
+    assert (tmp_path / "small.pt").stat().st_mtime_ns > first
+    (tmp_path / "small.json").unlink()
+    fit_network(TRAINING, data, validation, tmp_path)
+    assert (tmp_path / "small.json").exists() and not (tmp_path / "small.draft").exists()
+
+
+def test_training_lowers_the_error(folder, validation):
+    _, report = load_network(folder / "small.pt")
+    torch.manual_seed(0)
+    patterns, _ = infer(CompactNet(2, 10, **SMALL).eval(), validation.windows(2))
+    untrained = psnr_db(patterns, validation.patterns(), validation.full_scale_mm).mean()
+    assert report["validation_psnr_db"] > untrained + 1
+
+
+def test_the_hash_tells_configurations_and_data_apart():
+    changes = [
+        {"seed": 2},
+        {"scale": 8},
+        {"start": "base"},
+        {"options": {}},
+        {"recipe": replace(TRAINING.recipe, steps=151)},
+        {"draw": replace(TRAINING.draw, nuisances=Nuisances.none())},
+    ]
+    hashes = {replace(TRAINING, **change).sha256("data") for change in [{}, *changes]} | {TRAINING.sha256("other")}
+    assert len(hashes) == len(changes) + 2
+
+
+def test_a_network_starts_as_the_one_it_starts_from(folder, data, validation, tmp_path):
+    for suffix in (".pt", ".json"):
+        (tmp_path / f"small{suffix}").write_bytes((folder / f"small{suffix}").read_bytes())
+    still = Recipe(steps=1, batch=4, learning_rate=1e-12)
+    one = Training("one", "compact-stsr", still, start="small", options=SMALL)
+    fit_network(one, data, validation, tmp_path)
+    (net, _), (start, _) = load_network(tmp_path / "one.pt"), load_network(tmp_path / "small.pt")
+    alone = infer(net, validation.windows(1))[0]
+    assert np.allclose(alone, infer(start, validation.windows(2, given=1))[0], atol=1e-5)
+
+
+class Hostile:
+    def __reduce__(self):
+        return (print, ("it ran",))
+
+
+@pytest.mark.parametrize("damage", ["no weights", "no report", "other size", "hostile", "garbage"])
+def test_what_is_no_checkpoint_is_refused_by_name(folder, tmp_path, damage, capsys):
+    weights, report = torch.load(folder / "small.pt", weights_only=True), (folder / "small.json").read_text()
+    path = tmp_path / "net.pt"
+    if damage != "no report":
+        path.with_suffix(".json").write_text(
+            report.replace('"channels": 8', '"channels": 16') if damage == "other size" else report
+        )
+    if damage == "hostile":
+        torch.save({"weight": Hostile()}, path)
+    elif damage == "garbage":
+        path.write_bytes(b"no weights at all")
+    elif damage != "no weights":
+        torch.save(weights, path)
+    with pytest.raises(CheckpointError, match=r"net\.pt and net\.json are no checkpoint"):
+        load_network(path)
+    assert "it ran" not in capsys.readouterr().out
+
+
+def test_the_contact_level_is_the_one_that_overlaps_best():
+    rows, cols = np.mgrid[:40, :40] - 19.5
+    cone = np.maximum(1 - np.hypot(rows, cols) / 15, 0)[None].astype(np.float32)
+    assert best_contact_level(cone, cone >= 0.6 * cone.max()) == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("taps", range(1, 8))
+def test_windows_of_every_number_of_taps_are_drawn(taps):
+    shares = given_taps(taps)
+    assert len(shares) == taps and sum(shares) == pytest.approx(1) and min(shares) > 0
+
+
+def test_the_bundled_networks_start_from_the_base():
+    assert {training.name for training in BUNDLED} == {"stsr", "mtsr2", "mtsr4"}
+    assert {training.start for training in BUNDLED} == {BASE.name}
+    assert all(len(training.recipe.given) <= len(BASE.recipe.given) for training in BUNDLED)
+
+
+def test_one_network_by_the_command(data, tmp_path, capsys):
+    data.save(tmp_path / "data.npz")
+    options = ["--data", str(tmp_path / "data.npz"), "--network", "compact-mtsr2", "--name", "mine", "--steps", "2"]
+    main([str(tmp_path), *options, "--batch", "4", "--bf16"])
+    assert capsys.readouterr().out.startswith("mine: validation ")
+    assert load_network(tmp_path / "mine.pt")[1]["config"]["recipe"]["bf16"] is True
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--data", "absent.npz"], "no such file"),
+        (["--network", "compact-mtsr4"], "4 taps asked for"),
+        (["--network", "compact-stsr", "--start", "absent"], "absent.pt"),
+        (["--network", "compact-stsr", "--scale", "7"], "scale is 7"),
+    ],
+)
+def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, told):
+    data.save(tmp_path / "data.npz")
+    given = [] if "--data" in options else ["--data", str(tmp_path / "data.npz")]
+    with pytest.raises(SystemExit, match=rf"^fit: .*{told}[^\n]*$"):
+        main([str(tmp_path), *given, *options, "--steps", "1"])

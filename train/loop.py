@@ -1,0 +1,313 @@
+"""One training loop for every network: mixed precision, several devices, resumed after a kill, the same for one seed.
+
+Under torchrun every process takes its share of each batch, and gradients are averaged: the weights are those of one
+process but for the order in which is added, and but for batch normalisation, which sees the share alone.
+
+    torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/train.npz
+"""
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from math import cos, isfinite, pi
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from train.errors import TrainError
+from train.networks.blocks import PatternNet
+
+Batches = Callable[[int], tuple[Tensor, Tensor]]
+"""Windows (batch, 3K, rows, cols) and patterns (batch, H, W) of a batch number; one number is always one batch."""
+
+_WARM_UP: Final = 0.1
+_FIRST_SHARE: Final = 1 / 25
+_LAST_SHARE: Final = 1e-5
+_KEEP_EVERY_S: Final = 60.0
+_LOG_EVERY: Final = 50
+
+
+class NotResumableError(TrainError, ValueError):
+    """A run that was cut short had another configuration."""
+
+
+class DivergedError(TrainError, ArithmeticError):
+    """The loss is no number any more."""
+
+
+class Objective(Protocol):
+    """What is made small. One with networks of its own, such as a discriminator, trains and keeps them itself."""
+
+    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
+        """The scalar to descend."""
+        ...
+
+    def after_step(self) -> None:
+        """Called when the network has taken its step."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that it has learnt."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How a network is trained.
+
+    Attributes:
+        steps: optimizer steps.
+        batch: windows in a batch, shared by all devices.
+        learning_rate: highest of the one cycle.
+        weight_decay: of AdamW.
+        clip_norm: largest norm of a gradient.
+        given: share of windows with 1, 2, ... K taps given, older ones dropped.
+        bf16: multiply in bfloat16 and add in float32, on a device that is faster so.
+        minutes: end the cycle by the clock where that comes first, or None. The weights then depend on the machine.
+    """
+
+    steps: int
+    batch: int = 64
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.0
+    clip_norm: float = 1.0
+    given: tuple[float, ...] = (1.0,)
+    bf16: bool = False
+    minutes: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "learning_rate", "minutes"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} is {value}, expected more than 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """What a run came to: steps taken, seconds of training over all its parts, and the last loss."""
+
+    steps: int
+    elapsed_s: float
+    loss: float
+
+
+def rank_and_world() -> tuple[int, int]:
+    """Number of this process, and how many there are; joins torchrun's group the first time."""
+    if "WORLD_SIZE" not in os.environ:
+        return 0, 1
+    if not distributed.is_initialized():
+        distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+    return distributed.get_rank(), distributed.get_world_size()
+
+
+def gains_by_bf16(device: torch.device) -> bool:
+    """Whether a device multiplies in bfloat16 by itself; others imitate it, slowly."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    able = torch.cpu.get_capabilities()
+    return bool(able.get("avx512_bf16") or able.get("amx_bf16") or able.get("bf16"))
+
+
+def leave_group() -> None:
+    """End what torchrun began, all processes together: one that goes first takes the others' connections with it."""
+    if distributed.is_initialized():
+        distributed.barrier()
+        distributed.destroy_process_group()
+
+
+def wait_for_all() -> None:
+    """Let no process go on before all have come here."""
+    if distributed.is_initialized():
+        distributed.barrier()
+
+
+def device_of_rank(rank: int) -> torch.device:
+    """Where a process computes."""
+    return torch.device("cuda", rank % torch.cuda.device_count()) if torch.cuda.is_available() else torch.device("cpu")
+
+
+def learning_rate_share(progress: float) -> float:
+    """Share of the highest learning rate at a share of the run: up by a cosine, then down (Smith 2018, one cycle)."""
+    if progress < _WARM_UP:
+        return _FIRST_SHARE + (1 - _FIRST_SHARE) * (1 - cos(pi * progress / _WARM_UP)) / 2
+    return _LAST_SHARE + (1 - _LAST_SHARE) * (1 + cos(pi * (progress - _WARM_UP) / (1 - _WARM_UP))) / 2
+
+
+def train(
+    net: PatternNet,
+    objective: Objective,
+    batches: Batches,
+    recipe: Recipe,
+    resume_path: Path,
+    *,
+    identity: str = "",
+    log_folder: Path | None = None,
+    validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
+    validations: int = 5,
+) -> Trained:
+    """Train a network in place; cut short, it goes on where it was when called again.
+
+    Args:
+        net: on any device; left in evaluation mode.
+        objective: what is made small.
+        batches: gives the batch of a number.
+        recipe: how.
+        resume_path: where the state is kept while the run lasts.
+        identity: of what is trained on what; a run that was cut short goes on with the same alone.
+        log_folder: for TensorBoard, or None.
+        validate: gives figures to log, of the network in evaluation mode.
+        validations: how often, over the run.
+
+    The state at `resume_path` is left there: the caller deletes it when the result is safe.
+
+    Raises:
+        ValueError: a batch cannot be shared evenly by the processes.
+        NotResumableError: what lies at `resume_path` is of another recipe or identity.
+        DivergedError: the loss is not finite; the network is as it was before that step.
+    """
+    rank, world = rank_and_world()
+    if recipe.batch % world:
+        raise ValueError(f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each")
+    device = device_of_rank(rank)
+    net.to(device).train()
+    optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    parallel = DistributedDataParallel(net) if world > 1 else net
+    keeper = _Keeper(resume_path, recipe, identity, net, optimizer, objective, rank)
+    step, spent_s = keeper.restore(device)
+    wait_for_all()  # what lies there may be deleted when the first is done
+    clock = _Clock(recipe, spent_s)
+    log = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None, hidden=rank > 0)
+    check_at = {round(recipe.steps * (i + 1) / validations) for i in range(validations)} if validate else set()
+    loss = torch.inf
+    while (progress := clock.progress(step)) < 1:
+        rate = recipe.learning_rate * learning_rate_share(progress)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        window, truth = (part[rank::world].to(device) for part in batches(step))
+        with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
+            descended = objective.loss(parallel, window, truth)
+        optimizer.zero_grad()
+        descended.backward()
+        norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))
+        loss = float(descended.detach())
+        if not (isfinite(norm) and isfinite(loss)):
+            raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step}: lower the learning rate")
+        optimizer.step()
+        objective.after_step()
+        step += 1
+        log.step(step, loss, rate)
+        if validate and step in check_at and rank == 0:
+            net.eval()
+            log.figures(step, validate(net))
+            net.train()
+        keeper.keep_now_and_then(step, clock.elapsed_s())
+    log.close()
+    net.eval()
+    return Trained(step, clock.elapsed_s(), loss)
+
+
+class _Log:
+    """A bar on a terminal, and TensorBoard."""
+
+    def __init__(self, name: str, done: int, steps: int, folder: Path | None, hidden: bool) -> None:
+        self._bar = tqdm(
+            total=steps,
+            initial=done,
+            desc=name,
+            unit="step",
+            disable=hidden or not sys.stderr.isatty(),
+        )
+        self._writer = SummaryWriter(str(folder)) if folder else None
+
+    def step(self, step: int, loss: float, rate: float) -> None:
+        self._bar.update()
+        if step % _LOG_EVERY == 0:
+            self._bar.set_postfix(loss=f"{loss:.4f}")
+            self.figures(step, {"loss": loss, "learning rate": rate})
+
+    def figures(self, step: int, values: Mapping[str, float]) -> None:
+        if self._writer:
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        self._bar.close()
+        if self._writer:
+            self._writer.close()
+
+
+class _Clock:
+    """How far a run is, by its steps or by its time; all processes agree."""
+
+    def __init__(self, recipe: Recipe, spent_s: float) -> None:
+        self._recipe = recipe
+        self._started_s = time.monotonic() - spent_s
+
+    def elapsed_s(self) -> float:
+        return time.monotonic() - self._started_s
+
+    def progress(self, step: int) -> float:
+        by_steps = step / self._recipe.steps
+        if self._recipe.minutes is None:
+            return by_steps
+        by_time = torch.tensor(self.elapsed_s() / (60 * self._recipe.minutes), dtype=torch.float64)
+        if distributed.is_initialized():
+            distributed.broadcast(by_time, src=0)
+        return max(by_steps, float(by_time))
+
+
+class _Keeper:
+    """The state of a run on disk, so that a kill costs a minute."""
+
+    def __init__(
+        self,
+        path: Path,
+        recipe: Recipe,
+        identity: str,
+        net: nn.Module,
+        optimizer: torch.optim.Optimizer,
+        objective: Objective,
+        rank: int,
+    ) -> None:
+        self._path = path
+        self._hash = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
+        self._parts = {"net": net, "optimizer": optimizer, "objective": objective}
+        self._rank = rank
+        self._kept_s = time.monotonic()
+
+    def restore(self, device: torch.device) -> tuple[int, float]:
+        """Steps and seconds that lie behind, both 0 for a new run."""
+        if not self._path.exists():
+            return 0, 0.0
+        state = torch.load(self._path, map_location=device, weights_only=True)
+        if state["recipe"] != self._hash:
+            raise NotResumableError(
+                f"{self._path} is of a run with another recipe or on other data: delete it to start anew"
+            )
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+        return state["step"], state["elapsed_s"]
+
+    def keep_now_and_then(self, step: int, elapsed_s: float) -> None:
+        if self._rank == 0 and time.monotonic() - self._kept_s > _KEEP_EVERY_S:
+            self.keep(step, elapsed_s)
+
+    def keep(self, step: int, elapsed_s: float) -> None:
+        state = {name: part.state_dict() for name, part in self._parts.items()}
+        draft = self._path.with_name(self._path.name + ".draft")
+        torch.save(state | {"recipe": self._hash, "step": step, "elapsed_s": elapsed_s}, draft)
+        draft.replace(self._path)
+        self._kept_s = time.monotonic()

@@ -1,0 +1,205 @@
+"""One network from its data to its checkpoint: NAME.pt (weights) beside NAME.json (configuration and figures)."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edge.frozen import FrozenSet
+from edge.metrics import contact_iou, psnr_db, ssim
+from train.batches import Draw, WindowBatches, network_input
+from train.calibration import calibrate, interval_coverage
+from train.dataset import Sequences
+from train.errors import CheckpointError
+from train.loop import Objective, Recipe, device_of_rank, rank_and_world, train, wait_for_all
+from train.networks.blocks import PatternNet
+from train.networks.compact import CompactNet, HeteroscedasticError
+from train.networks.registry import build, grown
+from train.networks.srgan import SrganObjective, TactileSRGAN
+from train.objectives import RelativeError
+
+_CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
+_INFERRED_AT_ONCE: Final = 128
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """All that decides the weights of a network.
+
+    Attributes:
+        name: of the checkpoint.
+        network: a name of train.networks.registry.
+        recipe: how it is trained.
+        scale: pattern pixels per taxel pitch.
+        start: checkpoint whose weights it starts from, or None.
+        draw: how windows are drawn.
+        seed: of weights and draws.
+        options: further arguments of the network's class.
+    """
+
+    name: str
+    network: str
+    recipe: Recipe
+    scale: int = 10
+    start: str | None = None
+    draw: Draw = field(default_factory=Draw)
+    seed: int = 1
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def sha256(self, data_sha256: str) -> str:
+        """Hash of the configuration and the data, as written in the models' contract."""
+        config = asdict(self)
+        if self.draw.figure_share is None:
+            del config["draw"]["figure_share"]  # what was trained before there was a choice keeps its name
+        return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
+
+
+def fit_network(training: Training, data: Sequences, validation: FrozenSet, folder: Path) -> dict[str, Any]:
+    """Train, calibrate, judge and write one network; returns what its NAME.json holds.
+
+    A checkpoint that is there already, trained alike, is left as it is.
+
+    Args:
+        training: what to train.
+        data: sequences of at least as many taps as it takes.
+        validation: what contact level and deviations are set on.
+        folder: of the checkpoints.
+
+    Raises:
+        CheckpointError: the checkpoint to start from cannot be used.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
+    training_sha256 = training.sha256(data_sha256)
+    start = None if training.start is None else _file_sha256(folder / f"{training.start}.pt")
+    made_of = {"training_sha256": training_sha256, "start_sha256": start, "validation_sha256": validation.sha256()}
+    if path.exists() and path.with_suffix(".json").exists():
+        _, report = load_network(path)
+        if {name: report.get(name) for name in made_of} == made_of:
+            return report
+    torch.manual_seed(training.seed)
+    net = _first_weights(training, folder)
+    rank, world = rank_and_world()
+    seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
+    recipe = training.recipe
+    batches = WindowBatches(data.at_scale(training.scale), training.draw, recipe.given, recipe.batch, seed)
+    done = train(
+        net,
+        _objective(net, device_of_rank(rank), seed),
+        batches,
+        recipe,
+        (resume_path := folder / f"{training.name}.resume"),
+        identity=f"{training_sha256} {start}",
+        log_folder=folder / "logs" / training.name,
+        validate=lambda net: {"validation PSNR dB": _psnr(net, validation)},
+    )
+    net.cpu()
+    report = {
+        "name": training.name,
+        "network": training.network,
+        "scale": training.scale,
+        "options": training.options,
+        "taps": net.taps,
+        "config": asdict(training),
+        "data_sha256": data_sha256,
+        **made_of,
+        "steps": done.steps,
+        "elapsed_s": round(done.elapsed_s, 1),
+        "processes": world,
+        "threads": torch.get_num_threads(),
+        **_judged(net, validation),
+    }
+    if rank == 0:
+        # The report last: what it says is true of the weights beside it.
+        draft = path.with_suffix(".draft")
+        torch.save(net.state_dict(), draft)
+        draft.replace(path)
+        draft.write_text(json.dumps(report, indent=1) + "\n")
+        draft.replace(path.with_suffix(".json"))
+        resume_path.unlink(missing_ok=True)
+    wait_for_all()
+    return report
+
+
+def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
+    """The network of NAME.pt in evaluation mode, and NAME.json beside it.
+
+    Raises:
+        CheckpointError: a file is missing, or the weights do not fit the configuration.
+    """
+    try:
+        report = json.loads(path.with_suffix(".json").read_text())
+        net = build(report["network"], report["scale"], **report["options"])
+        net.load_state_dict(torch.load(path, weights_only=True))
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise CheckpointError(f"{path} and {path.stem}.json are no checkpoint of train.fit: {reason}") from error
+    return net.eval(), report
+
+
+def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) in zeroed counts, and deviations where there are."""
+    device = next(net.parameters()).device
+    patterns, deviations = [], []
+    with torch.inference_mode():
+        for part in torch.split(network_input(windows), _INFERRED_AT_ONCE):
+            given = net(part.to(device))
+            pattern, deviation = given if isinstance(given, tuple) else (given, None)
+            patterns.append(pattern.float().cpu().numpy())
+            if deviation is not None:
+                deviations.append(deviation.float().cpu().numpy())
+    return np.concatenate(patterns), np.concatenate(deviations) if deviations else None
+
+
+def best_contact_level(patterns: NDArray[np.float32], touching: NDArray[np.bool_]) -> float:
+    """Share of a pattern's maximum whose outline overlaps the true contact best."""
+    overlap = [contact_iou(patterns, touching, level).mean() for level in _CONTACT_LEVELS]
+    return _CONTACT_LEVELS[int(np.argmax(overlap))]
+
+
+def _file_sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"{path}, to start from: {error.strerror or error}; train it first") from error
+
+
+def _first_weights(training: Training, folder: Path) -> PatternNet:
+    if training.start is None:
+        return build(training.network, training.scale, **training.options)
+    start, _ = load_network(folder / f"{training.start}.pt")
+    return grown(start, training.network, training.scale, **training.options)
+
+
+def _objective(net: PatternNet, device: torch.device, seed: int) -> Objective:
+    if isinstance(net, CompactNet):
+        return HeteroscedasticError()
+    return SrganObjective(device, seed=seed) if isinstance(net, TactileSRGAN) else RelativeError()
+
+
+def _psnr(net: PatternNet, validation: FrozenSet) -> float:
+    patterns, _ = infer(net, validation.windows(net.taps))
+    return float(psnr_db(patterns, validation.patterns(), validation.full_scale_mm).mean())
+
+
+def _judged(net: PatternNet, validation: FrozenSet) -> Mapping[str, float]:
+    """Figures on the validation set; sets the factor of the deviations."""
+    patterns, deviations = infer(net, validation.windows(net.taps))
+    truth, full_scale = validation.patterns(), validation.full_scale_mm
+    figures = {
+        "contact_level": best_contact_level(patterns, validation.touching()),
+        "validation_psnr_db": float(psnr_db(patterns, truth, full_scale).mean()),
+        "validation_ssim": float(ssim(patterns, truth, full_scale).mean()),
+    }
+    if deviations is not None and isinstance(net, CompactNet):
+        factor = calibrate(truth, patterns, deviations)
+        net.deviation_scale *= factor
+        figures["validation_coverage"] = interval_coverage(truth, patterns, deviations * np.float32(factor))
+    return figures
