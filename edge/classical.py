@@ -12,6 +12,8 @@ from edge.errors import EdgeError
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's maximum from which these methods call a pixel touched: the edge of a blurred step."""
 
+_CUBIC_A: Final = -0.5
+
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
 
@@ -20,7 +22,8 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
     """The methods by name, with what was fitted on training taps.
 
     Args:
-        path: npz of bilinear_gain () in mm per count, and linear_map (features, pixels).
+        path: npz of bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels); bicubic is
+            left out where the file, of an earlier version, has no gain for it.
         scale: pattern pixels per taxel pitch.
 
     Raises:
@@ -29,6 +32,7 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             gain, matrix = float(arrays["bilinear_gain"]), arrays["linear_map"]
+            cubic_gain = float(arrays["bicubic_gain"]) if "bicubic_gain" in arrays else None
     except (OSError, ValueError, KeyError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
 
@@ -39,7 +43,10 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
         rows, cols = newest.shape[-2:]
         return (newest.reshape(len(newest), -1) @ matrix).reshape(-1, rows * scale, cols * scale)
 
-    return {"bilinear": by_gain, "linear map": by_map}
+    methods: dict[str, Method] = {"bilinear": by_gain, "linear map": by_map}
+    if cubic_gain is not None:
+        methods["bicubic"] = lambda newest: bicubic(newest[:, 2], scale) * cubic_gain
+    return methods
 
 
 def bilinear(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
@@ -60,6 +67,37 @@ def _weights(taxels: int, scale: int) -> NDArray[np.float64]:
     matrix[pixel, low] = 1 - (position - low)
     matrix[pixel, np.minimum(low + 1, taxels - 1)] += position - low
     return matrix
+
+
+def bicubic(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
+    """Interpolate taxels (..., rows, cols) to (..., rows*scale, cols*scale) by cubic convolution.
+
+    Pixels lie as those of `bilinear`, and outside the outer taxels their values are held likewise; curves between them
+    may overshoot.
+
+    Source: Keys 1981, Eq. 4, with a = -1/2 (Catmull-Rom), which alone is exact on parabolas.
+    """
+    rows, cols = taxel_values.shape[-2:]
+    return _cubic_weights(rows, scale) @ taxel_values @ _cubic_weights(cols, scale).T
+
+
+def _cubic_weights(taxels: int, scale: int) -> NDArray[np.float64]:
+    """Interpolation matrix (taxels*scale, taxels) along one axis, of the two taxels on either side."""
+    position = (np.arange(taxels * scale) + 0.5) / scale - 0.5
+    matrix = np.zeros((taxels * scale, taxels))
+    for offset in (-1, 0, 1, 2):
+        neighbour = np.floor(position).astype(int) + offset
+        weight = _cubic_kernel(np.abs(position - neighbour))
+        np.add.at(matrix, (np.arange(taxels * scale), np.clip(neighbour, 0, taxels - 1)), weight)
+    return matrix
+
+
+def _cubic_kernel(distance: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Weight of a taxel at a distance of 0 to 2 pitches."""
+    a, x = _CUBIC_A, distance
+    near = (a + 2) * x**3 - (a + 3) * x**2 + 1
+    far = a * (x**3 - 5 * x**2 + 8 * x - 4)
+    return np.where(x <= 1, near, far)
 
 
 def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) -> float:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from edge.errors import ModelError
 from firmware_bridge.geometry import SensorGeometry
 
-CONTRACT_VERSION: Final = 1
+CONTRACT_VERSION: Final = 2
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 OUTPUT_NAME: Final = "pattern"
+DEVIATION_NAME: Final = "deviation"
 KEY_PREFIX: Final = "tactile."
 
 
@@ -37,9 +38,11 @@ class Contract:
         rows: taxel rows.
         cols: taxel columns.
         pitch_mm: taxel pitch, in [mm].
+        interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
+            None where the model gives no deviation.
         training_sha256: of the training configuration.
         test_set_sha256: of the frozen test set that `test_error` was measured on.
-        test_error: number of taps given -> metric name -> value.
+        test_error: number of taps given -> metric name -> value; empty where the test set has another scale.
     """
 
     version: int
@@ -55,6 +58,7 @@ class Contract:
     rows: int
     cols: int
     pitch_mm: float
+    interval_factor: float | None
     training_sha256: str
     test_set_sha256: str
     test_error: dict[str, dict[str, float]]
@@ -69,6 +73,12 @@ class Contract:
         """Shape (H, W) of the pattern."""
         return (self.rows * self.scale, self.cols * self.scale)
 
+    @property
+    def output_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Shapes (1, H, W) of the network's outputs by name: the pattern, and its deviation if there is one."""
+        names = (OUTPUT_NAME,) if self.interval_factor is None else (OUTPUT_NAME, DEVIATION_NAME)
+        return dict.fromkeys(names, (1, *self.pattern_shape))
+
     def to_metadata(self) -> dict[str, str]:
         """The contract as the string map that ONNX metadata holds."""
         return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items()}
@@ -80,15 +90,11 @@ class Contract:
         Raises:
             ModelError: a key is missing, unreadable or out of range; the key is named.
         """
-        values: dict[str, Any] = {}
-        for field in fields(cls):
-            text = metadata.get(KEY_PREFIX + field.name)
-            if text is None:
-                raise ModelError(f"contract key '{field.name}' is missing: not a model made by export, or an old one")
-            try:
-                values[field.name] = json.loads(text)
-            except json.JSONDecodeError as error:
-                raise ModelError(f"contract key '{field.name}' is {text!r}, expected JSON") from error
+        version = _value(metadata, "version")
+        if version != CONTRACT_VERSION:  # before the other keys, which another version may not have
+            expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
+            raise ModelError(f"contract key 'version' is {version!r}, {expected}")
+        values = {field.name: _value(metadata, field.name) for field in fields(cls)}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
         return cls(**values)
@@ -115,12 +121,20 @@ class Contract:
         return deformation_counts / divisor
 
 
+def _value(metadata: Mapping[str, str], key: str) -> Any:
+    text = metadata.get(KEY_PREFIX + key)
+    if text is None:
+        raise ModelError(f"contract key '{key}' is missing: not a model made by export, or an old one")
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ModelError(f"contract key '{key}' is {text!r}, expected JSON") from error
+
+
 def _check(values: Mapping[str, Any]) -> None:
     def refuse(key: str, expected: str) -> None:
         raise ModelError(f"contract key '{key}' is {values[key]!r}, expected {expected}")
 
-    if values["version"] != CONTRACT_VERSION:
-        refuse("version", f"{CONTRACT_VERSION}: export the model again with this release")
     for key in ("taps", "scale", "rows", "cols"):
         if type(values[key]) is not int or values[key] < 1:
             refuse(key, "a whole number from 1")
@@ -133,6 +147,9 @@ def _check(values: Mapping[str, Any]) -> None:
         refuse("contact_level", "a number below 1")
     if not _is_number(values["angle_step_deg"]):
         refuse("angle_step_deg", "a number")
+    factor = values["interval_factor"]
+    if factor is not None and not (_is_number(factor) and factor > 0):
+        refuse("interval_factor", "a positive number, or null for a model without deviations")
     scaling = values["counts_per_unit"]
     if not isinstance(scaling, list) or len(scaling) != 3 or not all(_is_number(v) and v > 0 for v in scaling):
         refuse("counts_per_unit", "three positive numbers, for x, y, z")

@@ -28,7 +28,8 @@ class FrozenSet:
         tap: (n,) index of the frame's tap; frames of a tap are not independent.
         indentation_mm: (n,) float32, in [mm].
         force_n: (n,) float32, in [N].
-        unit_patterns: (taps, H, W) float16, deformation per indentation; 1 where the surface touches.
+        unit_patterns: (taps, H, W) float16, deformation per indentation.
+        touched: (taps, H, W) bool, pixels of which the surface touches at least half.
         surface: (taps,) name of the surface.
         angle_deg: (taps,) turn of the pad, in [deg].
         full_scale_mm: the patterns' declared full scale, in [mm].
@@ -40,6 +41,7 @@ class FrozenSet:
     indentation_mm: NDArray[np.float32]
     force_n: NDArray[np.float32]
     unit_patterns: NDArray[np.float16]
+    touched: NDArray[np.bool_]
     surface: NDArray[np.str_]
     angle_deg: NDArray[np.float32]
     full_scale_mm: float
@@ -64,7 +66,7 @@ class FrozenSet:
 
     def touching(self) -> NDArray[np.bool_]:
         """Pixels that the surface touches, (n, H, W)."""
-        return (self.unit_patterns == 1)[self.tap]
+        return self.touched[self.tap]
 
     def sha256(self) -> str:
         """Hash over all arrays, whatever file they lie in."""

@@ -7,19 +7,58 @@ from numpy.typing import NDArray
 
 from edge.contract import Contract
 from edge.frozen import FrozenSet
-from edge.metrics import contact_iou, psnr_db, rmse_percent, ssim, ssim_global
+from edge.metrics import boundary_distance_mm, contact_iou, interval_coverage, psnr_db, rmse_percent, ssim, ssim_global
+from edge.runtime import Model
+from firmware_bridge.geometry import USPA44
 
 
-def judge(patterns: NDArray[np.floating], frozen: FrozenSet, contact_level: float) -> dict[str, NDArray[np.float64]]:
-    """Every metric of every frame, (n,) each; patterns (n, H, W) in [mm]."""
+def judge(
+    patterns: NDArray[np.floating],
+    frozen: FrozenSet,
+    contact_level: float,
+    half_width_mm: NDArray[np.floating] | None = None,
+) -> dict[str, NDArray[np.float64]]:
+    """Every metric of every frame, (n,) each.
+
+    Args:
+        patterns: (n, H, W) in [mm].
+        frozen: the test set.
+        contact_level: share of a pattern's maximum from which a pixel counts as touched.
+        half_width_mm: (n, H, W), of the intervals that are to hold 90 % of pixels, in [mm]; "coverage_90" tells how
+            many they hold, and is left out without them.
+    """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
-    return {
+    errors = {
         "psnr_db": psnr_db(patterns, truth, full_scale),
         "ssim": ssim(patterns, truth, full_scale),
         "ssim_global": ssim_global(patterns, truth, full_scale),
         "rmse_percent": rmse_percent(patterns, truth, full_scale),
         "contact_iou": contact_iou(patterns, frozen.touching(), contact_level),
+        "boundary_mm": boundary_distance_mm(
+            patterns, frozen.touching(), contact_level, USPA44.pixel_pitch_mm(frozen.scale)
+        ),
     }
+    if half_width_mm is not None:
+        errors["coverage_90"] = interval_coverage(patterns, truth, half_width_mm)
+    return errors
+
+
+def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> dict[str, NDArray[np.float64]]:
+    """Every metric of every frame, (n,) each, of a model with the newest `given` taps or all it takes.
+
+    One run a frame gives the patterns and, where the model has them, the deviations.
+    """
+    contract = model.contract
+    half_widths_mm = []
+
+    def run(window: NDArray[np.float32]) -> NDArray[np.float32]:
+        pattern = model.run(window)
+        if model.deviation is not None and contract.interval_factor is not None:
+            half_widths_mm.append(contract.interval_factor * model.deviation)
+        return pattern
+
+    patterns = infer_all(run, contract, frozen, given)
+    return judge(patterns, frozen, contract.contact_level, np.stack(half_widths_mm) if half_widths_mm else None)
 
 
 def mean_error(errors: dict[str, NDArray[np.float64]]) -> dict[str, float]:

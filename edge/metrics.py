@@ -5,6 +5,7 @@ value per pattern, shape (...). Equal maps give an infinite PSNR, an SSIM of 1 a
 where both are constant or zero.
 """
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -76,6 +77,61 @@ def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -
     union = np.sum(found | touching, axis=(-2, -1))
     overlap = np.sum(found & touching, axis=(-2, -1))
     return np.where(union > 0, overlap / np.maximum(union, 1), 1.0)
+
+
+def boundary_distance_mm(
+    pattern: ArrayLike, touching: NDArray[np.bool_], level: float, pixel_mm: float
+) -> NDArray[np.float64]:
+    """How far the outlines of two contacts lie apart: each pixel of one to the nearest of the other, mean of both.
+
+    Where both are empty they agree: 0. Where one is, they are the map's diagonal apart.
+
+    Args:
+        pattern: (n, H, W), touched where it reaches `level` of its maximum.
+        touching: (n, H, W), what is touched.
+        level: share of a pattern's maximum.
+        pixel_mm: pixel size, in [mm].
+
+    Returns:
+        (n,) in [mm].
+    """
+    found = touched(np.asarray(pattern), level)
+    if found.shape != touching.shape:
+        raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
+    apart_px = _pixels_apart(*found.shape[1:])
+    ours, theirs = _outlines(found), _outlines(touching)
+    distance_px = np.zeros(len(found))
+    for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+        if one.any() and other.any():
+            between = apart_px[np.ix_(np.flatnonzero(one), np.flatnonzero(other))]
+            distance_px[i] = (between.min(axis=0).mean() + between.min(axis=1).mean()) / 2
+        elif one.any() or other.any():
+            distance_px[i] = np.hypot(*found.shape[1:])
+    return distance_px * pixel_mm
+
+
+def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Touched pixels (n, H, W) beside an untouched one or the map's end."""
+    around = np.pad(touching, ((0, 0), (1, 1), (1, 1)))
+    inside = around[:, :-2, 1:-1] & around[:, 2:, 1:-1] & around[:, 1:-1, :-2] & around[:, 1:-1, 2:]
+    return touching & ~inside
+
+
+@lru_cache(maxsize=2)
+def _pixels_apart(height: int, width: int) -> NDArray[np.float32]:
+    """Distance between any two pixels of a map, (H W, H W), in pixels."""
+    rows, columns = np.divmod(np.arange(height * width, dtype=np.float32), width)
+    return np.hypot(rows[:, None] - rows, columns[:, None] - columns)
+
+
+def interval_coverage(pattern: ArrayLike, truth: ArrayLike, half_width: ArrayLike) -> NDArray[np.float64]:
+    """Share of pixels whose truth lies no farther from the pattern than `half_width`, (..., H, W) in the same unit."""
+    errors = np.abs(np.asarray(pattern) - np.asarray(truth))
+    if errors.shape != np.shape(half_width):
+        raise ValueError(
+            f"half width of shape {np.shape(half_width)} for errors of shape {errors.shape}, expected equal"
+        )
+    return np.mean(errors <= half_width, axis=(-2, -1))
 
 
 def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:

@@ -131,7 +131,7 @@ def pump(
     Raises:
         LinkLostError: after every scan before it got its record.
         SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
-        ModelError: the model gave a pattern that is not finite.
+        ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
     """
     end_s = None if duration_s is None else clock_s() + duration_s
     with ScanReader(link, capacity_scans) as reader:

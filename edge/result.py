@@ -28,11 +28,15 @@ class Result:
         taps_used: taps that the pattern was made from; 0 without contact.
         pattern: (H, W) float32 in `pattern_unit`, or None.
         pattern_unit: unit of the pattern.
+        deviation: (H, W) float32, standard deviation of each pixel of the pattern, in `pattern_unit`; None without a
+            pattern, or where the model gives none.
         force_counts: summed z over the baseline, or None while it cannot be known.
         force_n: the same in [N], only if a calibration was given.
         area_mm2: touched area of the pattern, in [mm2].
         centroid_mm: x, y of the touched area's centroid from the sensor's centre, x to the right
             and y down, in [mm].
+        interval_mm: how far a touched pixel may be off: half of the interval that holds 90 % of pixels, mean over the
+            touched ones, in [mm]; None without a deviation.
         run_time_us: of the inference, scaling of the input included, in [us].
         baseline: subtracted from the scan, or None.
         baseline_age_s: how long ago the baseline was taken, in [s].
@@ -47,10 +51,12 @@ class Result:
     taps_used: int = 0
     pattern: NDArray[np.float32] | None = None
     pattern_unit: str = ""
+    deviation: NDArray[np.float32] | None = None
     force_counts: float | None = None
     force_n: float | None = None
     area_mm2: float | None = None
     centroid_mm: tuple[float, float] | None = None
+    interval_mm: float | None = None
     run_time_us: float | None = None
     baseline: Baseline | None = None
     baseline_age_s: float | None = None

@@ -35,6 +35,11 @@ class Model(Protocol):
         """Pattern (H, W) of a window (taps, 3, rows, cols) in network input units."""
         ...
 
+    @property
+    def deviation(self) -> NDArray[np.float32] | None:
+        """Standard deviation (H, W) of each pixel of the last run's pattern; None where the model gives none."""
+        ...
+
 
 class Runtime:
     """Makes one result of every scan.
@@ -102,7 +107,7 @@ class Runtime:
 
         Raises:
             WindowError: the scan is not of this sensor geometry.
-            ModelError: the model gave a pattern that is not finite.
+            ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
         """
         if scan.counts.shape != self._geometry.scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._geometry.scan_shape}")
@@ -143,14 +148,20 @@ class Runtime:
         start_ns = self._clock_ns()
         pattern = self._model.run(contract.scale_window(tap.window))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
-        pixel_pitch_mm = self._geometry.pixel_pitch_mm(contract.scale)
-        area_mm2, centroid_mm = touched_patch(pattern, contract.contact_level, pixel_pitch_mm)
+        deviation = self._model.deviation
+        touching = touched(pattern, contract.contact_level)
+        area_mm2, centroid_mm = touched_patch(pattern, touching, self._geometry.pixel_pitch_mm(contract.scale))
+        interval_mm = None
+        if deviation is not None and contract.interval_factor is not None and touching.any():
+            interval_mm = contract.interval_factor * float(deviation[touching].mean())
         return replace(
             result,
             state="contact",
             pattern=pattern.copy(),
             area_mm2=area_mm2,
             centroid_mm=centroid_mm,
+            deviation=None if deviation is None else deviation.copy(),
+            interval_mm=interval_mm,
             run_time_us=run_time_us,
         )
 
@@ -207,20 +218,20 @@ class _Sensor:
 
 
 def touched_patch(
-    pattern: NDArray[np.float32], contact_level: float, pixel_pitch_mm: float
+    pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
 ) -> tuple[float, tuple[float, float] | None]:
-    """Area and centroid of the touched pixels: those that reach `contact_level` of the maximum.
+    """Area and centroid of the touched pixels.
 
     Args:
         pattern: (H, W).
-        contact_level: share of the maximum, in 0..1.
+        touching: (H, W), which pixels are touched; their pattern is above zero.
         pixel_pitch_mm: distance of neighbouring pixels, in [mm].
 
     Returns:
         Area in [mm2]; pattern-weighted centroid x, y in [mm] from the pattern's centre, x to the
-        right and y down, or None where nothing is above zero.
+        right and y down, or None where nothing is touched.
     """
-    rows, cols = np.nonzero(touched(pattern, contact_level))
+    rows, cols = np.nonzero(touching)
     if rows.size == 0:
         return 0.0, None
     weights = pattern[rows, cols].astype(np.float64)

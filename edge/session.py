@@ -1,7 +1,7 @@
 """One model in onnxruntime: checked against its contract, arrays bound once."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +10,7 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright: ignore[reportAttributeAccessIssue]
 
-from edge.contract import INPUT_NAME, OUTPUT_NAME, Contract
+from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
 from edge.errors import ModelError, WindowError
 
 WARM_UP_RUNS: Final = 20
@@ -44,24 +44,33 @@ class ModelSession:
         session = _load(path)
         try:
             self.contract = Contract.from_metadata(session.get_modelmeta().custom_metadata_map)
-            _check_tensor("input", session.get_inputs(), INPUT_NAME, self.contract.window_shape)
-            _check_tensor("output", session.get_outputs(), OUTPUT_NAME, (1, *self.contract.pattern_shape))
+            _check_tensors("input", session.get_inputs(), {INPUT_NAME: self.contract.window_shape})
+            _check_tensors("output", session.get_outputs(), self.contract.output_shapes)
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
         self._input = np.zeros(self.contract.window_shape, dtype=np.float32)
-        self._output = np.zeros((1, *self.contract.pattern_shape), dtype=np.float32)
-        self._pattern = self._output[0]
-        self._pattern.setflags(write=False)
         self._session = session
         self._binding = session.io_binding()
-        for bind, name, array in (
-            (self._binding.bind_input, INPUT_NAME, self._input),
-            (self._binding.bind_output, OUTPUT_NAME, self._output),
-        ):
-            bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+        self._bind(self._binding.bind_input, INPUT_NAME, self._input)
+        outputs = {}
+        for name, shape in self.contract.output_shapes.items():
+            output = np.zeros(shape, dtype=np.float32)
+            self._bind(self._binding.bind_output, name, output)
+            outputs[name] = output[0]
+            outputs[name].setflags(write=False)
+        self._pattern: NDArray[np.float32] = outputs[OUTPUT_NAME]
+        self._deviation: NDArray[np.float32] | None = outputs.get(DEVIATION_NAME)
         window = np.zeros((self.contract.taps, 3, self.contract.rows, self.contract.cols), dtype=np.float32)
         for _ in range(WARM_UP_RUNS):
             self.run(window)
+
+    @property
+    def deviation(self) -> NDArray[np.float32] | None:
+        """Standard deviation of each pixel of the last run's pattern, in its unit, or None where the model has none.
+
+        (H, W) float32 above zero: the session's own array, read-only, and overwritten by the next run.
+        """
+        return self._deviation
 
     def run(self, window: NDArray[np.float32]) -> NDArray[np.float32]:
         """Infer the pattern of one window.
@@ -75,7 +84,7 @@ class ModelSession:
 
         Raises:
             WindowError: wrong shape or type, or not finite.
-            ModelError: the model gave a pattern that is not finite.
+            ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
         """
         expected = (self.contract.taps, 3, self.contract.rows, self.contract.cols)
         if window.shape != expected or window.dtype != np.float32:
@@ -84,9 +93,17 @@ class ModelSession:
             raise WindowError("window has values that are not finite")
         self._input[...] = window.reshape(self._input.shape)
         self._session.run_with_iobinding(self._binding)
-        if not np.isfinite(self._output).all():
+        if not np.isfinite(self._pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
+        deviation = self._deviation
+        # Not a number is neither above nor below anything, so it fails here too.
+        if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
+            raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
         return self._pattern
+
+    @staticmethod
+    def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
+        bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
 
 
 def _load(path: Path) -> onnxruntime.InferenceSession:
@@ -113,8 +130,8 @@ def _load(path: Path) -> onnxruntime.InferenceSession:
         raise ModelError(f"{path}: not a model that onnxruntime can load: {error}") from error
 
 
-def _check_tensor(role: str, tensors: Sequence[Any], name: str, shape: tuple[int, ...]) -> None:
+def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int, ...]]) -> None:
     got = ", ".join(f"{tensor.name} {tensor.type} {list(tensor.shape)}" for tensor in tensors)
-    expected = f"{name} tensor(float) {list(shape)}"
+    expected = ", ".join(f"{name} tensor(float) {list(shape)}" for name, shape in shapes.items())
     if got != expected:
         raise ModelError(f"graph {role} is {got}, but its contract says {expected}")

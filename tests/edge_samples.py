@@ -8,12 +8,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from edge.contract import INPUT_NAME, OUTPUT_NAME, Contract
+from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.scan import ABSENT, Scan
 
 ROOT = Path(__file__).parent.parent
 PERIOD_NS = 10_000_000
+TINY_DOUBT = 0.01
 REST = (
     np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None] + np.arange(16, dtype=np.int32).reshape(4, 4) * 37
 )
@@ -22,7 +23,7 @@ BASELINE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file
 
 def make_contract(**changes) -> Contract:
     values = {
-        "version": 1,
+        "version": 2,
         "taps": 4,
         "scale": 10,
         "tap_order": "newest first",
@@ -35,6 +36,7 @@ def make_contract(**changes) -> Contract:
         "rows": 4,
         "cols": 4,
         "pitch_mm": 4.7,
+        "interval_factor": None,
         "training_sha256": "ab" * 32,
         "test_set_sha256": "cd" * 32,
         "test_error": {"1": {"psnr_db": 30.1}, "4": {"psnr_db": 33.2, "rmse_percent": 2.1}},
@@ -49,27 +51,44 @@ def write_model(
     metadata: dict[str, str] | None = None,
     input_name: str = INPUT_NAME,
     output_name: str = OUTPUT_NAME,
+    with_deviation: bool | None = None,
+    doubt: float = TINY_DOUBT,
     input_shape: list | None = None,
     element_type: int = TensorProto.FLOAT,
     gain: float = 1.0,
 ) -> Path:
-    """A real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap."""
+    """A real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
+
+    The deviation, there if the contract has a factor for it unless asked otherwise, is `tiny_deviation`.
+    """
     contract = contract or make_contract()
+    with_deviation = contract.interval_factor is not None if with_deviation is None else with_deviation
     taps, scale = contract.taps, contract.scale
     weights = np.zeros((3 * taps, 1, scale, scale), dtype=np.float32)
     for tap in range(taps):
         weights[3 * tap + 2] = gain * 10.0**-tap
-    height, width = contract.pattern_shape
+    shape = [(input_shape or [1])[0], *contract.pattern_shape]
+    doubts = [
+        helper.make_node("Abs", [output_name], ["size"]),
+        helper.make_node("Mul", ["size", "doubt"], ["doubted"]),
+        helper.make_node("Add", ["doubted", "doubt"], [DEVIATION_NAME]),
+    ]
+    output_names = [output_name, DEVIATION_NAME] if with_deviation else [output_name]
     graph = helper.make_graph(
         [
             helper.make_node("Cast", [input_name], ["floats"], to=TensorProto.FLOAT),
             helper.make_node("ConvTranspose", ["floats", "weights"], ["squares"], strides=[scale, scale]),
             helper.make_node("Squeeze", ["squares", "axis"], [output_name]),
+            *(doubts if with_deviation else []),
         ],
         "tiny",
         [helper.make_tensor_value_info(input_name, element_type, input_shape or list(contract.window_shape))],
-        [helper.make_tensor_value_info(output_name, TensorProto.FLOAT, [(input_shape or [1])[0], height, width])],
-        [numpy_helper.from_array(weights, "weights"), numpy_helper.from_array(np.array([1]), "axis")],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in output_names],
+        [
+            numpy_helper.from_array(weights, "weights"),
+            numpy_helper.from_array(np.array([1]), "axis"),
+            numpy_helper.from_array(np.array(doubt, dtype=np.float32), "doubt"),
+        ],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
     helper.set_model_props(model, contract.to_metadata() if metadata is None else metadata)
@@ -81,6 +100,11 @@ def tiny_pattern(window_units: np.ndarray, scale: int = 10) -> np.ndarray:
     """What the tiny model makes of a window (taps, 3, rows, cols) in network units."""
     z = sum(window_units[tap, 2] * 10.0**-tap for tap in range(len(window_units)))
     return np.kron(z, np.ones((scale, scale)))
+
+
+def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
+    """What the tiny model says of its pattern's deviation."""
+    return TINY_DOUBT * (1 + np.abs(pattern))
 
 
 def make_scan(
@@ -115,12 +139,16 @@ class FakeModel:
         self.name = "fake"
         self.contract = contract or make_contract()
         self.windows: list[np.ndarray] = []
+        self.deviation: np.ndarray | None = None
         self._on_run = on_run
 
     def run(self, window: np.ndarray) -> np.ndarray:
         self._on_run()
         self.windows.append(window.copy())
-        return tiny_pattern(window).astype(np.float32)
+        pattern = tiny_pattern(window).astype(np.float32)
+        if self.contract.interval_factor is not None:
+            self.deviation = tiny_deviation(pattern)
+        return pattern
 
 
 class FakeLink:

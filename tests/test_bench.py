@@ -19,12 +19,15 @@ def rows():
 
 
 def test_each_method_has_its_rows_and_a_model_one_for_few_and_one_for_all_taps(rows):
-    assert [(row.method, row.given) for row in rows] == [("bilinear", 1), ("linear map", 1), ("mtsr2", 1), ("mtsr2", 2)]
+    assert [(row.method, row.given) for row in rows] == [
+        *(("bilinear", 1), ("linear map", 1), ("bicubic", 1)),
+        *(("mtsr2", 1), ("mtsr2", 2)),
+    ]
 
 
 def test_the_error_is_that_of_the_contract(rows):
     contract = ModelSession(find_model("mtsr2")).contract
-    for row in rows[2:]:
+    for row in rows[3:]:
         assert row.error == pytest.approx(contract.test_error[str(row.given)], rel=1e-3, abs=2e-4)
 
 
@@ -36,12 +39,20 @@ def test_a_row_becomes_a_line_with_a_cell_for_each_column(rows):
     assert f"| {rows[0].error['psnr_db']:.2f} |" in table_line(rows[0])
 
 
+def test_how_many_pixels_an_interval_holds_is_told_where_there_is_one(rows):
+    column = [cell.strip() for cell in header(100, 20).splitlines()[-2].split("|")].index("covered %")
+    cells = [table_line(row).split("|")[column].strip() for row in rows]
+    expected = [f"{100 * row.error['coverage_90']:.1f}" if "coverage_90" in row.error else "-" for row in rows]
+    assert cells == expected
+    assert {row.method for row in rows if "coverage_90" not in row.error}.isdisjoint({"mtsr2"})
+
+
 def test_the_second_table_names_every_surface(rows):
     lines = surface_table(rows).splitlines()
     assert len(lines) == 2 + 18
-    assert f"| {rows[2].psnr_db_by_surface['S']:.1f} |" in next(line for line in lines if line.startswith("| S |"))
-    mean_db = np.mean(list(rows[2].psnr_db_by_surface.values()))
-    assert mean_db == pytest.approx(rows[2].error["psnr_db"], abs=1e-3)
+    assert f"| {rows[3].psnr_db_by_surface['S']:.1f} |" in next(line for line in lines if line.startswith("| S |"))
+    mean_db = np.mean(list(rows[3].psnr_db_by_surface.values()))
+    assert mean_db == pytest.approx(rows[3].error["psnr_db"], abs=1e-3)
 
 
 def test_pace_runs_once_a_tick_and_counts_what_came_late():

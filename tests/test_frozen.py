@@ -17,6 +17,7 @@ def small():
         indentation_mm=np.linspace(0.1, 0.6, 6).astype(np.float32),
         force_n=np.linspace(1, 6, 6).astype(np.float32),
         unit_patterns=np.stack([np.eye(40), np.full((40, 40), 0.5)]).astype(np.float16),
+        touched=np.stack([np.eye(40) > 0, np.zeros((40, 40), dtype=bool)]),
         surface=np.array(["C", "F"]),
         angle_deg=np.array([0, 30], dtype=np.float32),
         full_scale_mm=0.5,

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from edge.metrics import contact_iou, psnr_db, rmse_percent, ssim, ssim_global, touched
+from edge.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global, touched
 
 
 def maps(seed, shape=(40, 40)):
@@ -98,3 +98,25 @@ def test_iou_counts_overlap_over_union():
     assert contact_iou(np.zeros((2, 2)), np.ones((2, 2), dtype=bool), 0.5) == 0
     with pytest.raises(ValueError, match="expected equal"):
         contact_iou(pattern, np.zeros((2, 3), dtype=bool), 0.5)
+
+
+def test_outlines_lie_as_far_apart_as_they_were_moved():
+    square = np.zeros((1, 12, 12))
+    square[0, 3:8, 2:7] = 1.0
+    moved = np.roll(square, 2, axis=2) > 0
+    # Of 16 outline pixels 5 lie 2 px from the nearest of the other on either open end, the others less.
+    assert boundary_distance_mm(square, square > 0, 0.5, 0.5) == 0
+    between = boundary_distance_mm(square, moved, 0.5, 0.5)[0]
+    assert between == boundary_distance_mm(moved.astype(float), square > 0, 0.5, 0.5)[0]
+    assert 0.3 < between < 1.0
+    line = np.zeros((1, 12, 12))
+    line[0, :, 4] = 1.0
+    assert boundary_distance_mm(line, np.roll(line, 3, axis=2) > 0, 0.5, 0.5) == pytest.approx(1.5)
+
+
+def test_no_contact_against_one_is_as_far_as_can_be():
+    nothing, all_of_it = np.zeros((1, 3, 4)), np.ones((1, 3, 4), dtype=bool)
+    assert boundary_distance_mm(nothing, all_of_it, 0.5, 2.0) == pytest.approx(10.0)
+    assert boundary_distance_mm(nothing, ~all_of_it, 0.5, 2.0) == 0
+    with pytest.raises(ValueError, match="expected equal"):
+        boundary_distance_mm(nothing, np.ones((1, 4, 4), dtype=bool), 0.5, 2.0)

@@ -2,11 +2,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan, tiny_pattern, write_model
+from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan, tiny_deviation, tiny_pattern, write_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import ModelError, UsageError, WindowError
+from edge.metrics import touched
 from edge.result import mask_bits
 from edge.runtime import HOLD_SCANS, SILENT_SCANS, Runtime, touched_patch
 from edge.session import ModelSession
@@ -38,6 +39,28 @@ def test_a_contact_gives_a_pattern_and_all_that_is_known():
     assert result.centroid_mm == pytest.approx((-2.35, -2.35))
     assert result.baseline is BASELINE and result.baseline_age_s == 60.0
     assert result.note is None
+    assert result.deviation is result.interval_mm is None, "the model gives none"
+
+
+def test_a_model_that_says_how_sure_it_is_is_heard():
+    model = FakeModel(make_contract(interval_factor=1.6))
+    runtime = make_runtime(model)
+    first = runtime.push(make_scan(0, press_counts=PRESS))
+    np.testing.assert_allclose(first.deviation, tiny_deviation(first.pattern))
+    # Where it is touched the pattern is 3, so the deviation .04, and .01 elsewhere.
+    assert first.interval_mm == pytest.approx(1.6 * 0.04)
+    kept = first.deviation.copy()
+    model.deviation += 1
+    np.testing.assert_array_equal(first.deviation, kept, "a result keeps its own deviation")
+    idle = runtime.push(make_scan(1))
+    assert idle.deviation is idle.interval_mm is None
+
+
+def test_where_nothing_is_touched_no_interval_is_told():
+    runtime = make_runtime(FakeModel(make_contract(interval_factor=1.6, counts_per_unit=(500.0, 500.0, -1000.0))))
+    result = runtime.push(make_scan(press_counts=PRESS))
+    assert result.state == "contact" and (result.pattern <= 0).all()
+    assert result.deviation is not None and result.interval_mm is result.centroid_mm is None and result.area_mm2 == 0
 
 
 def test_no_contact_no_inference():
@@ -59,8 +82,9 @@ def test_input_is_scaled_by_the_contract_newest_tap_first():
     assert not window[:, :2].any()
 
 
-def test_the_real_session_fits(tmp_path):
-    runtime = make_runtime(ModelSession(write_model(tmp_path / "tiny.onnx")))
+@pytest.mark.parametrize("factor", [None, 1.6])
+def test_the_real_session_fits(tmp_path, factor):
+    runtime = make_runtime(ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(interval_factor=factor))))
     first = runtime.push(make_scan(0, press_counts=2000))
     second = runtime.push(make_scan(1, press_counts=4000))
     assert first.pattern is not None and second.pattern is not None
@@ -69,6 +93,11 @@ def test_the_real_session_fits(tmp_path):
     window = np.zeros((4, 3, 4, 4))
     window[0, 2, 1, 1] = 4
     np.testing.assert_allclose(second.pattern, tiny_pattern(window), atol=1e-6)
+    assert (first.interval_mm, second.interval_mm) == pytest.approx(
+        (1.6 * 0.03, 1.6 * 0.05) if factor else (None, None)
+    )
+    if factor:
+        np.testing.assert_allclose(first.deviation, tiny_deviation(first.pattern), atol=1e-6)
 
 
 def test_a_scan_overtaken_spares_the_inference_but_feeds_the_tap():
@@ -217,7 +246,7 @@ def test_masks_have_bit_i_for_taxel_i():
 def test_patch_of_one_pixel_sits_on_it():
     pattern = np.zeros((40, 40), dtype=np.float32)
     pattern[39, 0] = 2
-    area_mm2, centroid_mm = touched_patch(pattern, 0.5, 0.47)
+    area_mm2, centroid_mm = touched_patch(pattern, touched(pattern, 0.5), 0.47)
     assert area_mm2 == pytest.approx(0.47**2)
     assert centroid_mm == pytest.approx((-19.5 * 0.47, 19.5 * 0.47))
 
@@ -225,14 +254,15 @@ def test_patch_of_one_pixel_sits_on_it():
 def test_patch_is_weighted_and_leaves_out_what_is_below_the_level():
     pattern = np.zeros((3, 5), dtype=np.float32)
     pattern[1] = [0.49, 0.5, 0, 1.0, 0]
-    area_mm2, centroid_mm = touched_patch(pattern, 0.5, 2.0)
+    area_mm2, centroid_mm = touched_patch(pattern, touched(pattern, 0.5), 2.0)
     assert area_mm2 == 2 * 4
     assert centroid_mm == pytest.approx(((1 * 0.5 + 3 * 1.0) / 1.5 * 2 - 4, 0.0))
 
 
 @pytest.mark.parametrize("pattern", [np.zeros((4, 4)), np.full((4, 4), -1.0)])
 def test_patch_of_nothing_is_nothing(pattern):
-    assert touched_patch(pattern.astype(np.float32), 0.5, 1.0) == (0.0, None)
+    pattern = pattern.astype(np.float32)
+    assert touched_patch(pattern, touched(pattern, 0.5), 1.0) == (0.0, None)
 
 
 @settings(max_examples=50, deadline=None)

@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from edge_samples import make_contract, tiny_pattern, write_model
+from edge_samples import make_contract, tiny_deviation, tiny_pattern, write_model
 from onnx import TensorProto
 
 from edge.contract import KEY_PREFIX, Contract
@@ -50,6 +50,45 @@ def test_non_contiguous_windows_are_right(session):
     np.testing.assert_array_equal(session.run(window).copy(), session.run(strided))
 
 
+@pytest.fixture(scope="module")
+def sure_session(tmp_path_factory):
+    """Of a model that says how sure it is."""
+    return ModelSession(write_model(tmp_path_factory.mktemp("sure") / "sure.onnx", make_contract(interval_factor=1.6)))
+
+
+def test_the_deviation_is_that_of_the_last_run(sure_session):
+    for seed in (1, 2):
+        window = random_window(seed)
+        pattern = sure_session.run(window)
+        np.testing.assert_allclose(pattern, tiny_pattern(window), atol=1e-6)
+        deviation = sure_session.deviation
+        assert deviation.shape == (40, 40) and deviation.dtype == np.float32
+        np.testing.assert_allclose(deviation, tiny_deviation(tiny_pattern(window)), atol=1e-6)
+    assert deviation is sure_session.deviation
+    with pytest.raises(ValueError, match="read-only"):
+        deviation[0, 0] = 1
+
+
+def test_a_model_without_deviation_has_none(session):
+    session.run(random_window())
+    assert session.deviation is None
+
+
+@pytest.mark.parametrize("doubt", [0.0, -0.01, np.nan, np.inf])
+def test_a_deviation_that_is_not_finite_and_above_zero_is_never_given_out(tmp_path, doubt):
+    path = write_model(tmp_path / "odd.onnx", make_contract(interval_factor=1.6), doubt=doubt)
+    with pytest.raises(ModelError, match="'odd' gave a deviation that is not finite and above zero"):
+        ModelSession(path)
+
+
+def test_one_bad_pixel_of_the_deviation_is_enough(tmp_path):
+    path = write_model(tmp_path / "far.onnx", make_contract(interval_factor=1.6), doubt=10.0)
+    session, window = ModelSession(path), np.zeros((4, 3, 4, 4), dtype=np.float32)
+    window[0, 2, 1, 1] = 1e38
+    with pytest.raises(ModelError, match="'far' gave a deviation that"):
+        session.run(window)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_window_that_is_not_finite_is_refused(session, bad):
     window = random_window()
@@ -85,7 +124,7 @@ def test_denormals_become_zero(session):
 
 
 BROKEN_VALUES = {
-    "version": 2,
+    "version": 1,
     "taps": 0,
     "scale": "10",
     "tap_order": "oldest first",
@@ -98,6 +137,7 @@ BROKEN_VALUES = {
     "rows": 4.0,
     "cols": -4,
     "pitch_mm": 0,
+    "interval_factor": 0,
     "training_sha256": None,
     "test_set_sha256": "",
     "test_error": [],
@@ -121,11 +161,26 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
         ModelSession(path)
 
 
+def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
+    metadata = make_contract(version=1).to_metadata()
+    del metadata[KEY_PREFIX + "interval_factor"]
+    with pytest.raises(ModelError, match=r"'version' is 1, expected 2: export the model again"):
+        ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
+
+
 @pytest.mark.parametrize(
     ("graph", "message"),
     [
         ({"input_name": "input"}, r"graph input is input tensor\(float\) \[1, 12, 4, 4\], .* window tensor"),
         ({"output_name": "out"}, r"graph output is out tensor\(float\) \[1, 40, 40\], .* pattern tensor"),
+        (
+            {"with_deviation": True},
+            r"output is pattern .*, deviation tensor\(float\) \[1, 40, 40\], but .* says pattern [^,]*, 40, 40\]$",
+        ),
+        (
+            {"with_deviation": False, "contract": make_contract(interval_factor=1.6)},
+            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract says pattern .*, deviation tensor",
+        ),
         ({"element_type": TensorProto.DOUBLE}, r"graph input is window tensor\(double\)"),
         ({"input_shape": ["n", 12, 4, 4]}, r"graph input is window tensor\(float\) \['n', 12, 4, 4\]"),
         ({"input_shape": [2, 12, 4, 4]}, r"graph input is window tensor\(float\) \[2, 12, 4, 4\]"),

@@ -43,6 +43,12 @@ def make_results(count=6, runtime=None, **settings):
     return results
 
 
+def make_sure_results(count=6, **settings):
+    """The same of a model that gives deviations."""
+    settings = {"source": "emulated", "baselines": {"4": BASELINE}} | settings
+    return make_results(count, Runtime(FakeModel(make_contract(interval_factor=1.6)), **settings))
+
+
 class TestJsonLines:
     def test_a_record_says_all_of_a_contact(self):
         ticks = iter([0, 123_456])
@@ -61,6 +67,7 @@ class TestJsonLines:
         np.testing.assert_allclose(pattern, result.pattern, rtol=1e-5)
         assert record.pop("counts") == result.scan.counts.tolist()
         assert record.pop("centroid_mm") == pytest.approx([-2.35, -2.35])
+        assert record.pop("deviation") is None
         assert record == {
             "time_ns": 8 * PERIOD_NS,
             "sensor": "4",
@@ -74,6 +81,7 @@ class TestJsonLines:
             "force_counts": 3000.0,
             "force_n": 2.5,
             "area_mm2": 22.09,
+            "interval_mm": None,
             "run_time_us": 123.5,
             "baseline": BASELINE.id,
             "baseline_origin": "file",
@@ -87,12 +95,23 @@ class TestJsonLines:
     def test_absent_is_null(self):
         runtime = Runtime(FakeModel(), source="device")
         record = json.loads(record_line(runtime.push(make_scan(absent=(2,))), {}))
-        for name in ("contact", "force_counts", "force_n", "area_mm2", "centroid_mm", "run_time_us", "pattern"):
+        absent = "contact force_counts force_n area_mm2 centroid_mm interval_mm run_time_us pattern deviation"
+        for name in absent.split():
             assert record[name] is None
         assert record["baseline"] is record["baseline_age_s"] is record["baseline_origin"] is None
         assert record["state"] == "zeroing" and record["fresh"] == 0xFFFF - 4
         assert [axis[0][2] for axis in record["counts"]] == [None] * 3
         assert ABSENT not in np.array(record["counts"]).ravel().tolist()
+
+    def test_a_deviation_stands_beside_its_pattern_in_the_same_digits(self):
+        result = make_sure_results(3)[4]
+        record = json.loads(record_line(result, {}))
+        for name in ("pattern", "deviation"):
+            expected = [[float(f"{value:.5g}") for value in row] for row in getattr(result, name).tolist()]
+            assert record[name] == expected
+        assert record["pattern"] != record["deviation"]
+        assert record["interval_mm"] == pytest.approx(1.6 * 0.04, abs=1e-3)
+        assert record["interval_mm"] == round(result.interval_mm, 5)
 
     @settings(max_examples=50, deadline=None)
     @given(st.lists(st.floats(-(2.0**99), 2.0**99, width=32, allow_subnormal=False), min_size=4, max_size=4))
@@ -140,8 +159,8 @@ class TestJsonLines:
 
 
 class TestNpz:
-    def record(self, path, results):
-        sink = NpzSink(path, *SHAPES)
+    def record(self, path, results, **settings):
+        sink = NpzSink(path, *SHAPES, **settings)
         for result in results:
             sink.write(result, {})
         sink.close()
@@ -164,6 +183,7 @@ class TestNpz:
         data = dict(np.load(tmp_path / "out.npz"))
         assert str(data.pop("format")) == "tactile-recording" and int(data.pop("version")) == 1
         assert {len(column) for column in data.values()} == {len(results)}
+        assert np.isnan(data["interval_mm"]).all() and "deviation" not in data
         for i, result in enumerate(results):
             row = {name: column[i] for name, column in data.items()}
             assert row["scan"] == result.scan.number and row["sensor"] == result.scan.sensor
@@ -179,6 +199,18 @@ class TestNpz:
             counts = np.nan if result.baseline is None else result.baseline.counts
             np.testing.assert_array_equal(row["baseline_counts"], counts)
         assert {"contact", "idle", "zeroing"} <= set(data["state"].tolist())
+
+    def test_deviations_are_kept_where_the_model_gives_them(self, tmp_path):
+        results = make_sure_results()
+        self.record(tmp_path / "out.npz", results, deviations=True)
+        data = np.load(tmp_path / "out.npz")
+        assert data["deviation"].shape == data["pattern"].shape
+        for i, result in enumerate(results):
+            np.testing.assert_array_equal(data["deviation"][i], 0 if result.pattern is None else result.deviation)
+            interval_mm = np.nan if result.interval_mm is None else np.float32(result.interval_mm)
+            np.testing.assert_array_equal(data["interval_mm"][i], interval_mm)
+        assert 0 < np.isfinite(data["interval_mm"]).sum() == data["has_pattern"].sum() < len(results)
+        assert len(load_recording(tmp_path / "out.npz").tracks) == 2
 
     def test_nothing_is_at_the_target_before_the_end_and_an_old_one_is_replaced(self, tmp_path):
         path = tmp_path / "out.npz"
@@ -322,6 +354,13 @@ class TestStatus:
         sink.write(runtime.push(make_scan(0, press_counts=3000)), {})
         assert sink.line().startswith("4 contact tap 1 3.00 N 22 mm2 ")
 
+    def test_a_model_that_gives_deviations_says_how_far_off_it_may_be(self):
+        sink = self.make()
+        ticks = iter(range(0, 10**9, 250_000))
+        for result in make_sure_results(4, clock_ns=lambda: next(ticks)):
+            sink.write(result, {})
+        assert " counts 22 mm2 +-0.064 mm 250 us 100 Hz" in sink.line() and sink.line().isascii()
+
     def test_a_note_while_zeroing_is_shown(self):
         sink = self.make()
         runtime = Runtime(FakeModel(), source="replay", baselines={"9": BASELINE})
@@ -415,7 +454,11 @@ def test_forms_open_their_sinks(tmp_path):
 def test_the_npz_sink_gets_the_shapes_of_the_contract(tmp_path):
     sink = open_sink(f"npz:{tmp_path}/a.npz", make_contract(scale=2))
     layout = json.loads((parts_dir(tmp_path / "a.npz") / npz.LAYOUT).read_text())
-    assert layout["pattern"][1] == [8, 8] and layout["counts"][1] == [3, 4, 4]
+    assert layout["pattern"][1] == [8, 8] and layout["counts"][1] == [3, 4, 4] and "deviation" not in layout
+    sink.close()
+    sink = open_sink(f"npz:{tmp_path}/b.npz", make_contract(scale=2, interval_factor=1.6))
+    layout = json.loads((parts_dir(tmp_path / "b.npz") / npz.LAYOUT).read_text())
+    assert layout["deviation"] == layout["pattern"]
     sink.close()
 
 

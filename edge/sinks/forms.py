@@ -14,7 +14,7 @@ FORMS: Final = ("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz")
 
 
 def open_sink(text: str, contract: Contract) -> Sink:
-    """Open the sink that `text` names; `contract` says the shapes that will come.
+    """Open the sink that `text` names; `contract` says which maps will come, and their shapes.
 
     Raises:
         UsageError: no such form; the forms are listed.
@@ -26,5 +26,6 @@ def open_sink(text: str, contract: Contract) -> Sink:
     if form == "jsonl" and target:
         return JsonLinesSink(target)
     if form == "npz" and target.endswith(".npz"):
-        return NpzSink(Path(target), (3, contract.rows, contract.cols), contract.pattern_shape)
+        scan_shape, deviations = (3, contract.rows, contract.cols), contract.interval_factor is not None
+        return NpzSink(Path(target), scan_shape, contract.pattern_shape, deviations=deviations)
     raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")

@@ -68,6 +68,7 @@ def record_line(result: Result, counters: Mapping[str, int]) -> str:
         "force_n": _rounded(result.force_n, 4),
         "area_mm2": _rounded(result.area_mm2, 3),
         "centroid_mm": None if result.centroid_mm is None else [round(value, 4) for value in result.centroid_mm],
+        "interval_mm": _rounded(result.interval_mm, 5),
         "run_time_us": _rounded(result.run_time_us, 1),
         "baseline": None if baseline is None else baseline.id,
         "baseline_origin": None if baseline is None else baseline.origin,
@@ -78,7 +79,8 @@ def record_line(result: Result, counters: Mapping[str, int]) -> str:
         "counts": _readings(scan),
         "pattern_unit": result.pattern_unit,
     }
-    return f'{json.dumps(record, allow_nan=False)[:-1]}, "pattern": {_pattern_text(result.pattern)}}}\n'
+    maps = f'"pattern": {_map_text(result.pattern)}, "deviation": {_map_text(result.deviation)}'
+    return f"{json.dumps(record, allow_nan=False)[:-1]}, {maps}}}\n"
 
 
 def _readings(scan: Scan) -> list[list[list[int | None]]]:
@@ -91,13 +93,13 @@ def _rounded(value: float | None, decimals: int) -> float | None:
     return None if value is None else round(value, decimals)
 
 
-def _pattern_text(pattern: NDArray[np.float32] | None) -> str:
+def _map_text(values: NDArray[np.float32] | None) -> str:
     """Nested lists with five significant digits; two and a half times as fast as json.dumps."""
-    if pattern is None:
+    if values is None:
         return "null"
-    height, width = pattern.shape
+    height, width = values.shape
     row = "[" + ", ".join(["%.5g"] * width) + "]"
-    return ("[" + ", ".join([row] * height) + "]") % tuple(pattern.ravel().tolist())
+    return ("[" + ", ".join([row] * height) + "]") % tuple(values.ravel().tolist())
 
 
 def _open(target: str) -> BufferedWriter:

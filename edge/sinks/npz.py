@@ -33,17 +33,21 @@ class NpzSink(Sink):
 
     Arrays, one row a scan: sensor, scan, time_ns, counts (3, rows, cols; -1 absent), source, state,
     contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros
-    where there is none), run_time_us (NaN where there is none), baseline (its id, or empty),
-    baseline_age_s (NaN without) and baseline_counts (3, rows, cols; NaN without).
+    where there is none), deviation (the same, only if the model gives it), interval_mm and
+    run_time_us (NaN where there is none), baseline (its id, or empty), baseline_age_s (NaN without)
+    and baseline_counts (3, rows, cols; NaN without).
     """
 
-    def __init__(self, path: Path, scan_shape: tuple[int, ...], pattern_shape: tuple[int, ...]) -> None:
+    def __init__(
+        self, path: Path, scan_shape: tuple[int, ...], pattern_shape: tuple[int, ...], *, deviations: bool = False
+    ) -> None:
         """Start the parts.
 
         Args:
             path: of the .npz; one that exists is replaced at the end.
             scan_shape: (3, rows, cols).
             pattern_shape: (H, W).
+            deviations: patterns come with deviations.
 
         Raises:
             SinkError: they cannot be written, or lie there from a run that did not end.
@@ -65,6 +69,8 @@ class NpzSink(Sink):
             "force_counts": ("<f4", ()),
             "has_pattern": ("|b1", ()),
             "pattern": ("<f4", pattern_shape),
+            **({"deviation": ("<f4", pattern_shape)} if deviations else {}),
+            "interval_mm": ("<f4", ()),
             "run_time_us": ("<f4", ()),
             "baseline": ("<U16", ()),
             "baseline_age_s": ("<f4", ()),
@@ -99,6 +105,8 @@ class NpzSink(Sink):
             "force_counts": np.nan if result.force_counts is None else result.force_counts,
             "has_pattern": pattern is not None,
             "pattern": self._no_pattern if pattern is None else pattern,
+            "deviation": self._no_pattern if result.deviation is None else result.deviation,
+            "interval_mm": np.nan if result.interval_mm is None else result.interval_mm,
             "run_time_us": np.nan if result.run_time_us is None else result.run_time_us,
             "baseline": "" if baseline is None else baseline.id,
             "baseline_age_s": np.nan if result.baseline_age_s is None else result.baseline_age_s,
@@ -106,8 +114,8 @@ class NpzSink(Sink):
         }
         self._scans += 1
         try:
-            for name, value in row.items():
-                self._files[name].write(_row_bytes(name, value, *self._layout[name]))
+            for name, (kind, shape) in self._layout.items():
+                self._files[name].write(_row_bytes(name, row[name], kind, shape))
             if self._scans % FLUSH_SCANS == 0:
                 self._flush()
         except OSError as error:

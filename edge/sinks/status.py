@@ -100,6 +100,8 @@ class StatusSink(Sink):
             words.append(f"{result.force_counts:.0f} counts")
         if result.area_mm2 is not None:
             words.append(f"{result.area_mm2:.0f} mm2")
+        if result.interval_mm is not None:
+            words.append(f"+-{result.interval_mm:.3f} mm")
         if result.run_time_us is not None:
             words.append(f"{result.run_time_us:.0f} us")
         rate_hz = self._rates[name].rate_hz

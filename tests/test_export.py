@@ -1,0 +1,189 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import numpy_helper
+from test_dataset import make_sequences
+
+from edge.contract import CONTRACT_VERSION
+from edge.frozen import FrozenSet
+from edge.judge import judge, judge_model, mean_error
+from edge.session import ModelSession
+from export import to_onnx
+from export.errors import ParityError
+from export.to_onnx import check_parity, export, main, parity_windows
+from train.calibration import half_width_mm, interval_coverage
+from train.errors import CheckpointError
+from train.freeze import freeze
+from train.loop import Recipe
+from train.networks.registry import build
+from train.nuisances import Nuisances
+from train.training import Training, fit_network, infer, load_network
+
+COMPACT = Training(
+    "sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options={"channels": 8, "blocks": 1}
+)
+
+
+def frozen_at(scale: int) -> FrozenSet:
+    """Six presses of four taps, not those of the training."""
+    return freeze(make_sequences(seed=1), Nuisances.none(), seed=1, scale=scale)
+
+
+def at_frames(frozen: FrozenSet, frames) -> FrozenSet:
+    """Some of its frames."""
+    names = ("newest", "tap", "indentation_mm", "force_n")
+    return replace(frozen, **{name: getattr(frozen, name)[frames] for name in names})
+
+
+@pytest.fixture(scope="module")
+def frozen():
+    return frozen_at(10)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A compact network at the test set's scale, as training leaves it, and what was exported of it."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    fit_network(COMPACT, make_sequences(taps=2), frozen_at(10), folder)
+    export(folder / "sure.pt", folder, frozen_at(10))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def session(folder):
+    return ModelSession(folder / "sure.onnx")
+
+
+def save_untrained(path, name, scale, **options):
+    """A checkpoint of first weights, which is enough to be exported."""
+    torch.manual_seed(0)
+    net = build(name, scale, **options)
+    torch.save(net.state_dict(), path)
+    report = {"network": name, "scale": scale, "options": options, "contact_level": 0.5, "training_sha256": "ab" * 32}
+    path.with_suffix(".json").write_text(json.dumps(report))
+    return path
+
+
+def test_an_exported_network_keeps_its_contract(folder, session, frozen):
+    contract, report = session.contract, json.loads((folder / "sure.json").read_text())
+    assert (contract.version, contract.taps, contract.scale, contract.sensor) == (CONTRACT_VERSION, 2, 10, "uSPa44")
+    assert (contract.counts_per_unit, contract.angle_step_deg) == ((500.0, 500.0, 1000.0), 5.0)
+    assert contract.training_sha256 == report["training_sha256"] == COMPACT.sha256(report["data_sha256"])
+    assert contract.contact_level == report["contact_level"]
+    assert contract.test_set_sha256 == frozen.sha256() and contract.output_full_scale == frozen.full_scale_mm
+
+
+def test_the_runtime_computes_what_was_trained_both_outputs(folder, session, frozen):
+    net, _ = load_network(folder / "sure.pt")
+    windows = frozen.windows(2)
+    patterns, deviations = infer(net, windows)
+    assert deviations is not None and net.deviation_scale != 1
+    for window, pattern, deviation in list(zip(windows, patterns, deviations, strict=True))[::10]:
+        np.testing.assert_allclose(session.run(session.contract.scale_window(window)), pattern, atol=1e-6)
+        np.testing.assert_allclose(session.deviation, deviation, rtol=1e-5)
+
+
+def test_the_contract_tells_error_and_coverage_for_every_number_of_taps(folder, session, frozen):
+    told = session.contract.test_error
+    net, _ = load_network(folder / "sure.pt")
+    for given in (1, 2):
+        patterns, deviations = infer(net, frozen.windows(2, given))
+        measured = judge(patterns, frozen, session.contract.contact_level, half_width_mm(deviations))
+        assert told[str(given)] == pytest.approx(mean_error(measured), abs=2e-4)
+        covered = interval_coverage(frozen.patterns(), patterns, deviations)
+        assert told[str(given)]["coverage_90"] == pytest.approx(covered, abs=2e-4)
+    assert set(told) == {"1", "2"} and told["1"] != told["2"]
+    assert 0 < told["2"]["coverage_90"] < 1
+
+
+def test_deviations_are_judged_in_the_same_runs_as_patterns(session, frozen):
+    class Counted:
+        name, contract, runs = session.name, session.contract, 0
+
+        def run(self, window):
+            self.runs += 1
+            return session.run(window)
+
+        deviation = property(lambda self: session.deviation)
+
+    counted = Counted()
+    errors = judge_model(counted, frozen)
+    assert counted.runs == len(frozen) == len(errors["coverage_90"])
+    assert len(set(errors["coverage_90"].tolist())) > 1, "every frame has its own deviations"
+
+
+def test_exporting_again_gives_the_same_bytes_without_traces_of_the_machine(folder, frozen, tmp_path):
+    line = export(folder / "sure.pt", tmp_path, frozen)
+    assert [path.name for path in tmp_path.iterdir()] == ["sure.onnx"]
+    assert line.startswith("sure.onnx: 0.") and "dB" in line and "interval covers" in line
+    content = (tmp_path / "sure.onnx").read_bytes()
+    assert content == (folder / "sure.onnx").read_bytes()
+    assert b".py" not in content and b"/tmp" not in content
+    assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
+
+
+def test_a_seed_size_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path):
+    path = save_untrained(tmp_path / "peer.pt", "stsr", 4)
+    line = export(path, tmp_path, at_frames(frozen, slice(0, 96, 30)))
+    assert "x4, not judged, the test set is of x10, parity" in line
+    session = ModelSession(tmp_path / "peer.onnx")
+    assert session.contract.pattern_shape == (16, 16) and session.contract.interval_factor is None
+    assert session.contract.test_error == {}
+    window = session.contract.scale_window(frozen.windows(1)[40])
+    with torch.inference_mode():
+        expected = load_network(path)[0](torch.from_numpy(window).reshape(1, 3, 4, 4))[0]
+    assert expected.max() > 0
+    np.testing.assert_allclose(session.run(window), expected, rtol=1e-4, atol=1e-6)
+    assert session.deviation is None
+
+
+@pytest.mark.parametrize("head", ["leave", "doubt"])
+def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp_path, monkeypatch, head):
+    model = onnx.load(folder / "sure.onnx")
+    for weight in model.graph.initializer:
+        if weight.name.startswith(head) and weight.name.endswith(".bias"):
+            weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * 1.001, weight.name))
+    monkeypatch.setattr(to_onnx, "to_model", lambda net, geometry: model)
+    with pytest.raises(ParityError, match=f"differ by .* in the {'pattern' if head == 'leave' else 'deviation'}"):
+        export(folder / "sure.pt", tmp_path, frozen)
+    assert not list(tmp_path.iterdir())
+
+
+def test_parity_is_checked_on_readings_of_every_force_and_on_extremes(folder, session, frozen):
+    windows = parity_windows(frozen, session.contract)
+    assert windows.shape[1:] == (2, 3, 4, 4) and windows.dtype == np.float32
+    assert (windows.max(axis=(1, 2, 3, 4)) == 0).any() and windows.max() == 1e4
+    many = at_frames(frozen, np.tile(np.arange(len(frozen)), 20))
+    taken = len(parity_windows(many, session.contract))
+    assert 50 < taken < 250 < len(many)
+    net, _ = load_network(folder / "sure.pt")
+    assert check_parity(net, session, windows) < 5e-6
+
+
+def test_what_is_no_checkpoint_is_refused(folder, frozen, tmp_path):
+    with pytest.raises(CheckpointError, match="No such file"):
+        export(tmp_path / "none.pt", tmp_path, frozen)
+    report = json.loads((folder / "sure.json").read_text())
+    del report["contact_level"]
+    (tmp_path / "old.pt").write_bytes((folder / "sure.pt").read_bytes())
+    (tmp_path / "old.json").write_text(json.dumps(report))
+    with pytest.raises(CheckpointError, match=r"no 'contact_level'"):
+        export(tmp_path / "old.pt", tmp_path, frozen)
+    assert not list(tmp_path.glob("*.onnx"))
+
+
+def test_the_command_ends_in_one_line(frozen, tmp_path, monkeypatch):
+    frozen.save(tmp_path / "frozen.npz")
+    monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
+    with pytest.raises(SystemExit, match=r"^export: .*none\.pt"):
+        main([str(tmp_path / "none.pt"), "--out", str(tmp_path)])
+
+
+def test_the_command_is_as_written(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--help"])
+    assert end.value.code == 0 and "python -m export.to_onnx" in capsys.readouterr().out
