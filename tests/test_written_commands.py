@@ -21,7 +21,8 @@ def test_they_were_found():
 
 @pytest.mark.parametrize(("source", "module"), sorted(WRITTEN))
 def test_a_module_has_its_command_line_and_help(source, module, capsys):
+    package = hasattr(importlib.import_module(module), "__path__")
     with pytest.raises(SystemExit) as left:
-        importlib.import_module(module).main(["--help"])
+        importlib.import_module(f"{module}.__main__" if package else module).main(["--help"])
     assert left.value.code == 0
     assert f"python -m {module}" in capsys.readouterr().out

@@ -1,0 +1,62 @@
+"""Run experiments: each writes NAME.md, NAME.csv and NAME.png.
+
+python -m train.experiments table3 angle --reports reports
+"""
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+from typing import Final
+
+from train.errors import TrainError
+from train.experiments.workbench import Workbench
+
+EXPERIMENTS: Final = {
+    "table3": "all methods at x10 on the same targets",
+    "table4": "STSR at five scales",
+    "angle": "MTSR-2 by angle between its taps",
+    "taps": "one to seven taps",
+    "bound": "what taps can tell at best",
+    "force": "error by contact force",
+    "force-recovery": "force through press, hold and release",
+    "unseen": "surfaces that were not trained on",
+    "real": "a hidden taxel of real recordings",
+    "robust": "error against the severity of nuisances",
+    "calibration": "how true the deviations are",
+    "fig5": "alpha and beta against force",
+    "fig7": "tPSF, PSF and depth against FEM",
+    "curved": "several PSFs by height against FEM",
+    "psf_speed": "patterns a second of the PSF by FFT and direct",
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m train.experiments",
+        description=(__doc__ or "").splitlines()[0],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="\n".join(f"  {name:15} {what}" for name, what in EXPERIMENTS.items()),
+    )
+    parser.add_argument("names", nargs="+", choices=EXPERIMENTS, metavar="NAME", help="which, in this order")
+    parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="datasets, made where they lack")
+    parser.add_argument(
+        "--checkpoints", type=Path, default=Path("checkpoints"), help="networks, trained where they lack"
+    )
+    parser.add_argument("--quick", action="store_true", help="everything tiny, to see that it runs")
+    options = parser.parse_args(arguments)
+    bench = Workbench(options.data, options.checkpoints, options.quick)
+    try:
+        for name in options.names:
+            page = importlib.import_module(f"train.experiments.{name.replace('-', '_')}").run(bench, options.reports)
+            sys.stdout.write(f"{page}\n")
+    except TrainError as error:
+        sys.exit(f"experiments: {error}")
+    except KeyboardInterrupt:
+        sys.exit("experiments: stopped; the same command goes on where it was")
+
+
+if __name__ == "__main__":
+    main()

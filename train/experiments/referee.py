@@ -1,0 +1,123 @@
+"""What the finite elements say of a press, worked out once and kept beside the reports: minutes of work a surface."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.geometry import USPA44
+from train.depth import Pose, Relief, depth_image
+from train.layer import Layer
+from train.mooney_rivlin import C2_SHARE
+from train.surfaces import surface_mesh
+
+SCALE: Final = 10
+"""Patterns are compared at 40 x 40, as in the paper."""
+CENTRE: Final = Pose(0.0, 0.0, 0.0)
+"""The paper's p5 r0."""
+_EDITION: Final = 1
+"""Raise it when train.fem changes what it finds: kept results of another edition are not read."""
+
+
+class Mesh(NamedTuple):
+    """Fineness of the elements: nodes per taxel pitch, and elements over the thickness."""
+
+    scale: int
+    cells_high: int
+
+    def __str__(self) -> str:
+        return f"{self.scale} nodes a pitch, {self.cells_high} high"
+
+
+FINEST: Final = Mesh(10, 8)
+REFEREE_POISSON: Final = 0.495
+"""Of rubber. The layer's own, lower one stands for sides that the finite elements have."""
+"""Its nodes are the pixels of the 40 x 40 pattern."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Equilibria of one press at `s` indentations.
+
+    Attributes:
+        patterns_mm: (s, 40, 40), in [mm].
+        force_n: (s,), in [N].
+        newton_steps: (s,), linear systems solved.
+        residual: (s,), force out of balance as a share of the reactions.
+        run_s: (s,), in [s], when it was worked out.
+    """
+
+    patterns_mm: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    newton_steps: NDArray[np.int64]
+    residual: NDArray[np.float32]
+    run_s: NDArray[np.float32]
+
+
+def judge(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path, pose: Pose = CENTRE) -> Verdict:
+    """Press a surface into the finite elements, or recall what came of it.
+
+    Args:
+        surface: its name.
+        mesh: fineness of the elements.
+        indentation_mm: (s,), rising, in [mm].
+        folder: where results are kept, made if absent.
+        pose: where the pad taps.
+
+    Raises:
+        NoEquilibriumError: a step did not converge.
+        ModuleNotFoundError: nothing is kept, and FElupe is not installed.
+    """
+    layer = LAYER
+    question = {
+        "edition": _EDITION,
+        "surface": surface,
+        "mesh": mesh,
+        "pose": asdict(pose),
+        "indentation_mm": np.round(indentation_mm, 6).tolist(),
+        "layer": asdict(layer),
+        "c2_share": C2_SHARE,
+        "geometry": asdict(USPA44),
+    }
+    path = folder / f"fem-{hashlib.sha256(json.dumps(question).encode()).hexdigest()[:16]}.npz"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        _keep(path, _work_out(surface, mesh, indentation_mm, pose, layer))
+    with np.load(path) as kept:
+        return Verdict(kept["patterns_mm"].astype(np.float32), *(kept[name] for name in _FIGURES))
+
+
+def relief(surface: str) -> Relief:
+    """A surface by name, to be looked down on."""
+    return Relief(surface, surface_mesh(surface))
+
+
+LAYER: Final = replace(Layer(), poisson=REFEREE_POISSON)
+"""The pad as the finite elements have it."""
+_FIGURES: Final = ("force_n", "newton_steps", "residual", "run_s")
+
+
+def _work_out(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], pose: Pose, layer: Layer) -> Verdict:
+    from train.fem import FemPad  # here, because kept results need no FElupe
+
+    pad = FemPad(*mesh, layer)
+    presses = pad.press(depth_image(relief(surface), pose, pad.size, pad.cell_mm), indentation_mm)
+    return Verdict(
+        pad.pattern(presses.displacement_mm, SCALE),
+        presses.force_n.astype(np.float32),
+        presses.newton_steps,
+        presses.residual.astype(np.float32),
+        presses.run_s.astype(np.float32),
+    )
+
+
+def _keep(path: Path, verdict: Verdict) -> None:
+    """Half precision: 0.05 % of a displacement, a tenth of what the mesh leaves open."""
+    figures = {name: getattr(verdict, name) for name in _FIGURES}
+    unfinished = path.with_suffix(".part.npz")  # a run that is stopped leaves no half result under the name
+    np.savez_compressed(unfinished, patterns_mm=verdict.patterns_mm.astype(np.float16), **figures)
+    unfinished.rename(path)

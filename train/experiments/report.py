@@ -1,0 +1,107 @@
+"""A report: one table as CSV and Markdown, one plot as PNG, and what they were made from."""
+
+import csv
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+Cell = str | int | float | None
+Row = dict[str, Cell]
+
+_RESAMPLES: Final = 2000
+_LEVEL: Final = 0.95
+_DPI: Final = 110
+
+
+class Report:
+    """Collects what an experiment found, and writes it as NAME.csv, NAME.md and NAME.png.
+
+    Args:
+        name: of the experiment, and of its files.
+        folder: where they go; made if absent.
+        quick: the run was cut short for a test: said at the top of the page.
+    """
+
+    def __init__(self, name: str, folder: Path, *, quick: bool = False) -> None:
+        self._path = folder / name
+        self._quick = quick
+        self._parts: list[str] = []
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def say(self, text: str) -> None:
+        """A paragraph of the page."""
+        self._parts.append(text)
+
+    def table(self, rows: Sequence[Row], caption: str, part: str = "") -> None:
+        """A table of the page, and a CSV of its own: NAME.csv, or NAME-PART.csv."""
+        columns = list(dict.fromkeys(column for row in rows for column in row))
+        with self._file(".csv", part).open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
+        lines += [" | ".join(_shown(row.get(column)) for column in columns) for row in rows]
+        self._parts.append("\n".join([caption, "", *(f"| {line} |" for line in lines)]))
+
+    @contextmanager
+    def figure(self, part: str = "", size: tuple[float, float] = (8, 5)) -> Iterator[Figure]:
+        """A plot of the page: NAME.png, or NAME-PART.png."""
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        path = self._file(".png", part)
+        figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+        self._parts.append(f"![{path.stem}]({path.name})")
+
+    def write(self) -> Path:
+        """Write the page, and say where it lies."""
+        head = [f"# {self._path.name}", _circumstances()]
+        if self._quick:
+            head.append("**A quick run, for the tests: no figure here means anything.**")
+        page = self._file(".md", "")
+        page.write_text("\n\n".join(head + self._parts) + "\n")
+        return page
+
+    def _file(self, suffix: str, part: str) -> Path:
+        return self._path.with_name(self._path.name + (f"-{part}" if part else "") + suffix)
+
+
+def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], seed: int = 0) -> tuple[float, float]:
+    """95 % interval of the mean of (n,) values, by drawing whole taps: frames of one tap are not independent."""
+    order, start = np.unique(taps, return_inverse=True)
+    sums = np.bincount(start, weights=values, minlength=len(order))
+    counts = np.bincount(start, minlength=len(order))
+    drawn = np.random.default_rng(seed).integers(len(order), size=(_RESAMPLES, len(order)))
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    low, high = np.quantile(means, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    return float(low), float(high)
+
+
+def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:
+    """Mean of (n,) values with its interval, as a table shows it: 35.92 (35.5..36.3)."""
+    low, high = bootstrap_interval(values, taps)
+    return f"{float(np.mean(values)):.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
+
+
+def _shown(cell: Cell) -> str:
+    if cell is None:
+        return "-"
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+
+
+def _circumstances() -> str:
+    command = " ".join(["python", *(["-m", "train.experiments"] if sys.argv[0].endswith("__main__.py") else [])])
+    command += "".join(f" {shlex.quote(word)}" for word in sys.argv[1:])
+    date = datetime.now(UTC).date().isoformat()
+    return f"`{command}`, {date}, {platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"

@@ -1,0 +1,114 @@
+"""What the experiments train, and on what: one list, so that no network is trained twice."""
+
+from dataclasses import replace
+from typing import Any, Final
+
+from edge.frozen import FrozenSet
+from train.dataset import Sequences, join
+from train.experiments.workbench import Workbench
+from train.fit import BASE, BUNDLED, given_taps
+from train.generation import Generation, random_figures
+from train.loop import Recipe
+from train.networks.blocks import PatternNet
+from train.poses import ANGLE_STEP_DEG, MAX_TAPS
+from train.training import Training
+
+SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
+"""The 18 surfaces."""
+FIGURES: Final = Generation(surfaces=random_figures(4500, 4500, seed=2), taps=MAX_TAPS, seed=2)
+"""Random figures, each once."""
+
+_SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
+"""The STSR as long as the compact one from nothing; srgan on top of srcnn."""
+_SEED_MINUTES_MORE: Final = 4.0
+"""Of every MTSR-K, on top of the STSR. All together two hours of processor time, on two cores."""
+SEED_BATCH: Final = 16
+_SEED_RATE: Final = 5e-4
+_SEED_DECAY: Final = 1e-2
+_ENDLESS: Final = 1_000_000
+_STAGE_STEPS: Final = 1000
+_SCALE_STEPS: Final = 2500
+_ANGLE_STEPS: Final = 1500
+
+
+def mixed(bench: Workbench) -> Sequences:
+    """What the bundled models are trained on: the 18 surfaces and as many random figures."""
+    return join([bench.data("seen", SEEN), bench.data("figures", FIGURES)])
+
+
+def by_angle(bench: Workbench, angle_step_deg: float) -> Sequences:
+    """The same with two taps, turned by another angle."""
+    if angle_step_deg == ANGLE_STEP_DEG:
+        return mixed(bench)
+    parts = {"seen": SEEN, "figures": FIGURES}
+    turned = {name: replace(config, taps=2, angle_step_deg=angle_step_deg) for name, config in parts.items()}
+    return join([bench.data(f"{name}-{angle_step_deg:g}-deg", config) for name, config in turned.items()])
+
+
+def compact(name: str) -> Training:
+    """A compact network trained on from the base: stsr, mtsr2, ... mtsr7; the bundled ones are those of train.fit."""
+    for training in BUNDLED:
+        if training.name == name:
+            return training
+    taps = int(name.removeprefix("mtsr"))
+    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=5e-4, given=given_taps(taps))
+    return Training(name, f"compact-{name}", recipe, start=BASE.name, seed=1 + taps)
+
+
+def at_scale(scale: int) -> Training:
+    """The compact STSR at another scale: the base's trunk, and pixels of its own."""
+    if scale == BASE.scale:
+        return compact("stsr")
+    recipe = Recipe(steps=_SCALE_STEPS, learning_rate=1e-3)
+    return Training(f"stsr-x{scale}", "compact-stsr", recipe, scale=scale, start=BASE.name)
+
+
+def at_angle(angle_step_deg: float) -> Training:
+    """The compact MTSR-2 for taps that are turned by an angle, from the STSR, which knows none."""
+    recipe = Recipe(steps=_ANGLE_STEPS, learning_rate=1e-3, given=given_taps(2))
+    return Training(f"mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start="stsr", seed=3)
+
+
+def alike(name: str) -> Training:
+    """A compact network trained on from the base for as long as every other of these."""
+    training = compact(name)
+    if training.recipe.steps == _STAGE_STEPS:
+        return training
+    return replace(training, name=f"{name}-alike", recipe=replace(training.recipe, steps=_STAGE_STEPS))
+
+
+def seed_size(network: str) -> Training:
+    """A network of the paper, by the clock."""
+    starts = network.startswith("mtsr")
+    recipe = Recipe(
+        steps=_ENDLESS,
+        batch=SEED_BATCH,
+        learning_rate=_SEED_RATE,
+        weight_decay=_SEED_DECAY,
+        given=given_taps(int(network.removeprefix("mtsr")) if starts else 1),
+        bf16=True,
+        minutes=_SEED_MINUTES.get(network, _SEED_MINUTES_MORE),
+    )
+    start = {"srgan": "seed-srcnn"}.get(network, "seed-stsr" if starts else None)
+    return Training(f"seed-{network}", network, recipe, start=start)
+
+
+SEED_STSR_LONGER: Final = replace(
+    seed_size("stsr"),
+    name="seed-stsr longer",
+    recipe=replace(seed_size("stsr").recipe, minutes=_SEED_MINUTES_MORE),
+    start="seed-stsr",
+)
+"""The STSR trained on for as long as MTSR-2 is from it: what is between the two is the second tap alone."""
+
+
+def trained(
+    bench: Workbench, training: Training, data: Sequences, validation: FrozenSet
+) -> tuple[PatternNet, dict[str, Any]]:
+    """A trained network and its report, and before it the one that it starts from."""
+    if training.start:
+        trained(bench, _STARTS[training.start], data, validation)
+    return bench.network(training, data, validation)
+
+
+_STARTS: Final = {start.name: start for start in (BASE, compact("stsr"), seed_size("stsr"), seed_size("srcnn"))}
