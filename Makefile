@@ -18,10 +18,16 @@ lint: $(VENV)/.dev  ## format, lint, types, import rules
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-models: $(VENV)/.dev  ## retrain and re-export the bundled models: about 20 minutes on two cores
-	$(BIN)/python -m train.freeze edge/models
-	$(BIN)/python -m train.fit checkpoints
+models: $(VENV)/.dev data/seen.npz data/figures.npz  ## retrain and re-export the bundled models: about 25 minutes on two cores
+	$(BIN)/python -m train.freeze edge/models --data data/seen.npz data/figures.npz
+	$(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/seen.npz data/figures.npz
 	$(BIN)/python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt --out edge/models
+
+data/seen.npz: $(VENV)/.dev  ## taps on the 18 surfaces
+	$(BIN)/python -m train.generate $@ --taps 7 --seed 1
+
+data/figures.npz: $(VENV)/.dev  ## taps on random figures
+	$(BIN)/python -m train.generate $@ --surfaces none --glyphs 4500 --polygons 4500 --taps 7 --seed 2
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -1,0 +1,167 @@
+import csv
+
+import numpy as np
+import pytest
+from experiment_samples import quick_bench
+
+from edge.taps import OFF_COUNTS, ON_COUNTS
+from train.dataset import between_frames
+from train.experiments import force_recovery
+from train.experiments.course import CLAIM_N, RANGE_N, Course, Scans, contact, errors, loop_percent, pressed
+from train.experiments.force_recovery import Gauge, training_presses
+from train.experiments.trainings import mixed
+from train.nuisances import Nuisances
+
+COURSE = Course(20.0)
+RAMP_N = 5.0 * COURSE.share
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    return quick_bench(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def sequences(bench):
+    return bench.held_out("test").newest(4)
+
+
+def z_of(scans):
+    return scans.windows[:, 0, 2].sum(axis=(1, 2))
+
+
+def test_the_report_has_every_gauge_under_both_conditions(bench, tmp_path):
+    page = force_recovery.run(bench, tmp_path)
+    with page.with_suffix(".csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["nuisances"], row["model"]) for row in rows] == [
+        (condition, model)
+        for condition in ("just zeroed", "drifted")
+        for model in ("summed z", "stsr", "mtsr4", "true pattern")
+    ]
+    assert set(rows[0]) >= {"error %", "loop %", "at no load %", "parameters", "MMAC", "run time ms"}
+    for row in rows:
+        if row["model"] == "true pattern":  # is in proportion to the force, and ends with it
+            assert row["with its own factor %"].startswith("0.00")
+            assert row["loop %"].startswith("0.00")
+            assert row["false contact, % of scans"].startswith("0.00")
+    assert page.with_name("force-recovery-surfaces.csv").exists()
+    assert page.with_suffix(".png").stat().st_size > 10_000
+    assert "**drifted**: least error has" in page.read_text()
+
+
+def test_a_course_presses_holds_releases_and_rests():
+    assert [int(COURSE.phase(number).sum()) for number in range(4)] == [40, 100, 20, 40]
+    assert sum(COURSE.phase(number) for number in range(4)).tolist() == [1] * 200
+    press, hold, release, rest = (COURSE.share[COURSE.phase(number)] for number in range(4))
+    np.testing.assert_allclose(press, np.arange(1, 41) / 40)
+    np.testing.assert_allclose(hold, 1)
+    np.testing.assert_allclose(release, np.arange(19, -1, -1) / 20, atol=1e-12)
+    np.testing.assert_allclose(rest, 0)
+    assert COURSE.time_s[0] == pytest.approx(0.05)  # a step after the pad was free
+    assert COURSE.time_s[-1] == pytest.approx(10)
+
+
+def test_without_nuisances_a_press_and_its_release_read_alike(sequences):
+    scans = pressed(sequences, 0, COURSE, Nuisances.none())
+    assert scans.force_n.max() == pytest.approx(5.0, rel=1e-5)
+    assert loop_percent(scans.force_n, z_of(scans) / 1400, COURSE) < 0.2  # counts are whole
+    np.testing.assert_allclose(scans.volume_mm3 / scans.volume_mm3.max(), scans.force_n / 5.0, atol=1e-5)
+    assert (scans.windows[COURSE.phase(3), 0] == 0).all()
+    end = sequences.share_at_force(np.array([0]), 5.0)
+    for tap in range(4):
+        clean = between_frames(sequences.counts[:1, tap], end[:, tap : tap + 1])[0, 0]
+        np.testing.assert_allclose(scans.windows[100, tap], np.rint(clean), atol=1)
+    assert (scans.windows[:, 1:] == scans.windows[:1, 1:]).all()
+
+
+def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind(sequences):
+    free = z_of(pressed(sequences, 0, COURSE, Nuisances.none()))
+    lagging = z_of(pressed(sequences, 0, COURSE, Nuisances.only("hysteresis")))
+    press, hold, release, rest = (COURSE.phase(number) for number in range(4))
+    assert (lagging[press][5:] < free[press][5:]).all()
+    assert np.corrcoef(lagging[hold][:40], np.arange(40))[0, 1] > 0.9  # it creeps up
+    assert lagging[hold][-1] > lagging[hold][0] + 10
+    assert (lagging[release] > free[release])[-5:].all()
+    assert lagging[rest][0] > 0
+    assert lagging[rest][-1] < lagging[rest][0] / 2
+    scans = pressed(sequences, 0, COURSE, Nuisances.none())
+    assert loop_percent(scans.force_n, lagging / 1400, COURSE) > loop_percent(scans.force_n, free / 1400, COURSE)
+
+
+def test_one_sensor_reads_the_course_and_the_earlier_taps(sequences):
+    clean = pressed(sequences, 0, COURSE, Nuisances.none()).windows[100]
+    read = pressed(sequences, 0, COURSE, Nuisances.only("gain_spread")).windows[100]
+    clear = np.abs(clean).min(axis=0) > 200
+    gain = np.where(clear, read / np.where(clear, clean, 1), 1)
+    assert clear.sum() > 10
+    np.testing.assert_allclose(gain[1:], np.broadcast_to(gain[0], gain[1:].shape), atol=0.01)
+    assert np.ptp(gain[0][clear]) > 0.05
+    other = pressed(sequences, 1, COURSE, Nuisances.only("gain_spread")).windows[100]
+    other_clean = pressed(sequences, 1, COURSE, Nuisances.none()).windows[100]
+    both = clear & (np.abs(other_clean).min(axis=0) > 200)
+    assert not np.allclose((other[0] / other_clean[0])[both], gain[0][both], atol=0.02)
+
+
+def test_a_gauge_has_one_factor_and_no_offset():
+    force_n = np.linspace(0, 5, 50)
+    scans = Scans(np.zeros((50, 1, 3, 4, 4), dtype=np.float32), force_n, 4 * force_n)
+    gauge = Gauge("volume", lambda scans: scans.volume_mm3, {}).fitted(scans)
+    assert gauge.newtons_per_unit == pytest.approx(0.25)
+    shifted = Gauge("volume and 8", lambda scans: scans.volume_mm3 + 8, {}).fitted(scans)
+    at_rest = Scans(scans.windows[:1], force_n[:1], 0 * force_n[:1])
+    assert shifted.force_n(at_rest)[0] == pytest.approx(8 * shifted.newtons_per_unit)
+    assert gauge.force_n(at_rest)[0] == 0
+
+
+def test_a_loop_is_the_largest_difference_at_equal_force():
+    found = RAMP_N.copy()
+    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(0, abs=1e-9)
+    release = COURSE.phase(2)
+    found[release] += 0.1
+    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(100 * 0.1 / RANGE_N)
+    found[release] = RAMP_N[release] + 0.4 * np.sin(np.pi * RAMP_N[release] / 5)  # widest half-way
+    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(8, rel=0.01)
+    found[COURSE.phase(1)] = 99  # neither the hold nor the rest are part of it
+    found[COURSE.phase(3)] = 99
+    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(8, rel=0.01)
+
+
+def test_figures_of_a_course_in_closed_form():
+    open_, rest = RAMP_N > 1.0, COURSE.phase(3)
+    perfect = errors(RAMP_N, RAMP_N, RAMP_N > 0, COURSE)
+    assert perfect == pytest.approx(
+        {"error": 0, "own": 0, "gated": 0, "loop": 0, "rest": 0, "false": 0, "false gated": 0, "missed": 100 / 160}
+    )  # the release's last scan is free again
+    half = errors(RAMP_N, RAMP_N / 2, open_, COURSE)
+    assert half["error"] == pytest.approx(100 * np.sqrt(np.mean((RAMP_N / 2) ** 2)) / RANGE_N)
+    assert half["own"] == pytest.approx(0, abs=1e-9)
+    assert half["missed"] == pytest.approx(100 * (~open_)[~rest].mean())
+    assert half["gated"] == pytest.approx(100 * np.sqrt(np.mean(np.where(open_, RAMP_N / 2, RAMP_N) ** 2)) / RANGE_N)
+    offset = errors(RAMP_N, RAMP_N + 1.01 * CLAIM_N, np.ones(200, dtype=bool), COURSE)
+    assert [offset["error"], offset["rest"]] == pytest.approx([101 * CLAIM_N / RANGE_N] * 2)
+    assert (offset["false"], offset["false gated"], offset["missed"]) == (100, 100, 0)
+    assert errors(RAMP_N, RAMP_N + 0.99 * CLAIM_N, open_, COURSE)["false"] == 0
+    assert errors(RAMP_N, RAMP_N - 1, open_, COURSE)["false"] == 0
+
+
+def test_the_runtimes_threshold_opens_late_and_closes_later():
+    windows = np.zeros((200, 1, 3, 4, 4), dtype=np.float32)
+    windows[:, 0, 2] = (1400 * RAMP_N / 16)[:, None, None]
+    gate = contact(Scans(windows, RAMP_N, RAMP_N), COURSE)
+    z = windows[:, 0, 2].sum(axis=(1, 2))
+    press, release = COURSE.phase(0), COURSE.phase(2)
+    np.testing.assert_array_equal(gate[press], z[press] >= ON_COUNTS)
+    np.testing.assert_array_equal(gate[release], z[release] >= OFF_COUNTS)
+    assert gate[COURSE.phase(1)].all()
+    assert not gate[COURSE.phase(3)].any()
+
+
+def test_training_presses_go_with_their_forces(bench):
+    scans = training_presses(mixed(bench), 40)
+    assert scans.windows.shape == (40, 4, 3, 4, 4)
+    assert 0.3 * 0.99 < scans.force_n.min() < 2
+    assert 6 < scans.force_n.max() < 8 * 1.01
+    np.testing.assert_allclose(z_of(scans) / scans.force_n, 1450, rtol=0.35)
+    # A deformation is a force over a stiffness; one figure's may be a few times another's, not more.
+    assert np.ptp(np.log(scans.volume_mm3 / scans.force_n)) < np.log(4)
