@@ -10,6 +10,7 @@ surface moves, where whole cells alone make them jump by 1 to 2 % (docs/log.md).
 """
 
 from dataclasses import dataclass
+from math import ceil
 from typing import Final
 
 import numpy as np
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 from train.layer import Layer, surface_compliance
 
 _MAX_STEPS: Final = 200
-_PADDED_LENGTHS: Final = 2
-"""Grid with padding over grid: the response of a bonded layer dies within a few thicknesses."""
+_DIES_WITHIN: Final = 8
+"""Thicknesses. The kernel is worked out on a grid that repeats itself after twice the pad, or after so many: the force
+on a punch is then off by 5e-4. On twice the pad it was off by .8 % at 10 mm and by 9 % at 50 mm."""
 REACH: Final = 1.5
 """Cells this many indentations deep may touch: the pad bulges out beside a contact, by 0.39 of the indentation at
 most over the 18 surfaces."""
@@ -69,7 +71,7 @@ class ContactSolver:
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
-        padded = _PADDED_LENGTHS * size
+        padded = 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
         q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
         q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
         compliance = surface_compliance(layer, np.hypot(q_x[None, :], q_y[:, None]))
