@@ -147,7 +147,11 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="no field 'exact', expected one of dipole, cylinder"):
         MagnetArray(USPA44, MAGNET, "exact")
     array = MagnetArray(USPA44, MAGNET)
-    assert np.isfinite(array.change_mt(moved(3, DOWN, 1.74))).all()
+    assert np.isfinite(array.change_mt(moved(3, DOWN, 0.99))).all()
+    assert np.isfinite(MagnetArray(USPA44, MAGNET, "cylinder").change_mt(moved(3, DOWN, 1.74))).all()
+    for near in (1.01, 1.74):
+        with pytest.raises(ValueError, match=r"comes within .* mm of its chip, .* expected 0\.75 mm or more"):
+            array.change_mt(moved(3, DOWN, near))
     for through in (1.75, 9.0, np.nan):
-        with pytest.raises(ValueError, match=r"expected less than the 1\.75 mm"):
+        with pytest.raises(ValueError, match="mm into its chip"):
             array.change_mt(moved(3, DOWN, through))

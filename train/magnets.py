@@ -119,6 +119,11 @@ FIELDS: Final[dict[str, Callable[[Magnet, Vectors, Vectors], Vectors]]] = {
 }
 
 
+_DIPOLE_CLEARANCE: Final = 0.75
+"""Diameters from a magnet's face to the chip below which a dipole is off by more than 30 %; at the default magnet's
+rest 7 %, pressed by .5 mm 12 % (reports/stability.md)."""
+
+
 class MagnetArray:
     """One magnet over one chip per taxel.
 
@@ -128,7 +133,7 @@ class MagnetArray:
         field: a name in FIELDS.
 
     Raises:
-        ValueError: no field of that name.
+        ValueError: no field of that name, or the magnet is too near to its chip for a dipole.
     """
 
     def __init__(self, geometry: SensorGeometry, magnet: Magnet, field: str = "dipole") -> None:
@@ -136,6 +141,8 @@ class MagnetArray:
             raise ValueError(f"no field {field!r}, expected one of {', '.join(FIELDS)}")
         self.magnet = magnet
         self._field = FIELDS[field]
+        self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm if field == "dipole" else 0.0
+        self._check_clear(magnet.clearance_mm)
         centres_mm = geometry.taxel_centres_mm().T
         # (2, chips, magnets): from each magnet to each chip, at rest.
         self._apart_mm = (centres_mm[:, :, None] - centres_mm[:, None, :]).astype(np.float32)
@@ -151,15 +158,22 @@ class MagnetArray:
             (..., taxels, 3), x, y, z in [mT].
 
         Raises:
-            ValueError: a magnet would be pressed through its chip.
+            ValueError: a magnet would be pressed through its chip, or too near to it for a dipole.
         """
-        deepest_mm = movement[..., _DOWN].max(initial=0.0)
-        if not deepest_mm < self.magnet.clearance_mm:
-            raise ValueError(
-                f"a magnet moves {deepest_mm:.3g} mm down, expected less than the {self.magnet.clearance_mm:.3g} mm "
-                f"it hangs above its chip: press less hard, or take a stiffer layer"
-            )
+        self._check_clear(self.magnet.clearance_mm - float(movement[..., _DOWN].max(initial=0.0)))
         return self.flux_mt(movement) - self.flux_mt(self._nowhere.astype(movement.dtype))
+
+    def _check_clear(self, clear_mm: float) -> None:
+        if not clear_mm > 0:
+            raise ValueError(
+                f"a magnet is pressed {abs(clear_mm):.3g} mm into its chip, expected to stay above it: press less "
+                "hard, or take a stiffer layer"
+            )
+        if clear_mm < self._least_clear_mm:
+            raise ValueError(
+                f"a magnet comes within {clear_mm:.3g} mm of its chip, where a dipole is off by more than 30 %: "
+                f"expected {self._least_clear_mm:.3g} mm or more; press less hard, or take field='cylinder'"
+            )
 
     def flux_mt(self, movement: NDArray[np.floating]) -> NDArray[np.floating]:
         """Flux density of all magnets at each chip, (..., taxels, 3) in [mT], for movements (..., taxels, 5)."""
