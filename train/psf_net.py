@@ -152,14 +152,16 @@ def degrade(pattern: Tensor, gamma: Tensor, geometry: SensorGeometry = USPA44, f
     Source: Wu and Liu 2024, Eq. 7-8.
     """
     height, width = pattern.shape[1:]
-    distance_mm = _distances_mm(geometry, height, width).to(pattern)
+    distance_mm = _distances_mm(geometry, height, width)
     gamma = gamma[..., None, None]
-    # Distances count from the nearest pixel: the division by the largest weight is then done, and never 0/0.
+    # Distances count from the nearest pixel: the division by the largest weight is then done, and never 0/0. Their
+    # differences are taken in float64, since a small gamma asks for their last digits.
     if form == "paper":
-        weights = torch.exp(-(distance_mm - distance_mm.amin(dim=1, keepdim=True)) / gamma**2)
+        beyond_mm = distance_mm - distance_mm.amin(dim=1, keepdim=True)
+        weights = torch.exp(-beyond_mm.to(pattern) / gamma**2)
     elif form == "code":
         square = distance_mm**2
-        weights = torch.exp(-(square - square.min()) / gamma)
+        weights = torch.exp(-(square - square.min()).to(pattern) / gamma)
         least = weights.amin(dim=(-2, -1), keepdim=True)
         weights = (weights - least) / (1 - least)
     else:
