@@ -38,10 +38,20 @@ _SLACK: Final = 1e-4
 """Pull and overlap that count as none: shares of the mean push of a touching node, and of the indentation."""
 _SOLVER_RESIDUAL: Final = 1e-6
 _SOLVER_STEPS: Final = 30
+_REMEDY: Final = "press in other steps: smaller ones or, near a Poisson's ratio of .5, larger"
+"""A step starts from the last one's field grown in proportion, which near incompressibility is not always near."""
 
 
 class NoEquilibriumError(TrainError, ArithmeticError):
-    """The elements found no equilibrium; the message names step and indentation."""
+    """The elements found no equilibrium; the message names step and indentation.
+
+    Attributes:
+        reached_mm: indentation of the last equilibrium before, in [mm]; 0 if there was none.
+    """
+
+    def __init__(self, message: str, reached_mm: float = 0.0) -> None:  # a default, or it could not be unpickled
+        super().__init__(message)
+        self.reached_mm = reached_mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +61,9 @@ class FemPresses:
     Attributes:
         indentation_mm: (s,), in [mm].
         push_n: (s, size, size), what each node is pushed down with, in [N]; 0 where nothing touches.
+        board_n: (s,), what the board holds up the pad with, in [N]: all pushes, as far as forces are in balance.
+        below_board_mm: (s,), how far the bulging sides reach below the board, in [mm]. Nothing holds them up: where it
+            is more than 0 the pad is softer than it should be.
         displacement_mm: (s, size, size), of the surface's nodes, downwards, in [mm]; row = y, column = x.
         touching: (s, size, size), the nodes that touch.
         newton_steps: (s,), linear systems solved, over all active sets.
@@ -60,6 +73,8 @@ class FemPresses:
 
     indentation_mm: NDArray[np.float64]
     push_n: NDArray[np.float64]
+    board_n: NDArray[np.float64]
+    below_board_mm: NDArray[np.float64]
     displacement_mm: NDArray[np.float64]
     touching: NDArray[np.bool_]
     newton_steps: NDArray[np.int64]
@@ -81,6 +96,7 @@ class FemPad:
         layer: thickness, and the material at small strain.
         c2_share: C2 / (C1 + C2).
         geometry: of a square sensor.
+        mixed: the formulation. Displacement alone locks as the rubber becomes incompressible: it is here to show that.
 
     Attributes:
         nodes_mm: (size,), where the nodes lie along a side, from the centre, in [mm].
@@ -94,11 +110,13 @@ class FemPad:
         layer: Layer = Layer(),  # noqa: B008 - frozen
         c2_share: float = C2_SHARE,
         geometry: SensorGeometry = USPA44,
+        mixed: bool = True,
     ) -> None:
         self.cell_mm = geometry.pixel_pitch_mm(scale)
         self.nodes_mm = _nodes_mm(geometry, scale)
         self._geometry = geometry
         self._rubber = MooneyRivlin.of_layer(layer, c2_share)
+        self._mixed = mixed
         heights_mm = np.linspace(0, layer.thickness_mm, cells_high + 1)
         self._mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, heights_mm)
         self._region = felupe.RegionHexahedron(self._mesh)
@@ -122,7 +140,7 @@ class FemPad:
         """
         steps_mm = np.asarray(indentation_mm, dtype=np.float64)
         self._check(depth_mm, steps_mm)
-        press = _Press(self._region, self._rubber, self.size)
+        press = _Press(self._region, self._rubber, self.size, self._mixed)
         found = [
             press.advance(step_mm, step_mm - depth_mm, f"step {i + 1} of {len(steps_mm)}, indentation {step_mm:.3g} mm")
             for i, step_mm in enumerate(steps_mm)
@@ -149,17 +167,14 @@ class FemPad:
 class _Press:
     """One press under way: the equilibrium so far, and what touches."""
 
-    def __init__(self, region: Any, rubber: MooneyRivlin, size: int) -> None:
+    def __init__(self, region: Any, rubber: MooneyRivlin, size: int, mixed: bool) -> None:
         self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
-        material = felupe.Material(
-            stress=lambda x: [rubber.stress(x[0]), x[-1]],
-            elasticity=lambda x: [rubber.stiffness(x[0])],
-        )
-        self._body = felupe.SolidBodyNearlyIncompressible(material, self._field, bulk=rubber.bulk_mpa)
+        self._body = _body(self._field, rubber, mixed)
         self._solver = _TangentSolver()
         self._touching = np.zeros((size, size), dtype=bool)
         self._indentation_mm = 0.0
         points = region.mesh.npoints
+        self._points_mm = region.mesh.points
         self._top = np.arange(points - size**2, points)
         self._board = np.arange(size**2)
 
@@ -176,7 +191,8 @@ class _Press:
         for _ in range(_MAX_SETS):
             result = self._balance(wanted_mm, name)
             newton_steps += result.iterations
-            out_of_balance_n = result.fun.reshape(-1, 3)[self._top, 2].reshape(self._touching.shape)
+            upwards_n = result.fun.reshape(-1, 3)[:, 2]
+            out_of_balance_n = upwards_n[self._top].reshape(self._touching.shape)
             push_n = np.where(self._touching, -out_of_balance_n, 0.0)
             down_mm = self._down_mm()
             pulled = push_n < -_SLACK * push_n.sum() / self._touching.sum()
@@ -186,14 +202,20 @@ class _Press:
             self._touch(self._touching & ~pulled | sunk)
         else:
             raise NoEquilibriumError(
-                f"{name}: what touches still changes after {_MAX_SETS} rounds; press in smaller steps"
+                f"{name}: what touches still changes after {_MAX_SETS} rounds; {_REMEDY}",
+                self._indentation_mm,
             )
         self._indentation_mm = indentation_mm
         residual = float(result.fnorms[-1])
-        return push_n, down_mm, self._touching.copy(), newton_steps, residual, perf_counter() - start
+        board_n = float(upwards_n[self._board].sum())
+        run_s = perf_counter() - start
+        return push_n, board_n, self._below_board_mm(), down_mm, self._touching.copy(), newton_steps, residual, run_s
 
     def _down_mm(self) -> NDArray[np.float64]:
         return -self._field[0].values[self._top, 2].reshape(self._touching.shape)
+
+    def _below_board_mm(self) -> float:
+        return -float((self._points_mm + self._field[0].values)[:, 2].min()) + 0.0  # no -0
 
     def _touch(self, touching: NDArray[np.bool_]) -> None:
         if (touching != self._touching).any():
@@ -221,8 +243,24 @@ class _Press:
                 )
         except felupe.NewtonConvergenceError as error:
             raise NoEquilibriumError(
-                f"{name}: no equilibrium within {_MAX_NEWTON} Newton steps; press in smaller steps"
+                f"{name}: no equilibrium within {_MAX_NEWTON} Newton steps; {_REMEDY}",
+                self._indentation_mm,
             ) from error
+
+
+def _body(field: Any, rubber: MooneyRivlin, mixed: bool) -> Any:
+    """The pad's elements: they bring the volumetric part themselves if mixed, and take it from the rubber if not."""
+    if mixed:
+        material = felupe.Material(
+            stress=lambda x: [rubber.stress(x[0]), x[-1]],
+            elasticity=lambda x: [rubber.stiffness(x[0])],
+        )
+        return felupe.SolidBodyNearlyIncompressible(material, field, bulk=rubber.bulk_mpa)
+    material = felupe.Material(
+        stress=lambda x: [rubber.stress(x[0]) + rubber.volumetric_stress(x[0]), x[-1]],
+        elasticity=lambda x: [rubber.stiffness(x[0]) + rubber.volumetric_stiffness(x[0])],
+    )
+    return felupe.SolidBody(material, field)
 
 
 class _TangentSolver:

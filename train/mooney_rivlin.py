@@ -1,7 +1,8 @@
-"""The Mooney-Rivlin solid: stress and stiffness of its distortional part, in closed form.
+"""The Mooney-Rivlin solid: energy, stress and stiffness of its distortional and volumetric parts, in closed form.
 
 psi(F) = C1 (I1 J^(-2/3) - 3) + C2 (I2 J^(-4/3) - 3), with I1, I2 the invariants of C = F^T F and J = det F: the shape
-alone is paid for. Change of volume, K (J - 1)^2 / 2, is left to the mixed elements, which see it cell by cell.
+alone is paid for. Change of volume, K (J - 1)^2 / 2, is a part of its own: the mixed elements see it cell by cell, and
+bring it themselves.
 Arrays are (3, 3, ...) as finite-element codes have them: the tensor's axes first, the points behind.
 
 Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (the split).
@@ -78,11 +79,32 @@ class MooneyRivlin:
         second = _curvature(inverse, volume, 4 / 3, i2, slope2, curve2)
         return self.c1_mpa * first + self.c2_mpa * second
 
+    def volumetric_energy(self, gradient: Tensors) -> Tensors:
+        """U = K (J - 1)^2 / 2 per undeformed volume, (...) in [MPa], of deformation gradients F (3, 3, ...)."""
+        return self.bulk_mpa / 2 * (_volume(gradient) - 1) ** 2
+
+    def volumetric_stress(self, gradient: Tensors) -> Tensors:
+        """First Piola-Kirchhoff stress dU / dF, (3, 3, ...) in [MPa]."""
+        volume = _volume(gradient)
+        return self.bulk_mpa * (volume - 1) * volume * _inverse_transposed(gradient)
+
+    def volumetric_stiffness(self, gradient: Tensors) -> Tensors:
+        """Its slope d^2 U / dF dF, (3, 3, 3, 3, ...) in [MPa]."""
+        volume = _volume(gradient)
+        inverse = _inverse_transposed(gradient)
+        pair = _outer(inverse, inverse)
+        return self.bulk_mpa * volume * ((2 * volume - 1) * pair - (volume - 1) * np.swapaxes(pair, 1, 3))
+
+
+def _volume(gradient: Tensors) -> Tensors:
+    """J."""
+    return np.linalg.det(np.moveaxis(gradient, (0, 1), (-2, -1)))
+
 
 def _invariants(gradient: Tensors) -> tuple[Tensors, Tensors, Tensors, Tensors]:
     """C, J, I1 and I2."""
     cauchy = np.einsum("ki...,kj...->ij...", gradient, gradient)
-    volume = np.linalg.det(np.moveaxis(gradient, (0, 1), (-2, -1)))
+    volume = _volume(gradient)
     i1 = np.einsum("ii...->...", cauchy)
     return cauchy, volume, i1, (i1**2 - np.einsum("ij...,ij...->...", cauchy, cauchy)) / 2
 
