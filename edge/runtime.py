@@ -23,6 +23,9 @@ HOLD_SCANS: Final = 5
 """A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
 SILENT_SCANS: Final = 50
 """A taxel not heard for so long is not lost for a moment: the user is told."""
+RANGE_ENDS: Final = (0, 65535)
+"""Of a chip. What stands there has left the range, and is no reading, unless the taxel rests nearby and wraps round."""
+NEAR_END_COUNTS: Final = 500.0
 
 
 class Model(Protocol):
@@ -189,17 +192,32 @@ class _Sensor:
         self._held = np.zeros(geometry.scan_shape, dtype=np.int32)
         self._age_scans = np.full((geometry.rows, geometry.cols), HOLD_SCANS + 1)
         self._oldest_scans = 0
+        self._saturated = np.zeros((geometry.rows, geometry.cols), dtype=bool)
 
     def hold(self, scan: Scan) -> NDArray[np.int32] | None:
         """The newest reading of every taxel, or None if one is too old or was never heard."""
-        np.copyto(self._held, scan.counts, where=scan.fresh)
+        at_end = self._at_end(scan.counts)
+        self._saturated = np.where(scan.fresh, at_end, self._saturated)
+        read = scan.fresh & ~at_end
+        np.copyto(self._held, scan.counts, where=read)
         self._age_scans += 1
-        self._age_scans[scan.fresh] = 0
+        self._age_scans[read] = 0
         self._oldest_scans = int(self._age_scans.max())
         return self._held if self._oldest_scans <= HOLD_SCANS else None
 
+    def _at_end(self, counts: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Taxels, (rows, cols), one of whose axes stands at an end of its range, far from rest."""
+        ends = np.isin(counts, RANGE_ENDS)
+        if self.baseline is None or not ends.any():
+            return np.zeros(counts.shape[1:], dtype=bool)
+        far = np.abs(deformation(counts, self.baseline)) > NEAR_END_COUNTS
+        return np.asarray((ends & far).any(axis=0))
+
     def silence(self) -> str | None:
-        """What to tell of taxels that are not heard; None while all are."""
+        """What to tell of taxels that are not heard, or say nothing; None while there are none."""
+        if self._oldest_scans > HOLD_SCANS and self._saturated.any():
+            saturated = ", ".join(map(str, np.flatnonzero(self._saturated)))
+            return f"no pattern, taxel {saturated} at the end of its range: overloaded, too near a magnet, or broken"
         if self._oldest_scans < SILENT_SCANS:
             return None
         silent = np.flatnonzero(self._age_scans >= SILENT_SCANS)

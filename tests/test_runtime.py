@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from edge.errors import ModelError, UsageError, WindowError
 from edge.metrics import touched
 from edge.result import mask_bits
-from edge.runtime import HOLD_SCANS, SILENT_SCANS, Runtime, touched_patch
+from edge.runtime import HOLD_SCANS, RANGE_ENDS, SILENT_SCANS, Runtime, touched_patch
 from edge.session import ModelSession
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
@@ -301,3 +301,31 @@ def test_a_taxel_that_stays_silent_is_named(silent, remedy, baselines):
     assert notes[HOLD_SCANS] is None
     assert notes[-1] == f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}"
     assert "silent" not in (runtime.push(make_scan(SILENT_SCANS)).note or "")
+
+
+def saturated(number, counts, taxel=5):
+    scan = make_scan(number, press_counts=PRESS)
+    raw = scan.counts.copy()
+    raw[2].flat[taxel] = counts
+    return dataclasses.replace(scan, counts=raw)
+
+
+@pytest.mark.parametrize("counts", RANGE_ENDS)
+def test_a_chip_at_the_end_of_its_range_has_no_reading(counts):
+    """It is held for a while, as a taxel that is not heard; then there is no pattern, and the taxel is named."""
+    runtime = make_runtime()
+    pattern = runtime.push(make_scan(0, press_counts=PRESS)).pattern
+    for number in range(1, HOLD_SCANS + 1):
+        np.testing.assert_array_equal(runtime.push(saturated(number, counts)).pattern, pattern)
+    gone = runtime.push(saturated(HOLD_SCANS + 1, counts))
+    assert (gone.state, gone.pattern, gone.contact) == ("incomplete", None, None)
+    assert gone.note == "no pattern, taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
+    back = runtime.push(make_scan(HOLD_SCANS + 2, press_counts=PRESS))
+    assert back.state == "contact" and back.note is None
+
+
+def test_a_count_from_the_end_is_a_reading():
+    runtime = make_runtime()
+    for number in range(HOLD_SCANS + 2):
+        result = runtime.push(saturated(number, 65534))
+    assert result.state == "contact"
