@@ -55,7 +55,16 @@ class FrozenSet:
         return self.unit_patterns.shape[-1] // self.newest.shape[-1]
 
     def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
-        """Windows (n, taps, 3, rows, cols) in zeroed counts; only the newest `given` taps are there, the rest zero."""
+        """Windows (n, taps, 3, rows, cols) in zeroed counts; only the newest `given` taps are there, the rest zero.
+
+        Raises:
+            FrozenSetError: the set has not as many taps.
+        """
+        if not 1 <= taps <= 1 + self.earlier.shape[1]:
+            raise FrozenSetError(
+                f"windows of {taps} taps asked for, the frozen test set has {1 + self.earlier.shape[1]}: make it again "
+                "with 'python -m train.freeze' from sequences of more"
+            )
         windows = np.concatenate([self.newest[:, None], self.earlier[self.tap]], axis=1)[:, :taps].astype(np.float32)
         windows[:, given if given is not None else taps :] = 0
         return windows

@@ -35,6 +35,12 @@ def test_windows_are_newest_first_and_absent_taps_are_zero(small):
     assert small.windows(1).shape == (6, 1, 3, 4, 4)
 
 
+@pytest.mark.parametrize("taps", [0, 8])
+def test_more_taps_than_there_are_are_refused(small, taps):
+    with pytest.raises(FrozenSetError, match=f"windows of {taps} taps asked for, the frozen test set has"):
+        small.windows(taps)
+
+
 def test_truth_is_the_unit_pattern_times_the_indentation(small):
     assert np.allclose(small.patterns()[5], 0.5 * 0.6)
     assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
