@@ -145,14 +145,16 @@ def _models(arguments: Sequence[str]) -> int:
     models = bundled_models()
     if not models:
         raise ModelError("no models are bundled with this installation")
-    print("model  taps scale   size  error on the frozen test set, all taps given")
+    widest = max(len(path.stem) for path in models)
+    print(f"{'model':{widest}s} taps scale    size arithmetic  error on the frozen test set, all taps given")
     for path in models:
         contract = ModelSession(path).contract
         error = contract.test_error.get(str(contract.taps), {})
         figures = ", ".join(f"{name} {value:.3g}" for name, value in error.items())
         size_mb = path.stat().st_size / 1e6
         print(
-            f"{path.stem:6s} {contract.taps:4d} {f'x{contract.scale}':>5s} {size_mb:3.1f} MB  {figures or 'not known'}"
+            f"{path.stem:{widest}s} {contract.taps:4d} {f'x{contract.scale}':>5s} {size_mb:4.1f} MB "
+            f"{contract.arithmetic:10s}  {figures or 'not known'}"
         )
     return 0
 

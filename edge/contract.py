@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from edge.errors import ModelError
 from firmware_bridge.geometry import SensorGeometry
 
-CONTRACT_VERSION: Final = 2
+CONTRACT_VERSION: Final = 3
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
+ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
 
 
@@ -26,6 +27,7 @@ class Contract:
 
     Attributes:
         version: of this agreement.
+        batch: windows in one run.
         taps: K, the number of taps in the window.
         scale: pattern pixels per taxel pitch.
         tap_order: order of the taps in the window.
@@ -38,6 +40,7 @@ class Contract:
         rows: taxel rows.
         cols: taxel columns.
         pitch_mm: taxel pitch, in [mm].
+        arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are float32 always.
         interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
             None where the model gives no deviation.
         training_sha256: of the training configuration.
@@ -46,6 +49,7 @@ class Contract:
     """
 
     version: int
+    batch: int
     taps: int
     scale: int
     tap_order: str
@@ -58,6 +62,7 @@ class Contract:
     rows: int
     cols: int
     pitch_mm: float
+    arithmetic: str
     interval_factor: float | None
     training_sha256: str
     test_set_sha256: str
@@ -65,8 +70,8 @@ class Contract:
 
     @property
     def window_shape(self) -> tuple[int, int, int, int]:
-        """Shape of the network's input: (1, 3 taps, rows, cols), a tap's x, y, z side by side."""
-        return (1, 3 * self.taps, self.rows, self.cols)
+        """Shape of the network's input: (batch, 3 taps, rows, cols), a tap's x, y, z side by side."""
+        return (self.batch, 3 * self.taps, self.rows, self.cols)
 
     @property
     def pattern_shape(self) -> tuple[int, int]:
@@ -75,9 +80,9 @@ class Contract:
 
     @property
     def output_shapes(self) -> dict[str, tuple[int, int, int]]:
-        """Shapes (1, H, W) of the network's outputs by name: the pattern, and its deviation if there is one."""
+        """Shapes (batch, H, W) of the network's outputs by name: the pattern, and its deviation if there is one."""
         names = (OUTPUT_NAME,) if self.interval_factor is None else (OUTPUT_NAME, DEVIATION_NAME)
-        return dict.fromkeys(names, (1, *self.pattern_shape))
+        return dict.fromkeys(names, (self.batch, *self.pattern_shape))
 
     def to_metadata(self) -> dict[str, str]:
         """The contract as the string map that ONNX metadata holds."""
@@ -135,11 +140,13 @@ def _check(values: Mapping[str, Any]) -> None:
     def refuse(key: str, expected: str) -> None:
         raise ModelError(f"contract key '{key}' is {values[key]!r}, expected {expected}")
 
-    for key in ("taps", "scale", "rows", "cols"):
+    for key in ("batch", "taps", "scale", "rows", "cols"):
         if type(values[key]) is not int or values[key] < 1:
             refuse(key, "a whole number from 1")
     if values["tap_order"] != TAP_ORDER:
         refuse("tap_order", repr(TAP_ORDER))
+    if values["arithmetic"] not in ARITHMETICS:
+        refuse("arithmetic", " or ".join(map(repr, ARITHMETICS)))
     for key in ("output_full_scale", "pitch_mm", "contact_level"):
         if not _is_number(values[key]) or values[key] <= 0:
             refuse(key, "a positive number")

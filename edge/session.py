@@ -44,6 +44,11 @@ class ModelSession:
         session = _load(path)
         try:
             self.contract = Contract.from_metadata(session.get_modelmeta().custom_metadata_map)
+            if self.contract.batch != 1:
+                raise ModelError(
+                    f"contract key 'batch' is {self.contract.batch}, but windows are run one at a time here: export it "
+                    "without --batch"
+                )
             _check_tensors("input", session.get_inputs(), {INPUT_NAME: self.contract.window_shape})
             _check_tensors("output", session.get_outputs(), self.contract.output_shapes)
         except ModelError as error:

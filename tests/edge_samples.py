@@ -23,7 +23,8 @@ BASELINE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file
 
 def make_contract(**changes) -> Contract:
     values = {
-        "version": 2,
+        "version": 3,
+        "batch": 1,
         "taps": 4,
         "scale": 10,
         "tap_order": "newest first",
@@ -36,6 +37,7 @@ def make_contract(**changes) -> Contract:
         "rows": 4,
         "cols": 4,
         "pitch_mm": 4.7,
+        "arithmetic": "float32",
         "interval_factor": None,
         "training_sha256": "ab" * 32,
         "test_set_sha256": "cd" * 32,

@@ -397,9 +397,9 @@ class TestModels:
         out = capsys.readouterr().out.splitlines()
         size_mb = (tmp_path / "mtsr4.onnx").stat().st_size / 1e6
         figures = ["psnr_db", "33.2,", "rmse_percent", "2.1"]
-        assert out[1].split() == ["mtsr4", "4", "x10", f"{size_mb:.1f}", "MB", *figures]
+        assert out[1].split() == ["mtsr4", "4", "x10", f"{size_mb:.1f}", "MB", "float32", *figures]
         figures = ["psnr_db", "30.1,", "coverage_90", "0.903"]
-        assert out[2].split() == ["stsr", "1", "x10", f"{size_mb:.1f}", "MB", *figures]
+        assert out[2].split() == ["stsr", "1", "x10", f"{size_mb:.1f}", "MB", "float32", *figures]
 
     def test_none_bundled_is_4(self, monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)

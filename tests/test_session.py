@@ -125,6 +125,7 @@ def test_denormals_become_zero(session):
 
 BROKEN_VALUES = {
     "version": 1,
+    "batch": 0,
     "taps": 0,
     "scale": "10",
     "tap_order": "oldest first",
@@ -137,6 +138,7 @@ BROKEN_VALUES = {
     "rows": 4.0,
     "cols": -4,
     "pitch_mm": 0,
+    "arithmetic": "int4",
     "interval_factor": 0,
     "training_sha256": None,
     "test_set_sha256": "",
@@ -164,7 +166,7 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
     metadata = make_contract(version=1).to_metadata()
     del metadata[KEY_PREFIX + "interval_factor"]
-    with pytest.raises(ModelError, match=r"'version' is 1, expected 2: export the model again"):
+    with pytest.raises(ModelError, match=r"'version' is 1, expected 3: export the model again"):
         ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
 
 
