@@ -8,13 +8,17 @@ import torch
 from onnx import numpy_helper
 from test_dataset import make_sequences
 
-from edge.contract import CONTRACT_VERSION
+from edge.contract import CONTRACT_VERSION, Contract
+from edge.errors import ModelError
 from edge.frozen import FrozenSet
 from edge.judge import judge, judge_model, mean_error
 from edge.session import ModelSession
 from export import to_onnx
-from export.errors import ParityError
-from export.to_onnx import check_parity, export, main, parity_windows
+from export.errors import ExportError, ParityError
+from export.graph import to_model
+from export.parity import GraphRun, check_parity, read_windows
+from export.to_onnx import export, main
+from firmware_bridge.geometry import USPA44
 from train.calibration import half_width_mm, interval_coverage
 from train.errors import CheckpointError
 from train.freeze import freeze
@@ -147,21 +151,54 @@ def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp
     for weight in model.graph.initializer:
         if weight.name.startswith(head) and weight.name.endswith(".bias"):
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * 1.001, weight.name))
-    monkeypatch.setattr(to_onnx, "to_model", lambda net, geometry: model)
+    monkeypatch.setattr(to_onnx, "to_model", lambda net, geometry, batch=1: model)
     with pytest.raises(ParityError, match=f"differ by .* in the {'pattern' if head == 'leave' else 'deviation'}"):
         export(folder / "sure.pt", tmp_path, frozen)
     assert not list(tmp_path.iterdir())
 
 
-def test_parity_is_checked_on_readings_of_every_force_and_on_extremes(folder, session, frozen):
-    windows = parity_windows(frozen, session.contract)
-    assert windows.shape[1:] == (2, 3, 4, 4) and windows.dtype == np.float32
-    assert (windows.max(axis=(1, 2, 3, 4)) == 0).any() and windows.max() == 1e4
-    many = at_frames(frozen, np.tile(np.arange(len(frozen)), 20))
-    taken = len(parity_windows(many, session.contract))
-    assert 50 < taken < 250 < len(many)
-    net, _ = load_network(folder / "sure.pt")
-    assert check_parity(net, session, windows) < 5e-6
+def test_a_batch_is_one_run_of_many_windows(folder, frozen, tmp_path):
+    export(folder / "sure.pt", tmp_path, frozen, batch=3)
+    model = onnx.load(tmp_path / "sure.onnx")
+    contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+    assert contract.batch == 3 and contract.window_shape == (3, 6, 4, 4)
+    windows = read_windows(frozen, contract)[:7]
+    single = GraphRun(onnx.load(folder / "sure.onnx"))
+    for together, alone in zip(GraphRun(model)(windows), single(windows), strict=True):
+        np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-7)
+    with pytest.raises(ModelError, match=r"'batch' is 3, .* export it without --batch"):
+        ModelSession(tmp_path / "sure.onnx")
+    with pytest.raises(ExportError, match="a batch of 0 asked for"):
+        export(folder / "sure.pt", tmp_path, frozen, batch=0)
+
+
+@pytest.mark.parametrize("taps", range(1, 8))
+@pytest.mark.parametrize("kind", ["", "compact-"])
+def test_every_network_of_both_families_is_exported(tmp_path, taps, kind):
+    name = f"{kind}mtsr{taps}" if taps > 1 else f"{kind}stsr"
+    options = {"channels": 8, "blocks": 1} if kind else {}
+    seven = at_frames(freeze(make_sequences(taps=7, seed=1), Nuisances.none(), seed=1, scale=10), slice(0, 96, 30))
+    export(save_untrained(tmp_path / "one.pt", name, 4, **options), tmp_path, seven)
+    assert ModelSession(tmp_path / "one.onnx").contract.taps == taps
+
+
+@pytest.mark.parametrize("scale", [4, 6, 8, 10, 20])
+def test_every_scale_is_exported(frozen, tmp_path, scale):
+    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", scale, channels=8, blocks=1)
+    assert f"x{scale}" in export(path, tmp_path, frozen)
+    assert ModelSession(tmp_path / "one.onnx").contract.pattern_shape == (4 * scale, 4 * scale)
+
+
+def test_batch_normalisation_is_folded_into_the_convolutions(frozen, tmp_path):
+    net = build("mtsr2", 4).eval()
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            torch.nn.init.uniform_(module.running_mean, -1, 1)
+            torch.nn.init.uniform_(module.running_var, 0.5, 2)
+    model = to_model(net, USPA44)
+    assert "BatchNormalization" not in {node.op_type for node in model.graph.node}
+    windows = np.random.default_rng(0).normal(size=(3, 6, 4, 4)).astype(np.float32)
+    assert check_parity(net, model, windows, 0.5) < 1e-5
 
 
 def test_what_is_no_checkpoint_is_refused(folder, frozen, tmp_path):
@@ -181,6 +218,39 @@ def test_the_command_ends_in_one_line(frozen, tmp_path, monkeypatch):
     monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
     with pytest.raises(SystemExit, match=r"^export: .*none\.pt"):
         main([str(tmp_path / "none.pt"), "--out", str(tmp_path)])
+
+
+def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, monkeypatch, capsys):
+    """First weights tell nothing apart, so two steps of training change nothing that is seen."""
+    frozen.save(tmp_path / "frozen.npz")
+    make_sequences(count=40).save(tmp_path / "taps.npz")
+    monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
+    monkeypatch.setattr(to_onnx, "held_out", lambda split: make_sequences(count=6, seed=2))
+    monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
+    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=8, blocks=1)
+    command = [str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz"), "--fine-tune-steps", "2"]
+    with pytest.raises(SystemExit, match=r"^export: integers cost .* in one-int8\.onnx: use the float32 model"):
+        main(command)
+    line = capsys.readouterr().out
+    assert line.startswith("one-int8.onnx") and "fine-tuned 2 steps" in line
+    contract = ModelSession(tmp_path / "one-int8.onnx").contract
+    assert contract.arithmetic == "int8"
+    assert (contract.training_sha256 == "ab" * 32) == ("not taken" in line)
+
+
+@pytest.mark.parametrize(
+    "option", [["--all-integers"], ["--fine-tune-steps", "3"], ["--int8", "x", "--fine-tune-steps", "-1"]]
+)
+def test_options_that_do_not_fit_are_a_usage_error(option):
+    with pytest.raises(SystemExit) as end:
+        main(["one.pt", *option])
+    assert end.value.code == 2
+
+
+def test_a_folder_that_is_a_file_ends_in_one_line(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(SystemExit, match=r"^export: .*taken: File exists"):
+        main(["one.pt", "--out", str(tmp_path / "taken")])
 
 
 def test_the_command_is_as_written(capsys):

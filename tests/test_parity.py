@@ -1,0 +1,249 @@
+"""Every bundled model computes what its network computes, at every level, and in a second runtime."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import numpy_helper
+
+from edge.bundle import BUNDLE_DIR, bundled_models, find_model
+from edge.contract import Contract
+from edge.errors import ModelError
+from edge.frozen import load_frozen_set
+from edge.judge import judge_model
+from edge.session import ModelSession
+from export import verify as verify_module
+from export.errors import ExportError, ParityError
+from export.graph import outputs
+from export.int8 import convolutions
+from export.parity import LEVELS, GraphRun, differences, extreme_windows, read_windows
+from export.reference import network_of
+from export.verify import Parity, main, table, verify
+
+MODELS = [path.stem for path in bundled_models()]
+IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]
+IN_INTEGERS = [name for name in MODELS if name.endswith("-int8")]
+
+
+@cache
+def frozen():
+    return load_frozen_set(BUNDLE_DIR / "frozen.npz")
+
+
+@cache
+def rows(name):
+    return list(verify(find_model(name), frozen()))
+
+
+def graph_of(name):
+    model = onnx.load(find_model(name))
+    return model, Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+
+
+def save(model, path):
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def test_every_network_is_bundled_in_both_arithmetics():
+    assert IN_FLOAT and [f"{name}-int8" for name in IN_FLOAT] == IN_INTEGERS
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_bundled_model_keeps_every_bound_at_every_level(name):
+    assert [row for row in rows(name) if row.broken] == []
+    assert {row.level for row in rows(name)} == set(LEVELS)
+    assert {"test set", "zeros", "denormals", "one hot taxel", "1000 x full range"} <= {
+        row.windows for row in rows(name)
+    }
+
+
+@pytest.mark.parametrize("name", IN_INTEGERS)
+def test_integers_cost_a_tenth_of_a_decibel_at_most(name):
+    lost_db = [-row.psnr_change_db for row in rows(name) if row.psnr_change_db is not None]
+    assert len(lost_db) == len(LEVELS) and 0 < max(lost_db) <= 0.1
+    session, in_float = (ModelSession(find_model(each)) for each in (name, name.removesuffix("-int8")))
+    taps = str(session.contract.taps)
+    said_db = in_float.contract.test_error[taps]["psnr_db"] - session.contract.test_error[taps]["psnr_db"]
+    assert said_db == pytest.approx(max(lost_db), abs=2e-3)
+    assert (session.contract.arithmetic, in_float.contract.arithmetic) == ("int8", "float32")
+
+
+@pytest.mark.parametrize("name", IN_INTEGERS)
+def test_most_convolutions_run_in_integers(name):
+    model, _ = graph_of(name)
+    integer, every = convolutions(model)
+    assert integer >= 14 and every == 23
+    assert convolutions(graph_of(name.removesuffix("-int8"))[0])[0] == 0
+    assert {output.type.tensor_type.elem_type for output in model.graph.output} == {onnx.TensorProto.FLOAT}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_another_runtime_computes_the_same(name):
+    """A model is portable only if two runtimes agree."""
+    openvino = pytest.importorskip("openvino")
+    model, contract = graph_of(name)
+    core = openvino.Core()
+    compiled = core.compile_model(
+        core.read_model(model.SerializeToString()),
+        "CPU",
+        {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1},
+    )
+    windows = read_windows(frozen(), contract)
+    given = [[np.array(maps) for maps in compiled([window[None]]).values()] for window in windows]
+    theirs = [np.concatenate(maps) for maps in zip(*given, strict=True)]
+    # In integers the two round where neither is wrong: the maps differ by a step here and there.
+    bound = 1e-5 if contract.arithmetic == "float32" else 0.15
+    for difference in differences(
+        list(contract.output_shapes), GraphRun(model)(windows), theirs, contract.output_full_scale
+    ):
+        assert difference.relative < bound
+    if contract.arithmetic == "int8":
+        every = read_windows(frozen(), contract, None)
+        judged = judge_model(ModelSession(find_model(name)), frozen())["psnr_db"].mean()
+        patterns = np.concatenate([np.array(next(iter(compiled([window[None]]).values()))) for window in every])
+        error = np.mean((patterns - frozen().patterns()) ** 2, axis=(1, 2))
+        assert np.mean(10 * np.log10(frozen().full_scale_mm ** 2 / error)) == pytest.approx(judged, abs=0.05)
+
+
+@pytest.mark.parametrize("name", IN_FLOAT)
+def test_the_network_is_made_again_from_its_graph(name):
+    model, contract = graph_of(name)
+    net = network_of(model)
+    assert (net.taps, net.scale, net.training) == (contract.taps, contract.scale, False)
+    del model.metadata_props[:]
+    with pytest.raises(ExportError, match=r"'tactile\.origin' is missing"):
+        network_of(model)
+
+
+def test_a_graph_without_its_weights_asks_for_the_checkpoint():
+    model, _ = graph_of("stsr")
+    model.graph.initializer[0].name = "folded"
+    with pytest.raises(ExportError, match=r"does not hold .* name its checkpoint"):
+        network_of(model)
+
+
+def spoiled(name, factor):
+    """A bundled graph one of whose biases is another, its network's weights as they were."""
+    model, _ = graph_of(name)
+    (bias,) = [weight for weight in model.graph.initializer if weight.name == "leave.0.bias"]
+    bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) * np.float32(factor), bias.name))
+    return model
+
+
+def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeypatch, capsys):
+    path = save(spoiled("stsr", 1.01), tmp_path / "stsr.onnx")
+    monkeypatch.setattr(verify_module, "network_of", lambda _: network_of(graph_of("stsr")[0]))
+    with pytest.raises(SystemExit, match=r"verify: \d+ of \d+ comparisons break a bound"):
+        main([str(path)])
+    printed = capsys.readouterr().out
+    assert "pattern differs by" in printed and "more than 1e-05" in printed
+
+
+def test_integers_that_cost_too_much_break_the_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr(verify_module, "MOST_LOSS_DB", 0.01)
+    broken = [row for row in verify(find_model("stsr-int8"), frozen()) if row.broken]
+    assert len(broken) == len(LEVELS) and all("dB lost, more than 0.01" in row.broken for row in broken)
+
+
+def test_a_deviation_that_is_not_above_zero_breaks_the_bound(monkeypatch):
+    class Sure(GraphRun):
+        def __call__(self, windows):
+            pattern, deviation = super().__call__(windows)
+            return [pattern, deviation * 0]
+
+    monkeypatch.setattr(verify_module, "GraphRun", Sure)
+    assert any(row.broken == "a deviation is not above zero" for row in verify(find_model("stsr-int8"), frozen()))
+
+
+def test_integers_that_say_something_else_break_the_bound(monkeypatch):
+    class Other(GraphRun):
+        def __call__(self, windows):
+            pattern, deviation = super().__call__(windows)
+            return [pattern * np.float32(0.5), deviation]
+
+    monkeypatch.setattr(verify_module, "GraphRun", Other)
+    monkeypatch.setattr(verify_module, "MOST_LOSS_DB", 100)
+    assert any("pattern differs by" in row.broken for row in verify(find_model("stsr-int8"), frozen()))
+
+
+def test_a_network_of_another_training_is_refused(tmp_path):
+    for name, source in (("stsr-int8.onnx", "stsr-int8"), ("stsr.onnx", "mtsr2")):
+        (tmp_path / name).write_bytes(find_model(source).read_bytes())
+    with pytest.raises(SystemExit, match=r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model"):
+        main([str(tmp_path / "stsr-int8.onnx")])
+
+
+@pytest.mark.parametrize("spoil", [np.nan, np.inf])
+def test_what_is_not_finite_is_no_parity(spoil):
+    maps = np.ones((2, 4, 4), np.float32)
+    bad = maps.copy()
+    bad[1, 2, 3] = spoil
+    with pytest.raises(ParityError, match="the pattern is not finite"):
+        differences(["pattern"], [maps], [bad], 0.5)
+    with pytest.raises(ParityError, match="torch gives a pattern that is not finite"):
+        differences(["pattern"], [bad], [maps], 0.5)
+    with pytest.raises(ParityError, match="outputs of shape"):
+        differences(["pattern"], [maps], [maps[:1]], 0.5)
+
+
+def test_a_difference_is_a_share_of_full_scale_or_of_what_is_larger():
+    small, large = np.full((1, 4, 4), 0.1, np.float32), np.full((1, 4, 4), 10.0, np.float32)
+    for size, expected in ((small, 0.02), (large, 0.001)):
+        (found,) = differences(["pattern"], [size], [size + np.float32(0.01)], 0.5)
+        assert found.relative == pytest.approx(expected, rel=1e-4)
+        assert found.largest == pytest.approx(0.01, rel=1e-4)
+
+
+def test_windows_are_of_every_force_and_stiff_ones_beside():
+    _, contract = graph_of("mtsr4")
+    step = read_windows(frozen(), contract)
+    assert step.shape[1:] == (12, 4, 4) and 50 < len(step) < 250 < len(read_windows(frozen(), contract, None))
+    stiff = extreme_windows(contract)
+    assert all(window.shape == (1, 12, 4, 4) and window.dtype == np.float32 for window in stiff.values())
+    bits = stiff["denormals"].view(np.uint32)  # a comparison would take them for zeros
+    assert not stiff["zeros"].any() and bits.min() > 0 and bits.max() < 0x00800000
+    assert stiff["1000 x full range"].max() == pytest.approx(1000 * 32768 / 500)
+    assert not stiff["2 of 4 taps"][:, 6:].any() and stiff["2 of 4 taps"][:, 3:6].any()
+    assert not stiff["rest to full load in one scan"][:, 3:].any()
+
+
+def test_a_batch_that_is_not_full_is_filled_and_cut():
+    model, contract = graph_of("stsr")
+    windows = read_windows(frozen(), contract)[:5]
+    net = network_of(model)
+    for mine, true in zip(GraphRun(model)(windows), outputs(net, torch.from_numpy(windows)), strict=True):
+        np.testing.assert_allclose(mine, true.numpy(), atol=1e-6)
+
+
+def test_the_table_shows_of_extreme_windows_the_worst():
+    row = Parity(
+        "one", "all", "zeros", differences(["pattern"], *[[np.ones((1, 2, 2), np.float32)]] * 2, 0.5), None, ""
+    )
+    other = replace(row, windows="full range", differences=(replace(row.differences[0], relative=1e-6),))
+    lines = table([row, replace(row, windows="test set", psnr_change_db=-0.01), other]).splitlines()
+    assert len(lines) == 4 and "-0.0100" in lines[3] and "full range" in lines[2] and "zeros" not in "".join(lines)
+
+
+def test_integers_alone_ask_for_what_they_are_of(tmp_path):
+    path = tmp_path / "stsr-int8.onnx"
+    path.write_bytes(find_model("stsr-int8").read_bytes())
+    with pytest.raises(SystemExit, match=r"stsr\.onnx, of which these are the integers, is not beside it"):
+        main([str(path)])
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [(None, "cannot be read: No such file"), (b"\xff\xff\xff", "not an ONNX model"), (b"", "contract key 'version'")],
+)
+def test_what_is_no_model_ends_in_one_line(tmp_path, content, complaint):
+    path = tmp_path / "other.onnx"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SystemExit, match=f"^verify: .*other.onnx: {complaint}"):
+        main([str(path)])
+    with pytest.raises(ModelError):
+        list(verify(path, frozen()))
