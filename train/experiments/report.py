@@ -45,11 +45,19 @@ class Report:
 
     def table(self, rows: Sequence[Row], caption: str, part: str = "") -> None:
         """A table of the page, and a CSV of its own: NAME.csv, or NAME-PART.csv."""
-        columns = list(dict.fromkeys(column for row in rows for column in row))
+        self.keep(rows, part)
+        self.show(rows, caption)
+
+    def keep(self, rows: Sequence[Row], part: str = "") -> None:
+        """A CSV: NAME.csv, or NAME-PART.csv."""
         with self._file(".csv", part).open("w", newline="") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer = csv.DictWriter(file, _columns(rows), lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
+
+    def show(self, rows: Sequence[Row], caption: str) -> None:
+        """A table of the page."""
+        columns = _columns(rows)
         lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
         lines += [" | ".join(_shown(row.get(column)) for column in columns) for row in rows]
         self._parts.append("\n".join([caption, "", *(f"| {line} |" for line in lines)]))
@@ -94,6 +102,10 @@ def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digit
     return f"{float(np.mean(values)):.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
 
 
+def _columns(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(column for row in rows for column in row))
+
+
 def _shown(cell: Cell) -> str:
     if cell is None:
         return "-"
@@ -101,7 +113,7 @@ def _shown(cell: Cell) -> str:
 
 
 def _circumstances() -> str:
-    command = " ".join(["python", *(["-m", "train.experiments"] if sys.argv[0].endswith("__main__.py") else [])])
-    command += "".join(f" {shlex.quote(word)}" for word in sys.argv[1:])
+    module = getattr(sys.modules["__main__"].__spec__, "parent", None)
+    command = shlex.join(["python", *(["-m", module] if module else []), *sys.argv[1:]])
     date = datetime.now(UTC).date().isoformat()
     return f"`{command}`, {date}, {platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"

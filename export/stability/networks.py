@@ -1,0 +1,59 @@
+"""The networks in both arithmetics on windows that no training holds: finite, and as torch in float64."""
+
+import copy
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+
+from edge.bundle import bundled_models
+from edge.contract import Contract
+from export.graph import outputs
+from export.parity import GraphRun, extreme_windows
+from export.reference import contract_in, in_float, network_of
+from export.stability.case import Case, timed
+from train.networks.blocks import PatternNet
+
+PART: Final = "networks"
+FLOAT: Final = 1e-5
+"""float32 against float64, as a share of the largest value that the network gives."""
+INT8: Final = {"zeros": 1e-3, "denormals": 1e-3, "a count in one taxel": 1e-3, "one hot taxel": 0.1}
+"""The same for integers; presses with some of the taps by INT8_PRESS, what is beyond any touch by INT8_BEYOND."""
+INT8_PRESS: Final = 0.05
+INT8_BEYOND: Final = 0.5
+"""Ranges were taken of touches that happen: a bound against nonsense, not an accuracy."""
+
+
+def cases(quick: bool = False) -> Iterator[Case]:
+    """All of them, of every bundled model."""
+    for path in bundled_models()[:2] if quick else bundled_models():
+        model = onnx.load(path)
+        yield from of_graph(path.stem, model, network_of(onnx.load(in_float(path))), contract_in(model))
+
+
+def of_graph(name: str, model: onnx.ModelProto, net: PatternNet, contract: Contract) -> Iterator[Case]:
+    """One graph, against the network that it was made of."""
+    run, double = GraphRun(model), copy.deepcopy(net).double()
+    for severity, window in extreme_windows(contract).items():
+        given, run_ms = timed(lambda window=window: run(window))
+        true = [maps.numpy() for maps in outputs(double, torch.from_numpy(_felt(window)).double())]
+        size = max(float(np.abs(maps).max()) for maps in true)
+        apart = max(float(np.abs(mine - maps).max()) for mine, maps in zip(given, true, strict=True))
+        most = FLOAT if contract.arithmetic == "float32" else _most(severity)
+        sound = all(np.isfinite(maps).all() for maps in given) and bool((given[-1] > 0).all() or len(given) == 1)
+        value = apart / max(size, contract.output_full_scale) if sound else float("nan")
+        yield Case(
+            PART, name, severity, "to torch in float64, all finite", value, most, run_ms, note=f"largest {size:.2g} mm"
+        )
+
+
+def _most(severity: str) -> float:
+    return INT8.get(severity, INT8_PRESS if severity.endswith("taps") else INT8_BEYOND)
+
+
+def _felt(window: NDArray[np.float32]) -> NDArray[np.float32]:
+    """As the runtime feels it: a denormal is none."""
+    return np.where(np.abs(window) < np.finfo(np.float32).tiny, np.float32(0), window)
