@@ -22,6 +22,8 @@ models: $(VENV)/.dev data/seen.npz data/figures.npz  ## retrain and re-export th
 	$(BIN)/python -m train.freeze edge/models --data data/seen.npz data/figures.npz
 	$(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/seen.npz data/figures.npz
 	$(BIN)/python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt --out edge/models
+	$(BIN)/python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt --out edge/models --int8 data/seen.npz data/figures.npz
+	$(BIN)/python -m export.verify edge/models/*.onnx
 
 data/seen.npz: $(VENV)/.dev  ## taps on the 18 surfaces
 	$(BIN)/python -m train.generate $@ --taps 7 --seed 1

@@ -13,7 +13,8 @@ from edge.judge import by_surface, judge, judge_model, mean_error
 from edge.session import ModelSession
 from firmware_bridge.geometry import USPA44
 
-NAMES = ("stsr", "mtsr2", "mtsr4")
+IN_FLOAT = ("stsr", "mtsr2", "mtsr4")
+NAMES = (*IN_FLOAT, *(f"{name}-int8" for name in IN_FLOAT))
 
 
 @cache
@@ -37,7 +38,7 @@ def classical_psnr_db():
     return {name: judge(method(newest), frozen(), 0.5)["psnr_db"] for name, method in methods.items()}
 
 
-def test_the_three_models_are_there_each_in_one_small_file():
+def test_the_models_are_there_each_in_one_small_file():
     assert {path.stem for path in bundled_models()} == set(NAMES)
     for path in bundled_models():
         assert path.stat().st_size < 3e6

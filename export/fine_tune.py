@@ -1,0 +1,193 @@
+"""Networks trained a little more as their integers will compute, where rounding what is trained costs too much."""
+
+import contextlib
+import copy
+import hashlib
+import json
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from edge.frozen import FrozenSet
+from edge.metrics import psnr_db
+from export.graph import to_model
+from export.int8 import quantised
+from export.parity import GraphRun
+from export.rounding import integer_convolutions, rounded
+from firmware_bridge.geometry import SensorGeometry
+from train.batches import Draw, WindowBatches, network_input
+from train.calibration import calibrate
+from train.dataset import Sequences
+from train.fit import given_taps
+from train.freeze import SEED, freeze
+from train.loop import Recipe, train
+from train.networks.blocks import PatternNet
+from train.networks.compact import CompactNet, HeteroscedasticError
+from train.nuisances import Nuisances
+from train.objectives import RelativeError
+
+
+@dataclass(frozen=True, slots=True)
+class FineTuning:
+    """When and how networks are trained on for integers.
+
+    Attributes:
+        steps: optimizer steps.
+        validation: flat sequences, of no test and no training, by which it is decided and deviations are calibrated.
+        learning_rate: highest of the one cycle. With four times as much the bundled single-tap network, all in
+            integers, keeps nine tenths of its loss, with this six.
+        batch: windows in a batch.
+        seed: of the draws.
+    """
+
+    steps: int
+    validation: Sequences
+    learning_rate: float = 1e-4
+    batch: int = 64
+    seed: int = 1
+
+    def recipe(self, taps: int) -> Recipe:
+        """How a network of so many taps is trained on."""
+        return Recipe(self.steps, self.batch, self.learning_rate, given=given_taps(taps))
+
+    def frozen(self, scale: int) -> FrozenSet:
+        """The validation set of training, at a scale."""
+        return freeze(self.validation, Nuisances(), SEED, scale=scale)
+
+    def sha256(self, training_sha256: str, data_sha256: str, *, every: bool) -> str:
+        """Hash of all that decides the weights of a network that was trained and then trained on."""
+        own = [self.steps, self.learning_rate, self.batch, self.seed, every]
+        return hashlib.sha256(json.dumps([training_sha256, data_sha256, *own]).encode()).hexdigest()
+
+
+def fine_tuned(
+    net: PatternNet,
+    model: onnx.ModelProto,
+    quantised_model: onnx.ModelProto,
+    sequences: Sequences,
+    recipe: Recipe,
+    seed: int = 1,
+) -> PatternNet:
+    """A copy of a network, trained on while its convolutions compute as integers will.
+
+    Ranges of values stay those of the quantised graph; scales of weights follow the weights. What comes back holds
+    plain weights, to be exported and quantised anew with ranges measured again, and then `recalibrated`.
+
+    Args:
+        net: without batch normalisation, see `export.rounding.folded`.
+        model: its graph in float.
+        quantised_model: its graph in integers.
+        sequences: training taps, of at least as many taps as it takes.
+        recipe: how.
+        seed: of the draws.
+
+    Raises:
+        ExportError: the graph has convolutions that the network lacks.
+        DatasetError: the sequences have fewer taps than the network takes.
+        DivergedError: the learning rate is too high.
+    """
+    trained = copy.deepcopy(net)
+    objective = HeteroscedasticError() if isinstance(trained, CompactNet) else RelativeError()
+    batches = WindowBatches(sequences.at_scale(net.scale), Draw(), recipe.given, recipe.batch, seed)
+    with contextlib.ExitStack() as done:
+        done.enter_context(rounded(trained, integer_convolutions(model, quantised_model)))
+        folder = done.enter_context(tempfile.TemporaryDirectory())
+        train(trained, objective, batches, recipe, Path(folder) / "fine-tune.resume")
+        trained.cpu()
+    plain = copy.deepcopy(net)
+    plain.load_state_dict(trained.state_dict())
+    return plain.eval()
+
+
+def recalibrated(net: PatternNet, integers: onnx.ModelProto, validation: FrozenSet) -> PatternNet:
+    """A copy whose deviations, where it has any, tell the errors of its graph in integers.
+
+    Those of the network are no measure: a background that is flat in float is cut to whole steps in integers.
+
+    Args:
+        net: of these weights, in float.
+        integers: its graph.
+        validation: of the network's scale.
+    """
+    other = copy.deepcopy(net)
+    if isinstance(other, CompactNet):
+        patterns, deviations = GraphRun(integers)(network_input(validation.windows(net.taps)).numpy())
+        other.deviation_scale *= calibrate(validation.patterns(), patterns, deviations)
+    return other
+
+
+@dataclass(frozen=True, slots=True)
+class Quantised:
+    """A network in integers, and what they cost.
+
+    Attributes:
+        net: of these weights, in float.
+        model: its graph in float, of a batch of one.
+        integers: its graph in integers, of a batch of one.
+        trained_on: whether the weights are others than those given.
+        said: what was done and what it brought, in a few words; empty where nothing was.
+    """
+
+    net: PatternNet
+    model: onnx.ModelProto
+    integers: onnx.ModelProto
+    trained_on: bool = False
+    said: str = ""
+
+
+def quantised_well(
+    net: PatternNet,
+    geometry: SensorGeometry,
+    windows: NDArray[np.float32],
+    sequences: Sequences,
+    tuning: FineTuning | None,
+    most_loss_db: float,
+    *,
+    every: bool = False,
+) -> Quantised:
+    """A network in integers, trained on for them where they cost more than `most_loss_db` on the validation set.
+
+    Weights that are no better for it are not taken.
+
+    Args:
+        net: without batch normalisation, see `export.rounding.folded`.
+        geometry: of the sensor.
+        windows: of which ranges are taken, see `export.int8.quantised`.
+        sequences: training taps.
+        tuning: how it is trained on, or None for never.
+        most_loss_db: what integers may cost.
+        every: all convolutions in integers.
+
+    Raises:
+        ExportError: nothing of the graph can be done in integers.
+        DivergedError: the learning rate is too high.
+    """
+    model = to_model(net, geometry)
+    plain = Quantised(net, model, quantised(model, windows, every=every))
+    if tuning is None:
+        return plain
+    validation = tuning.frozen(net.scale)
+    in_float_db = graph_psnr_db(model, net.taps, validation)
+    before_db = in_float_db - graph_psnr_db(plain.integers, net.taps, validation)
+    if before_db <= most_loss_db:
+        return plain
+    recipe = tuning.recipe(net.taps)
+    other = fine_tuned(net, model, plain.integers, sequences, recipe, tuning.seed)
+    integers = quantised(to_model(other, geometry), windows, every=every)
+    now_db = in_float_db - graph_psnr_db(integers, net.taps, validation)
+    said = f"fine-tuned {tuning.steps} steps: before {before_db:.3f} dB lost in validation, now {now_db:.3f}"
+    if now_db >= before_db:
+        return replace(plain, said=f"{said}, so not taken")
+    other = recalibrated(other, integers, validation)
+    model = to_model(other, geometry)
+    return Quantised(other, model, quantised(model, windows, every=every), trained_on=True, said=said)
+
+
+def graph_psnr_db(model: onnx.ModelProto, taps: int, validation: FrozenSet) -> float:
+    """Mean PSNR of a graph's patterns on a frozen set of its scale, in [dB]."""
+    patterns = GraphRun(model)(network_input(validation.windows(taps)).numpy())[0]
+    return float(np.mean(psnr_db(patterns, validation.patterns(), validation.full_scale_mm)))

@@ -1,0 +1,61 @@
+"""Networks to ONNX graphs: fixed shapes, one file, nothing of the machine they were made on."""
+
+import logging
+import warnings
+from typing import Final
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME
+from export.errors import ExportError
+from firmware_bridge.geometry import SensorGeometry
+from train.networks.blocks import PatternNet
+
+OPSET: Final = 18
+
+
+def to_model(net: PatternNet, geometry: SensorGeometry, batch: int = 1) -> onnx.ModelProto:
+    """The network as an ONNX graph of a fixed batch, checked, without a contract yet.
+
+    The exporter folds batch normalisation into the convolutions before it.
+
+    Raises:
+        ExportError: the batch is not positive, or torch gives no graph.
+    """
+    if batch < 1:
+        raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
+    example = torch.zeros(batch, 3 * net.taps, geometry.rows, geometry.cols)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not there
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # torch's own, about torch's own
+        program = torch.onnx.export(
+            net,
+            (example,),
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=[INPUT_NAME],
+            output_names=[OUTPUT_NAME, DEVIATION_NAME][: len(outputs(net, example))],
+            verbose=False,
+        )
+    if program is None:
+        raise ExportError("torch.onnx.export gave no program")
+    model = program.model_proto
+    graph = model.graph
+    # Where a layer was traced from is the exporter's affair, and holds paths of the machine it ran on.
+    del model.metadata_props[:]
+    for node in graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ""
+    for value in (*graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        del value.metadata_props[:]
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def outputs(net: nn.Module, windows: Tensor) -> tuple[Tensor, ...]:
+    """The patterns, and their deviations where the network gives any."""
+    with torch.inference_mode():
+        given = net(windows)
+    return given if isinstance(given, tuple) else (given,)

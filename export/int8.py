@@ -1,0 +1,168 @@
+"""Graphs in 8-bit integers: unsigned activations, signed weights with a scale for each channel, float in and out.
+
+What is worth it is worth it where the time goes: the convolutions of the largest grid but for those that give the
+outputs. Those of smaller grids, which read the taxels, stay in float: they take a tenth of the time, and what they lose
+no later layer finds again (docs/log.md).
+"""
+
+import contextlib
+import io
+import logging
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import onnx
+import onnxruntime
+from numpy.typing import NDArray
+from onnx import NodeProto
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
+
+from edge.contract import INPUT_NAME, Contract
+from edge.session import LOG_FATAL_ONLY
+from export.errors import ExportError
+from train.batches import Draw, WindowBatches, network_input
+from train.dataset import Sequences
+
+_PERCENTILE: Final = 99.999
+"""Of a layer's values lie within its range; what lies beyond is cut. With the whole range the bundled models lose .03
+to .07 dB more: few values are that large, and all others pay for them with coarser steps."""
+_PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
+"""Done in integers where any or all of what they take is."""
+
+
+_CALIBRATED_ON: Final = 512
+_FEWEST: Final = 32
+_SET_FORCE_N: Final = (0.3, 8.0)
+"""Of the taps that ranges are taken of: light ones count as much."""
+
+
+def calibration_windows(taps: Sequences, contract: Contract) -> NDArray[np.float32]:
+    """Windows (n, 3K, rows, cols) in network units, drawn from training taps as training does, light contacts too.
+
+    Raises:
+        DatasetError: the sequences have fewer taps than the network takes.
+        ExportError: there are too few sequences for ranges to mean anything.
+    """
+    if len(taps) < _FEWEST:
+        raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
+    few = taps.pick(np.unique(np.linspace(0, len(taps) - 1, min(len(taps), _CALIBRATED_ON)).round().astype(int)))
+    given = (1 / contract.taps,) * contract.taps
+    batches = WindowBatches(few.at_scale(contract.scale), Draw(set_force_n=_SET_FORCE_N), given, len(few), seed=0)
+    return network_input(batches.draw(0)[0]).numpy()
+
+
+class _Windows(CalibrationDataReader):
+    def __init__(self, windows: NDArray[np.float32], batch: int) -> None:
+        filled = np.concatenate([windows, np.resize(windows, (-len(windows) % batch, *windows.shape[1:]))])
+        self._left: Iterator[NDArray[np.float32]] = iter(filled.reshape(-1, batch, *windows.shape[1:]))
+
+    def get_next(self) -> dict[str, NDArray[np.float32]] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        window = next(self._left, None)
+        return None if window is None else {INPUT_NAME: window}
+
+
+def quantised(model: onnx.ModelProto, windows: NDArray[np.float32], *, every: bool = False) -> onnx.ModelProto:
+    """The same graph with quantise and dequantise nodes around what may be done in integers.
+
+    Args:
+        model: in float.
+        windows: (n, 3K, rows, cols) in network units, of which the ranges are taken: light contacts among them.
+        every: all convolutions, not only those that are worth it.
+
+    Raises:
+        ExportError: nothing in the graph may be done in integers.
+    """
+    nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value
+    if not nodes:
+        raise ExportError("no convolution of the graph may be done in integers: export it without --int8")
+    with tempfile.TemporaryDirectory() as drafts, _quiet():
+        path = Path(drafts) / "int8.onnx"
+        quantize_static(
+            onnx.ModelProto.FromString(model.SerializeToString()),
+            path,
+            _Windows(windows, batch),
+            quant_format=QuantFormat.QDQ,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            per_channel=True,
+            op_types_to_quantize=["Conv", *_PASSING_ON],
+            nodes_to_quantize=nodes,
+            calibrate_method=CalibrationMethod.Percentile,
+            extra_options={"CalibPercentile": _PERCENTILE},
+        )
+        integers = onnx.load(path)
+    onnx.checker.check_model(integers, full_check=True)
+    return integers
+
+
+def integer_nodes(model: onnx.ModelProto, *, every: bool = False) -> list[str]:
+    """Names of the nodes that are done in integers, in the graph's order; `every`: all convolutions among them."""
+    shapes = _shapes(model)
+    made_by = {name: node for node in model.graph.node for name in node.output}
+    convs = [node for node in model.graph.node if node.op_type == "Conv"]
+    largest = max((_pixels(shapes, node) for node in convs), default=0)
+    last = _last_convolutions(model, made_by)
+    chosen = {node.name for node in convs if every or (_pixels(shapes, node) == largest and node.name not in last)}
+    for node in model.graph.node:  # every node stands behind those that it takes from
+        takes = [made_by[name].name for name in node.input if name in made_by]
+        if takes and _PASSING_ON.get(node.op_type, _never)(name in chosen for name in takes):
+            chosen.add(node.name)
+    return [node.name for node in model.graph.node if node.name in chosen]
+
+
+def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
+    """How many convolutions onnxruntime runs in integers once it has optimised a graph, and how many there are."""
+    with tempfile.TemporaryDirectory() as drafts:
+        path = Path(drafts) / "optimised.onnx"
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = LOG_FATAL_ONLY
+        options.optimized_model_filepath = str(path)
+        onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        kinds = [node.op_type for node in onnx.load(path).graph.node if "Conv" in node.op_type]
+    return kinds.count("QLinearConv"), len(kinds)
+
+
+def _never(_: Iterable[bool]) -> bool:
+    return False
+
+
+def _last_convolutions(model: onnx.ModelProto, made_by: dict[str, NodeProto]) -> set[str]:
+    """Those from which an output is made without another convolution between."""
+    found, behind = set(), [value.name for value in model.graph.output]
+    while behind:
+        node = made_by.get(behind.pop())
+        if node is None:
+            continue
+        if node.op_type == "Conv":
+            found.add(node.name)
+        else:
+            behind += node.input
+    return found
+
+
+def _shapes(model: onnx.ModelProto) -> dict[str, list[int]]:
+    inferred = onnx.shape_inference.infer_shapes(model)
+    return {
+        value.name: [length.dim_value for length in value.type.tensor_type.shape.dim]
+        for value in (*inferred.graph.value_info, *inferred.graph.output)
+    }
+
+
+def _pixels(shapes: dict[str, list[int]], node: NodeProto) -> int:
+    height, width = shapes[node.output[0]][-2:]
+    return height * width
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[Any]:
+    """The quantiser prints and warns of steps that are not for us to take."""
+    root, before = logging.getLogger(), logging.getLogger().level
+    root.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        root.setLevel(before)

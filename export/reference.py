@@ -1,0 +1,78 @@
+"""The network that a graph was made of, made again from what the graph itself keeps.
+
+A float32 graph holds the weights under the names that the network has for them, and beside its contract which network
+it is. So parity can be checked wherever the model is, without its checkpoint. Where batch normalisation was folded
+into the weights that is not so: the paper's networks need their checkpoint.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import onnx
+import torch
+from onnx import numpy_helper
+
+from edge.contract import Contract
+from export.errors import ExportError
+from train.networks.blocks import PatternNet
+from train.networks.registry import build
+
+ORIGIN_KEY: Final = "tactile.origin"
+
+
+INT8_SUFFIX: Final = "-int8"
+
+
+def contract_in(model: onnx.ModelProto) -> Contract:
+    """The contract that a graph holds.
+
+    Raises:
+        ModelError: a key is missing, unreadable or out of range; the key is named.
+    """
+    return Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+
+
+def in_float(path: Path) -> Path:
+    """Where the float32 graph lies of which NAME-int8.onnx is the integers; NAME.onnx is its own."""
+    return path.with_name(path.stem.removesuffix(INT8_SUFFIX) + path.suffix)
+
+
+def origin(report: Mapping[str, Any]) -> dict[str, str]:
+    """Metadata that tell which network a graph is, of what a checkpoint's report says.
+
+    What was trained on for integers is still of the network that it was trained on from.
+    """
+    told = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
+    return {ORIGIN_KEY: json.dumps(told, sort_keys=True)}
+
+
+def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
+    """What a graph says of its network.
+
+    Raises:
+        ExportError: it says nothing.
+    """
+    told = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
+    if told is None:
+        raise ExportError(f"metadata key '{ORIGIN_KEY}' is missing: export the model again")
+    return json.loads(told)
+
+
+def network_of(model: onnx.ModelProto) -> PatternNet:
+    """The network of a float32 graph, in evaluation mode.
+
+    Raises:
+        ExportError: the graph does not say which it is, or does not hold its weights.
+    """
+    made = origin_of(model)
+    net = build(made["network"], made["scale"], **made["options"])
+    held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in model.graph.initializer}
+    lacking = [name for name in net.state_dict() if name not in held]
+    if lacking:
+        raise ExportError(
+            f"the graph does not hold {lacking[0]} and {len(lacking) - 1} more weights: name its checkpoint"
+        )
+    net.load_state_dict({name: held[name].reshape(value.shape) for name, value in net.state_dict().items()})
+    return net.eval()

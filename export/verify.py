@@ -1,0 +1,225 @@
+"""Do models compute what their networks compute? A table; exit code 1 where a bound is broken.
+
+python -m export.verify edge/models/*.onnx
+
+Every graph is run at every optimisation level of onnxruntime on the frozen test set, on real recordings where there are
+some, and on stiff and extreme windows. float32 graphs are compared with torch, int8 graphs with the torch network that
+they are the integers of. That network is made again from the float32 graph's own weights, or is a checkpoint's.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+
+from edge.bundle import BUNDLE_DIR
+from edge.contract import Contract
+from edge.errors import EdgeError, ModelError
+from edge.frozen import FrozenSet, load_frozen_set
+from edge.metrics import psnr_db
+from export.errors import ExportError, ParityError
+from export.graph import outputs
+from export.parity import LEVELS, TOLERANCE, Difference, GraphRun, differences, extreme_windows, read_windows
+from export.recordings import recorded_windows
+from export.reference import INT8_SUFFIX, contract_in, in_float, network_of, origin_of
+from export.to_onnx import MOST_LOSS_DB
+from train.errors import TrainError
+from train.networks.blocks import PatternNet
+from train.training import load_network
+
+_TORCH_BATCH: Final = 128
+INT8_READ: Final = 0.25
+"""Largest relative difference of integers from their network on readings, in any pixel; measured: .10 on the test set,
+.17 on recordings."""
+INT8_EXTREME: Final = 0.5
+"""On windows beyond any touch: against nonsense, not an accuracy."""
+READINGS: Final = ("test set", "recordings")
+
+
+@dataclass(frozen=True, slots=True)
+class Parity:
+    """One graph at one level on some windows.
+
+    Attributes:
+        model: its name.
+        level: of optimisation.
+        windows: which.
+        differences: by output; empty where nothing could be compared.
+        psnr_change_db: of the graph over the network, where truth is known.
+        broken: which bound, or "".
+    """
+
+    model: str
+    level: str
+    windows: str
+    differences: tuple[Difference, ...]
+    psnr_change_db: float | None
+    broken: str
+
+    def cells(self) -> list[str]:
+        """As a table shows it."""
+        largest = " ".join(f"{difference.largest:.1e}" for difference in self.differences) or "-"
+        relative = " ".join(f"{difference.relative:.1e}" for difference in self.differences) or "-"
+        change = "-" if self.psnr_change_db is None else f"{self.psnr_change_db:+.4f}"
+        return [self.model, self.level, self.windows, largest, relative, change, self.broken or "holds"]
+
+
+COLUMNS: Final = ("model", "level", "windows", "largest", "relative", "PSNR change dB", "bound")
+
+
+def verify(
+    path: Path, frozen: FrozenSet, checkpoints: Path | None = None, recordings: Path | None = None
+) -> Iterator[Parity]:
+    """Every level and every kind of windows of one model.
+
+    Args:
+        path: NAME.onnx or NAME-int8.onnx; then NAME.onnx lies beside it, or NAME.pt in `checkpoints`.
+        frozen: the test set; a model of another scale is compared with its network, but not judged.
+        checkpoints: folder of NAME.pt; without, networks are made of the float32 graphs.
+        recordings: folder of TRIAL/xela_SENSOR.csv; left out without.
+
+    Raises:
+        ModelError: no model, or its contract is broken.
+        ExportError: its network is not to be had.
+        CheckpointError: its checkpoint cannot be used.
+    """
+    model = _load(path)
+    try:
+        contract = contract_in(model)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+    try:
+        net = _network(path, model, contract, checkpoints)
+    except ExportError as error:
+        raise ExportError(f"{path}: {error}") from error
+    groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
+    if recordings is not None:
+        groups["recordings"] = recorded_windows(recordings, contract)
+    groups |= extreme_windows(contract)
+    expected = {name: _run_torch(net, windows) for name, windows in groups.items()}
+    truth = frozen.patterns() if contract.scale == frozen.scale else None
+    for level in LEVELS:
+        run = GraphRun(model, level)
+        for name, windows in groups.items():
+            given = run(windows)
+            yield _judge(path.stem, level, name, contract, expected[name], given, truth if name == "test set" else None)
+
+
+def _judge(
+    model: str,
+    level: str,
+    windows: str,
+    contract: Contract,
+    expected: list[NDArray[np.float32]],
+    given: list[NDArray[np.float32]],
+    truth: NDArray[np.float32] | None,
+) -> Parity:
+    full_scale = contract.output_full_scale
+    try:
+        found = tuple(differences(list(contract.output_shapes), expected, given, full_scale))
+    except ParityError as error:
+        return Parity(model, level, windows, (), None, str(error))
+    change_db = None
+    if truth is not None:
+        change_db = float((psnr_db(given[0], truth, full_scale) - psnr_db(expected[0], truth, full_scale)).mean())
+    broken, largest = "", max(found, key=lambda difference: difference.relative)
+    bound = TOLERANCE
+    if contract.arithmetic == "int8":
+        bound = INT8_READ if windows in READINGS else INT8_EXTREME
+    if not largest.relative <= bound:
+        broken = f"{largest.output} differs by {largest.relative:.1e}, more than {bound:g}"
+    elif change_db is not None and not change_db >= -MOST_LOSS_DB:
+        broken = f"{-change_db:.3f} dB lost, more than {MOST_LOSS_DB}"
+    if len(given) > 1 and not (given[1] > 0).all():
+        broken = "a deviation is not above zero"
+    return Parity(model, level, windows, found, change_db, broken)
+
+
+def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints: Path | None) -> PatternNet:
+    """The network that a model is of, by name and by what both say of its training."""
+    made = origin_of(model)["training_sha256"]
+    if checkpoints is not None:
+        source = checkpoints / f"{path.stem.removesuffix(INT8_SUFFIX)}.pt"
+        net, report = load_network(source)
+        trained = report.get("training_sha256")
+    else:
+        source = in_float(path)
+        if not source.exists():
+            raise ExportError(
+                f"{source.name}, of which these are the integers, is not beside it: put it there, or name the "
+                "folder of its checkpoint with --checkpoints"
+            )
+        graph = _load(source)
+        net, trained = network_of(graph), origin_of(graph)["training_sha256"]
+    if trained != made or (net.taps, net.scale) != (contract.taps, contract.scale):
+        raise ExportError(f"{source} is of another training than the model: export the model again from it")
+    return net
+
+
+def _load(path: Path) -> onnx.ModelProto:
+    try:
+        return onnx.load_from_string(path.read_bytes())
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
+    except Exception as error:  # protobuf's own, of which there are several
+        raise ModelError(f"{path}: not an ONNX model") from error
+
+
+def _run_torch(net: PatternNet, windows: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    parts = [outputs(net, part) for part in torch.from_numpy(windows).split(_TORCH_BATCH)]
+    return [torch.cat(maps).numpy() for maps in zip(*parts, strict=True)]
+
+
+def table(rows: list[Parity]) -> str:
+    """In Markdown, the windows that no test set holds as one line a level: the worst of them."""
+    lines = [COLUMNS, ("---",) * len(COLUMNS), *(row.cells() for row in _worst(rows))]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _worst(rows: list[Parity]) -> list[Parity]:
+    """All rows of readings; of extreme windows those that break a bound, or else the one that is off most."""
+    shown: dict[tuple[str, str, str], list[Parity]] = {}
+    for row in rows:
+        read = row.windows in READINGS
+        shown.setdefault((row.model, row.level, row.windows if read else ""), []).append(row)
+    kept: list[Parity] = []
+    for same in shown.values():
+        broken = [row for row in same if row.broken]
+        kept += broken or [max(same, key=lambda row: max(difference.relative for difference in row.differences))]
+    return kept
+
+
+def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os.environ) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m export.verify", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
+    parser.add_argument("--checkpoints", type=Path, help="folder of NAME.pt (default: the graphs' own weights)")
+    told = environment.get("TACTILE_RECORDINGS")
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=Path(told) if told else None,
+        help="folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)",
+    )
+    options = parser.parse_args(arguments)
+    try:
+        frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+        rows = [row for path in options.models for row in verify(path, frozen, options.checkpoints, options.recordings)]
+    except (ExportError, TrainError, EdgeError) as error:
+        sys.exit(f"verify: {error}")
+    sys.stdout.write(table(rows) + "\n")
+    broken = sum(bool(row.broken) for row in rows)
+    if broken:
+        sys.exit(f"verify: {broken} of {len(rows)} comparisons break a bound")
+
+
+if __name__ == "__main__":
+    main()
