@@ -196,33 +196,36 @@ class _Sensor:
 
     def hold(self, scan: Scan) -> NDArray[np.int32] | None:
         """The newest reading of every taxel, or None if one is too old or was never heard."""
-        at_end = self._at_end(scan.counts)
-        self._saturated = np.where(scan.fresh, at_end, self._saturated)
-        read = scan.fresh & ~at_end
+        self._find_saturated(scan)
+        read = scan.fresh & ~self._saturated
         np.copyto(self._held, scan.counts, where=read)
         self._age_scans += 1
         self._age_scans[read] = 0
         self._oldest_scans = int(self._age_scans.max())
         return self._held if self._oldest_scans <= HOLD_SCANS else None
 
-    def _at_end(self, counts: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Taxels, (rows, cols), one of whose axes stands at an end of its range, far from rest."""
-        ends = np.isin(counts, RANGE_ENDS)
-        if self.baseline is None or not ends.any():
-            return np.zeros(counts.shape[1:], dtype=bool)
-        far = np.abs(deformation(counts, self.baseline)) > NEAR_END_COUNTS
-        return np.asarray((ends & far).any(axis=0))
+    def _find_saturated(self, scan: Scan) -> None:
+        """Keep which taxels stand, on some axis, at an end of the chip's range and far from rest."""
+        low, high = RANGE_ENDS
+        self._saturated &= ~scan.fresh
+        ends = (scan.counts == low) | (scan.counts == high)
+        if self.baseline is not None and ends.any():
+            far = np.abs(deformation(scan.counts, self.baseline)) > NEAR_END_COUNTS
+            self._saturated |= (ends & far).any(axis=0)
 
     def silence(self) -> str | None:
         """What to tell of taxels that are not heard, or say nothing; None while there are none."""
-        if self._oldest_scans > HOLD_SCANS and self._saturated.any():
+        notes = []
+        if self._saturated.any():
+            held = "its last reading is held" if self._oldest_scans <= HOLD_SCANS else "no pattern"
             saturated = ", ".join(map(str, np.flatnonzero(self._saturated)))
-            return f"no pattern, taxel {saturated} at the end of its range: overloaded, too near a magnet, or broken"
-        if self._oldest_scans < SILENT_SCANS:
-            return None
-        silent = np.flatnonzero(self._age_scans >= SILENT_SCANS)
-        remedy = "try another --id-map" if 2 * silent.size == self._age_scans.size else "it may be broken"
-        return f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}"
+            notes.append(f"{held}, taxel {saturated} at the end of its range: overloaded, too near a magnet, or broken")
+        if self._oldest_scans >= SILENT_SCANS:
+            silent = np.flatnonzero((self._age_scans >= SILENT_SCANS) & ~self._saturated)
+            remedy = "try another --id-map" if 2 * silent.size == self._age_scans.size else "it may be broken"
+            if silent.size:
+                notes.append(f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}")
+        return "; ".join(notes) or None
 
     def zero(self, scan: Scan) -> None:
         """Use the scan for the baseline; a refusal becomes the note, and zeroing starts over."""

@@ -60,7 +60,7 @@ class FineTuning:
 
     def sha256(self, training_sha256: str, data_sha256: str, *, every: bool) -> str:
         """Hash of all that decides the weights of a network that was trained and then trained on."""
-        own = [self.steps, self.learning_rate, self.batch, self.seed, every]
+        own = [self.steps, self.learning_rate, self.batch, self.seed, every, self.validation.sha256()]
         return hashlib.sha256(json.dumps([training_sha256, data_sha256, *own]).encode()).hexdigest()
 
 

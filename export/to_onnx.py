@@ -46,6 +46,9 @@ MOST_LOSS_DB: Final = 0.1
 """What integers may cost on the frozen test set."""
 FINE_TUNE_STEPS: Final = 500
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
+MOST_COVERAGE_CHANGE: Final = 0.02
+"""What integers may change the share of pixels by that the 90 % interval holds."""
+_UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
 def contract_of(
@@ -127,7 +130,7 @@ def export(
     single = model if batch == 1 else to_model(net, geometry)
     session = _session(_bytes(single, replace(contract, batch=1), report), name)
     judged = contract.scale == frozen.scale
-    in_float = judge_model(session, frozen)["psnr_db"].mean() if judged else None
+    in_float = mean_error(judge_model(session, frozen)) if judged else {}
     said = ""
     if calibration is not None:
         seen = calibration_windows(calibration, contract)
@@ -153,13 +156,23 @@ def export(
     if calibration is not None:
         integer, convs = convolutions(model)
         facts.append(f"{integer} of {convs} convolutions in integers")
-        if in_float is not None:
-            lost_db = in_float - contract.test_error[str(net.taps)]["psnr_db"]
-            facts.append(f"{lost_db:.3f} dB lost to them" + f", {_COSTLY}" * bool(lost_db > MOST_LOSS_DB))
+        if in_float:
+            facts += _cost(in_float, contract.test_error[str(net.taps)])
     facts += [said] * bool(said)
     content = _bytes(model, contract, report)
     (folder / f"{name}.onnx").write_bytes(content)
     return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join(facts)}"
+
+
+def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
+    """What integers cost, and what of that is too much."""
+    lost_db = in_float["psnr_db"] - in_integers["psnr_db"]
+    facts = [f"{lost_db:.3f} dB lost to them"]
+    if lost_db > MOST_LOSS_DB:
+        facts.append(_COSTLY)
+    if "coverage_90" in in_float and abs(in_integers["coverage_90"] - in_float["coverage_90"]) > MOST_COVERAGE_CHANGE:
+        facts.append(_UNSURE)
+    return facts
 
 
 def _session(content: bytes, name: str) -> ModelSession:
@@ -224,10 +237,10 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(f"export: {error}")
     except OSError as error:
         sys.exit(f"export: {error.filename}: {error.strerror}")
-    costly = [line.partition(":")[0] for line in lines if _COSTLY in line]
-    if costly:
-        remedy = "use the float32 model, or fine-tune for longer"
-        sys.exit(f"export: integers cost {_COSTLY} in {', '.join(costly)}: {remedy}")
+    costly = {line.partition(":")[0]: [cost for cost in (_COSTLY, _UNSURE) if cost in line] for line in lines}
+    told = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
+    if told:
+        sys.exit(f"export: integers cost too much in {', '.join(told)}: use the float32 model, or fine-tune for longer")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 import onnx
 import torch
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from edge.bundle import BUNDLE_DIR
@@ -169,7 +170,7 @@ def _load(path: Path) -> onnx.ModelProto:
         return onnx.load_from_string(path.read_bytes())
     except OSError as error:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
-    except Exception as error:  # protobuf's own, of which there are several
+    except DecodeError as error:
         raise ModelError(f"{path}: not an ONNX model") from error
 
 

@@ -58,6 +58,12 @@ def test_a_share_of_figures_needs_figures_and_others(data, surfaces):
         WindowBatches(same, replace(CLEAN, figure_share=0.1), (1.0,), 8, seed=1)
 
 
+@pytest.mark.parametrize("share", [0.0, 1.0, 1.5, -0.1, float("nan")])
+def test_a_share_of_figures_is_between_none_and_all(data, share):
+    with pytest.raises(ValueError, match="expected one between 0 and 1"):
+        WindowBatches(data, replace(CLEAN, figure_share=share), (1.0,), 8, seed=1)
+
+
 def test_older_taps_are_dropped_as_often_as_asked(data):
     batches = WindowBatches(data, CLEAN, (0.25, 0.0, 0.75), 24, seed=1)
     given = torch.cat([(batches(n)[0].view(24, 3, 48).abs().amax(dim=2) > 0).sum(dim=1) for n in range(50)])

@@ -229,7 +229,9 @@ def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, m
     monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
     path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=8, blocks=1)
     command = [str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz"), "--fine-tune-steps", "2"]
-    with pytest.raises(SystemExit, match=r"^export: integers cost .* in one-int8\.onnx: use the float32 model"):
+    with pytest.raises(
+        SystemExit, match=r"^export: integers cost too much in one-int8\.onnx .*: use the float32 model"
+    ):
         main(command)
     line = capsys.readouterr().out
     assert line.startswith("one-int8.onnx") and "fine-tuned 2 steps" in line
@@ -257,3 +259,13 @@ def test_the_command_is_as_written(capsys):
     with pytest.raises(SystemExit) as end:
         main(["--help"])
     assert end.value.code == 0 and "python -m export.to_onnx" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("psnr_db", "coverage", "said"),
+    [(34.95, 0.9, []), (34.8, 0.9, ["more than 0.1 dB"]), (34.95, 0.84, ["an interval changed by more than 2%"])],
+)
+def test_what_integers_cost_too_much_is_said(psnr_db, coverage, said):
+    in_float = {"psnr_db": 35.0, "coverage_90": 0.9}
+    facts = to_onnx._cost(in_float, {"psnr_db": psnr_db, "coverage_90": coverage})
+    assert facts[0] == f"{35 - psnr_db:.3f} dB lost to them" and facts[1:] == said

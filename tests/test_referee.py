@@ -4,14 +4,14 @@ import pytest
 pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install 'tactile-edge-sr[fem]'")
 
 from train.experiments import referee
-from train.experiments.referee import Mesh, judge
+from train.experiments.referee import Mesh, press_or_recall
 
 STEPS_MM = np.array([0.1, 0.2])
 COARSE = Mesh(2, 1)
 
 
 def test_a_verdict_is_kept_and_recalled_without_finite_elements(tmp_path, monkeypatch):
-    first = judge("large circle", COARSE, STEPS_MM, tmp_path)
+    first = press_or_recall("large circle", COARSE, STEPS_MM, tmp_path)
     assert first.patterns_mm.shape == (2, 40, 40)
     assert first.force_n[1] > 2 * first.force_n[0] > 0
     assert first.patterns_mm[:, 20, 20] == pytest.approx(STEPS_MM, rel=1e-3)
@@ -20,18 +20,18 @@ def test_a_verdict_is_kept_and_recalled_without_finite_elements(tmp_path, monkey
         raise AssertionError("worked out again")
 
     monkeypatch.setattr(referee, "_work_out", refuse)
-    again = judge("large circle", COARSE, STEPS_MM, tmp_path)
+    again = press_or_recall("large circle", COARSE, STEPS_MM, tmp_path)
     assert np.array_equal(again.patterns_mm, first.patterns_mm)
     assert np.array_equal(again.force_n, first.force_n)
     # Whatever the answer depends on asks anew.
     for other in (("small circle", COARSE, STEPS_MM), ("large circle", Mesh(2, 2), STEPS_MM)):
         with pytest.raises(AssertionError, match="worked out again"):
-            judge(*other, tmp_path)
+            press_or_recall(*other, tmp_path)
     with pytest.raises(AssertionError, match="worked out again"):
-        judge("large circle", COARSE, STEPS_MM / 2, tmp_path)
+        press_or_recall("large circle", COARSE, STEPS_MM / 2, tmp_path)
 
 
 def test_half_precision_is_precise_enough(tmp_path):
-    kept = judge("large circle", COARSE, STEPS_MM, tmp_path).patterns_mm
+    kept = press_or_recall("large circle", COARSE, STEPS_MM, tmp_path).patterns_mm
     pad_pattern = referee._work_out("large circle", COARSE, STEPS_MM, referee.CENTRE, referee.LAYER).patterns_mm
     assert np.abs(kept - pad_pattern).max() < 5e-4 * STEPS_MM[-1]

@@ -316,7 +316,12 @@ def test_a_chip_at_the_end_of_its_range_has_no_reading(counts):
     runtime = make_runtime()
     pattern = runtime.push(make_scan(0, press_counts=PRESS)).pattern
     for number in range(1, HOLD_SCANS + 1):
-        np.testing.assert_array_equal(runtime.push(saturated(number, counts)).pattern, pattern)
+        held = runtime.push(saturated(number, counts))
+        np.testing.assert_array_equal(held.pattern, pattern)
+        assert (
+            held.note
+            == "its last reading is held, taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
+        )
     gone = runtime.push(saturated(HOLD_SCANS + 1, counts))
     assert (gone.state, gone.pattern, gone.contact) == ("incomplete", None, None)
     assert gone.note == "no pattern, taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
@@ -329,3 +334,15 @@ def test_a_count_from_the_end_is_a_reading():
     for number in range(HOLD_SCANS + 2):
         result = runtime.push(saturated(number, 65534))
     assert result.state == "contact"
+
+
+def test_taxels_that_are_silent_are_named_beside_one_at_the_end_of_its_range():
+    runtime = make_runtime()
+    half = tuple(range(8, 16))
+    for number in range(SILENT_SCANS):
+        scan = make_scan(number, absent=half)
+        raw = scan.counts.copy()
+        raw[2].flat[5] = RANGE_ENDS[1]
+        note = runtime.push(dataclasses.replace(scan, counts=raw)).note
+    assert "taxel 5 at the end of its range" in note
+    assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")

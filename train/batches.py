@@ -46,7 +46,7 @@ class WindowBatches:
         seed: of everything that is drawn.
 
     Raises:
-        ValueError: a share of figures is asked for, but all of the sequences are figures, or none.
+        ValueError: a share of figures is not between 0 and 1, or all of the sequences are figures, or none.
     """
 
     def __init__(self, sequences: Sequences, draw: Draw, given: tuple[float, ...], batch: int, seed: int) -> None:
@@ -118,6 +118,8 @@ def _streams(surfaces: NDArray[np.str_], draw: Draw, seed: int) -> list[_Stream]
     everything = np.arange(len(surfaces))
     if draw.figure_share is None:
         return [_Stream(everything, [seed, 0])]
+    if not 0 < draw.figure_share < 1:
+        raise ValueError(f"a share of figures of {draw.figure_share}, expected one between 0 and 1")
     figures = np.array([is_random_figure(name) for name in surfaces], dtype=bool)
     if figures.all() or not figures.any():
         raise ValueError(

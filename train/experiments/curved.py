@@ -16,7 +16,7 @@ from edge.metrics import psnr_db, rmse_percent
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
 from train.depth import depth_image
-from train.experiments.referee import CENTRE, FINEST, SCALE, Mesh, judge, relief
+from train.experiments.referee import CENTRE, FINEST, SCALE, Mesh, press_or_recall, relief
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.heights import PLANES, heights_pattern
@@ -67,7 +67,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     rows: list[Row] = []
     with report.figure(size=(11, 4.5)) as figure:
         for axes, surface in zip(figure.subplots(1, len(SURFACES)), SURFACES, strict=True):
-            truth, *coarser = [judge(surface, mesh, indentation_mm, bench.data_folder) for mesh in meshes]
+            truth, *coarser = [press_or_recall(surface, mesh, indentation_mm, bench.data_folder) for mesh in meshes]
             press = _press(surface, indentation_mm.astype(np.float32))
             found = _patterns(press)
             found["layer"] = (press.surface_mm, press.contact_s)

@@ -19,7 +19,7 @@ from edge.metrics import psnr_db, rmse_percent
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
 from train.depth import depth_image
-from train.experiments.referee import CENTRE, FINEST, REFEREE_POISSON, SCALE, Mesh, Verdict, judge, relief
+from train.experiments.referee import CENTRE, FINEST, REFEREE_POISSON, SCALE, Mesh, Verdict, press_or_recall, relief
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.layer import Layer
@@ -75,7 +75,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     meshes = _QUICK_MESHES if bench.quick else MESHES
     steps = 2 if bench.quick else STEPS
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
-    verdicts = {mesh: [judge(name, mesh, indentation_mm, bench.data_folder) for name in surfaces] for mesh in meshes}
+    verdicts = {
+        mesh: [press_or_recall(name, mesh, indentation_mm, bench.data_folder) for name in surfaces] for mesh in meshes
+    }
     finest = verdicts[meshes[0]]
     truth = np.stack([verdict.patterns_mm for verdict in finest])
     force_n = np.stack([verdict.force_n for verdict in finest])

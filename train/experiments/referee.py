@@ -58,7 +58,9 @@ class Verdict:
     run_s: NDArray[np.float32]
 
 
-def judge(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path, pose: Pose = CENTRE) -> Verdict:
+def press_or_recall(
+    surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path, pose: Pose = CENTRE
+) -> Verdict:
     """Press a surface into the finite elements, or recall what came of it.
 
     Args:
