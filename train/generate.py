@@ -20,6 +20,7 @@ need this package installed, and users' meshes at the same path. Only the caller
 """
 
 import argparse
+import os
 import shutil
 import sys
 import time
@@ -37,6 +38,9 @@ from train.poses import ANGLE_STEP_DEG, MAX_TAPS
 from train.surfaces import PLATES, SURFACES, surface_mesh
 
 _INTERRUPTED: Final = 130
+# Joblib's resource tracker, a process of its own, finds now and then that an interrupted pool's semaphore is gone
+# before it could be signed off, and says so on the terminal. It has no other switch than Python's own.
+_TRACKER_QUIET: Final = "ignore:resource_tracker:UserWarning"
 _NAMED: Final = {"all": SURFACES, "plate1": PLATES[0], "plate2": PLATES[1], "none": ()}
 
 
@@ -120,6 +124,7 @@ def _numbered(config: Generation, chunk: int) -> tuple[int, Sequences]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
     options = _parser().parse_args(arguments)
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), _TRACKER_QUIET)))
     started_s = time.monotonic()
     try:
         config = _config(options)
