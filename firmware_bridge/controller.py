@@ -46,14 +46,16 @@ class Controller(NamedTuple):
 
 
 def bus_timeline(
-    controllers: Sequence[Controller], *, jitter_s: float, seed: int, loop: bool
+    controllers: Sequence[Controller], *, jitter_s: float, seed: int, loop: bool, frame_s: float = FRAME_S
 ) -> Iterator[tuple[float, CanFrame]]:
-    """All frames on the bus in their order, each with its time in [s] from the first scan."""
-    lanes = [_lane(controller, jitter_s, seed, loop) for controller in controllers]
+    """All frames on the bus in their order, `frame_s` [s] long each, with their time in [s] from the first scan."""
+    lanes = [_lane(controller, jitter_s, seed, loop, frame_s) for controller in controllers]
     return heapq.merge(*lanes, key=lambda timed: timed[0])
 
 
-def _lane(controller: Controller, jitter_s: float, seed: int, loop: bool) -> Iterator[tuple[float, CanFrame]]:
+def _lane(
+    controller: Controller, jitter_s: float, seed: int, loop: bool, frame_s: float
+) -> Iterator[tuple[float, CanFrame]]:
     noise = random.Random(f"{seed} {controller.can_id}")
     number, free_s = 0, 0.0
     while True:
@@ -62,7 +64,7 @@ def _lane(controller: Controller, jitter_s: float, seed: int, loop: bool) -> Ite
             time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
             for frame in scan_frames(counts, controller.can_id, noise):
                 yield time_s, frame
-                time_s += FRAME_S
+                time_s += frame_s
             number, free_s = number + 1, time_s
         if not loop:
             return

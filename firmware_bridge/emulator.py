@@ -9,23 +9,28 @@ The first line it prints is the port.
 """
 
 import argparse
+import fcntl
 import math
 import os
 import random
 import select
+import struct
 import sys
 import termios
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from itertools import groupby
-from typing import Final, Self
+from pathlib import Path
+from typing import Final, Self, TextIO
 
-from firmware_bridge.controller import Controller, SlcanAdapter, bus_timeline
+from firmware_bridge.controller import FRAME_S, Controller, SlcanAdapter, bus_timeline
 from firmware_bridge.errors import BridgeError, RecordingError
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import Recording, load_recording
 from firmware_bridge.slcan import CanFrame
+from firmware_bridge.xela import USPA44_MAP
 
 LINE_SPEED_BAUD: Final = 3_000_000
 _STOP_POLL_S: Final = 0.05
@@ -57,8 +62,10 @@ class Emulator:
         left_open: bool = False,
         jitter_s: float = 0.001,
         latency_s: float = 0.001,
+        frame_s: float = FRAME_S,
         ignores_line_speed: bool = False,
         seed: int = 0,
+        on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
     ) -> None:
         """Prepare to play; nothing is opened yet.
 
@@ -71,14 +78,16 @@ class Emulator:
             left_open: the channel is open from the start, as a client leaves it that was killed.
             jitter_s: a scan comes up to so much early or late, in [s].
             latency_s: the adapter hands on what it has once in this time, in [s].
+            frame_s: what a frame takes on the bus, in [s]; a real one carries no more than 480 scans a second.
             ignores_line_speed: as USB-CDC adapters do.
             seed: of jitter and unused bytes.
+            on_scan: told the controller and the monotonic time in [ns] when the last frame of a scan is handed on.
 
         Raises:
             ValueError: an option is out of range.
             RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
         """
-        for name, value in (("jitter_s", jitter_s), ("latency_s", latency_s)):
+        for name, value in (("jitter_s", jitter_s), ("latency_s", latency_s), ("frame_s", frame_s)):
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} is {value}, expected 0 or more")
         bus = _controllers(recordings, controllers, rate_hz)
@@ -86,9 +95,11 @@ class Emulator:
         self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open)
         self.sent_frames = 0
         self.lost_frames = 0
-        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop)
+        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s)
         self._latency_s = latency_s
         self._ignores_line_speed = ignores_line_speed
+        self._on_scan = on_scan
+        self._last_frames = {USPA44_MAP.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
         self._garble = random.Random(f"line {seed}")
         self._stop = threading.Event()
         self._through = threading.Event()
@@ -137,12 +148,20 @@ class Emulator:
         return math.ceil(timed[0] / self._latency_s) * self._latency_s
 
     def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
-        lines = [self.adapter.encode(frame, time_s) for time_s, frame in frames]
+        lines: list[bytes] = []
+        ended: list[int] = []
+        for time_s, frame in frames:
+            lines.append(self.adapter.encode(frame, time_s))
+            if frame.can_id in self._last_frames:
+                ended.append(self._last_frames[frame.can_id])
+        now_ns = time.monotonic_ns()  # before the write: who reads may be through before it is back
         room = self._write(b"".join(lines))
         for line in lines:
             room -= len(line)
             self.sent_frames += room >= 0
             self.lost_frames += room < 0
+        for controller in ended:
+            self._on_scan(controller, now_ns)
 
     def _obey_until(self, deadline_s: float) -> bool:
         """Serve commands until a time on the monotonic clock; False when told to stop."""
@@ -170,14 +189,16 @@ class Emulator:
         return self._garble.randbytes(math.ceil(len(data) * min(1.0, (speed_baud or 0) / LINE_SPEED_BAUD)))
 
     def _drain(self) -> None:
-        """Let the client fetch what is under way: hanging up takes it away from it.
-
-        Asking whether its side is readable makes the kernel bring up what it still holds back; asking
-        how much there is to read (FIONREAD) does not, and on a busy machine says none too early.
-        """
-        while self.adapter.channel_open and select.select([self._client_fd], [], [], 0)[0]:
+        """Let the client fetch what is under way: hanging up takes it away from it."""
+        while self.adapter.channel_open and self._unread_bytes():
             if not self._obey_until(time.monotonic() + _DRAIN_POLL_S):
                 return
+
+    def _unread_bytes(self) -> int:
+        # Asking whether its side is readable makes the kernel bring up what it still holds back, but says no while
+        # there is less than the client wants at once (VMIN); asking for the number alone says none too early.
+        select.select([self._client_fd], [], [], 0)
+        return struct.unpack("i", fcntl.ioctl(self._client_fd, termios.FIONREAD, bytes(4)))[0]
 
 
 def _controllers(recordings: Sequence[Recording], can_ids: Sequence[int], rate_hz: float | None) -> list[Controller]:
@@ -213,9 +234,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ignore-line-speed", action="store_true", help="as USB-CDC adapters do")
     parser.add_argument("--jitter-ms", type=float, default=1.0, help="of scans, up to so much (default: 1)")
     parser.add_argument("--latency-ms", type=float, default=1.0, help="of the adapter (default: 1)")
+    parser.add_argument("--frame-us", type=float, default=1e6 * FRAME_S, help="of the bus, a frame (default: 130)")
     parser.add_argument("--seed", type=int, default=0, help="of jitter and unused bytes (default: 0)")
+    parser.add_argument("--stamps", metavar="FILE", help="of each scan controller and time of its last frame, ns")
     parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started it")
     options = parser.parse_args(arguments)
+    with ExitStack() as closing:
+        stamps = closing.enter_context(Path(options.stamps).open("w")) if options.stamps else None
+        return _play(parser, options, stamps)
+
+
+def _play(parser: argparse.ArgumentParser, options: argparse.Namespace, stamps: TextIO | None) -> int:
     try:
         emulator = Emulator(
             [load_recording(path) for path in options.file],
@@ -226,8 +255,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             left_open=options.left_open,
             jitter_s=options.jitter_ms / 1000,
             latency_s=options.latency_ms / 1000,
+            frame_s=options.frame_us / 1e6,
             ignores_line_speed=options.ignore_line_speed,
             seed=options.seed,
+            on_scan=lambda controller, time_ns: stamps.write(f"{controller} {time_ns}\n") if stamps else None,
         )
     except (BridgeError, ValueError) as error:
         parser.error(str(error))

@@ -227,7 +227,8 @@ def test_a_slow_reader_loses_frames_and_stops_nobody():
             time.sleep(0.01)
         decoder = SlcanScans()
         while emulator.sent_frames + emulator.lost_frames < 400 * 16:
-            decoder.feed(port.read(port.in_waiting or 1), 0)
+            decoder.feed(port.read(port.in_waiting), 0)  # not for one byte more: it may hang up meanwhile
+            time.sleep(0.001)
         decoder.feed(read_to_the_end(port), 0)
         told = decoder.counters()
         # A frame of which a part found room is lost as well: its head is skipped before the next.
@@ -384,3 +385,21 @@ def test_the_terminal_is_left_for_the_client_to_set_up():
         os.write(client, b"S8\nO\n")
         assert select.select([client], [], [], 0.2)[0] == []
         os.close(client)
+
+
+def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():
+    stamps = []
+    emulator = Emulator(
+        [make_recording(10), make_recording(10, seed=1)],
+        frame_s=2e-4,
+        on_scan=lambda controller, time_ns: stamps.append((controller, time_ns, emulator.sent_frames)),
+    )
+    begun_ns = time.monotonic_ns()
+    with emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+    assert all(sent >= 16 * (number + 1) for number, (_, _, sent) in enumerate(stamps))
+    for controller in (4, 6):
+        told_ns = [time_ns for name, time_ns, _ in stamps if name == controller]
+        came_ns = [scan.time_ns for scan in scans if scan.sensor == str(controller)]
+        assert len(told_ns) == len(came_ns) == 10
+        assert all(begun_ns < before < after for before, after in zip(told_ns, came_ns, strict=True))

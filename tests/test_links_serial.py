@@ -15,11 +15,12 @@ from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_l
 
 from firmware_bridge.emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links import slcan_serial
+from firmware_bridge.links import bursts, slcan_serial
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording import Recording, Track
 from firmware_bridge.scan import Scan
-from firmware_bridge.xela import LAYOUT_A_MAP, trigger_frame
+from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.xela import LAYOUT_A_MAP, USPA44_MAP, trigger_frame
 
 
 @pytest.mark.parametrize("acknowledges", [True, False])
@@ -164,15 +165,59 @@ def test_the_cable_out_is_told_at_once_and_every_time():
 
 def test_what_came_before_the_loss_is_not_lost(monkeypatch):
     """The last byte may come alone, and the cable go before the next look: it may close a scan."""
+    came = [b"\r"]
 
-    def gone(port):
+    def read(descriptor, most_bytes):
+        if came:
+            return came.pop()
         raise OSError(errno.EIO, "Input/output error")
 
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        monkeypatch.setattr(serial.Serial, "in_waiting", property(gone))
-        os.write(device.device_fd, b"\r")
-        assert link.read(5.0) == []
-        assert link.counters()["received_bytes"] == link.counters()["replies"] == 1
+        monkeypatch.setattr(bursts.os, "read", read)
+        got = link.read(0.0), link.counters()["received_bytes"], link.counters()["replies"]
+        with pytest.raises(LinkLostError):
+            link.read(0.0)
+        came.append(b"")
+        with pytest.raises(LinkLostError, match="hung up"):
+            link.read(0.0)
+        monkeypatch.undo()
+    assert got == ([], 1, 1)
+
+
+@pytest.mark.parametrize("piece_bytes", [1, 22, 62, 100, 352])
+def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes):
+    """Also behind one that was torn, which its own end cannot close."""
+    lines = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        for sent, complete in ((lines, [True]), (lines[:3] + lines[4:], []), (lines, [False, True]), (lines, [True])):
+            text = b"".join(sent)
+            for at in range(0, len(text), piece_bytes):
+                os.write(device.device_fd, text[at : at + piece_bytes])
+            scans = []
+            end_s = time.monotonic() + 10
+            while len(scans) < len(complete) and time.monotonic() < end_s:
+                scans += link.read(0.1)
+            assert [scan.complete for scan in scans] == complete
+
+
+def test_few_reads_make_a_scan(monkeypatch):
+    """A plain loop wakes for every piece that comes; here the kernel gathers them."""
+    wakes = []
+    poll = select.poll
+
+    class CountedPoll:
+        def __init__(self):
+            self._poll = poll()
+            self.register = self._poll.register
+
+        def poll(self, timeout_ms):
+            wakes.append(timeout_ms)
+            return self._poll.poll(timeout_ms)
+
+    monkeypatch.setattr(select, "poll", CountedPoll)
+    with Emulator([make_recording(60)], latency_s=0.0) as emulator, SlcanSerialLink(emulator.port) as link:
+        assert len(read_until_lost(link)) == 60
+    assert len(wakes) < 60 * 5, "one for each of sixteen frames"
 
 
 def test_reading_where_nothing_comes():
@@ -358,9 +403,6 @@ def test_terminal_errors_are_link_errors(monkeypatch):
 
     with SilentDevice() as device:
         with SlcanSerialLink(device.port) as link:
-            monkeypatch.setattr(serial.Serial, "read", fail)
-            with pytest.raises(LinkLostError):
-                link.read(0.0)
             monkeypatch.setattr(serial.Serial, "write", fail)
         with pytest.raises(DeviceError):
             link.__enter__()

@@ -282,3 +282,15 @@ def test_random_bytes_make_no_scan():
     noise = random.Random(11)
     scans = SlcanScans()
     assert [scan for _ in range(300) for scan in scans.feed(noise.randbytes(1000), 0)] == []
+
+
+def test_who_closes_no_scan_does_not_change_how_many_readings_are_waited_for():
+    """One flipped bit in an id, and a sensor unplugged in mid-scan."""
+    assembler = ScanAssembler(USPA44)
+    feed(assembler, cycle(0) + cycle(1))
+    assembler.feed(cycle(0, "5")[0], 50)
+    assert assembler.fewest_missing() == 16
+    feed(assembler, [*cycle(0, "6"), *cycle(1, "6")[:9]], 60)
+    assert assembler.fewest_missing() == 7
+    feed(assembler, cycle(2), 60 + 2 * LONGEST_SCAN_NS)
+    assert assembler.fewest_missing() == 16

@@ -18,6 +18,7 @@ except ImportError:
 from firmware_bridge.assembler import SlcanScans
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.bursts import BurstReader
 from firmware_bridge.links.ports import serial_ports
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import BITRATE_1M, CLOSE, OPEN, CanFrame, encode_frame
@@ -78,18 +79,20 @@ class SlcanSerialLink:
         self._scans = SlcanScans(model)
         self._received_bytes = 0
         self._serial: serial.Serial | None = None
+        self._bursts: BurstReader | None = None
 
     def __enter__(self) -> Self:
         self._serial = self._open_port()
         try:
             self._start(self._serial)
+            self._bursts = BurstReader(self._serial.fileno())
         except _PORT_ERRORS as error:
             self._serial.close()
             raise DeviceError(f"{self.port}: does not take commands: {error}") from error
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        port, self._serial = self._serial, None
+        port, self._serial, self._bursts = self._serial, None, None
         if port is None:
             return
         with suppress(*_PORT_ERRORS):  # gone already: nobody left to tell
@@ -106,17 +109,12 @@ class SlcanSerialLink:
         Raises:
             LinkLostError: the port is gone.
         """
-        if self._serial is None:
+        if self._bursts is None:
             raise ValueError("the link is not open: use it in a with statement")
         try:
-            if self._serial.timeout != timeout_s:
-                self._serial.timeout = timeout_s
-            data = self._serial.read(1)
-        except _PORT_ERRORS as error:
+            data = self._bursts.read(timeout_s, self._scans.bytes_until_scan())
+        except OSError as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
-        if data:
-            with suppress(*_PORT_ERRORS):  # what came before the loss counts; the next call tells of it
-                data += self._serial.read(self._serial.in_waiting)
         self._received_bytes += len(data)
         return self._scans.feed(data, time.monotonic_ns())
 

@@ -1,15 +1,15 @@
 """From what a user writes to a link."""
 
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link
-from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.ports import find_adapter, find_by_serial, serial_ports
-from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
 from firmware_bridge.xela import USPA44_MAP, ModelMap, trigger_frames
+
+if TYPE_CHECKING:
+    from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 FORMS: Final = (
     "slcan:/dev/ttyUSB0[@baud]",
@@ -17,6 +17,9 @@ FORMS: Final = (
     "replay:FILE[,FILE]",
     "demo",
 )
+
+
+# Each link is loaded only where it is asked for: start-up time and memory are for what runs.
 
 
 def open_source(
@@ -39,14 +42,18 @@ def open_source(
         RecordingError: a recording that cannot be used.
     """
     if text is None:
-        return _slcan_link(find_adapter(serial_ports()).path, DEFAULT_BAUD, model)
+        return _slcan_link(find_adapter(serial_ports()).path, None, model)
     scheme, _, rest = text.partition(":")
     if scheme == "slcan":
         return _slcan(text, rest, model)
     if scheme == "replay" and rest:
+        from firmware_bridge.links.replay import ReplayLink
+
         # A file may have a comma in its name.
         return ReplayLink([rest] if Path(rest).exists() else rest.split(","), rate_hz)
     if text == "demo" and demo_recording is not None:
+        from firmware_bridge.links.demo import DemoLink
+
         return DemoLink(demo_recording, rate_hz)
     raise _refusal(text)
 
@@ -54,18 +61,20 @@ def open_source(
 def _slcan(text: str, rest: str, model: ModelMap) -> Link:
     port, at, baud = rest.rpartition("@")
     if not at:
-        port, baud = rest, str(DEFAULT_BAUD)
-    if port in ("", "serial=") or not baud.isascii() or not baud.isdigit() or int(baud) == 0:
+        port = rest
+    if port in ("", "serial=") or (at and not (baud.isascii() and baud.isdigit() and int(baud) > 0)):
         raise _refusal(text)
     if port.startswith("serial="):
         port = find_by_serial(port.removeprefix("serial="), serial_ports()).path
-    link = _slcan_link(port, int(baud), model)
+    link = _slcan_link(port, int(baud) if at else None, model)
     link.name = text
     return link
 
 
-def _slcan_link(port: str, baud: int, model: ModelMap) -> SlcanSerialLink:
-    return SlcanSerialLink(port, baud, model=model, triggers=trigger_frames(model))
+def _slcan_link(port: str, baud: int | None, model: ModelMap) -> "SlcanSerialLink":
+    from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
+
+    return SlcanSerialLink(port, DEFAULT_BAUD if baud is None else baud, model=model, triggers=trigger_frames(model))
 
 
 def _refusal(text: str) -> SourceError:
