@@ -39,7 +39,7 @@ class Baseline:
 
     Attributes:
         sensor: name of the sensor.
-        counts: (3, rows, cols) float32 in 0..65536, read-only.
+        counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent.
         created_unix_s: when it was taken, in [s] since 1970.
         scans: how many scans it is the median of.
         origin: taken at this start-up, or loaded from a file.
@@ -102,8 +102,15 @@ def deformation(scan_counts: NDArray[np.integer], baseline: Baseline) -> NDArray
     """
     half = COUNTS_ON_CIRCLE // 2
     # float32 holds halves exactly up to 2^23, so nothing is rounded here.
-    signed = (scan_counts.astype(np.float32) - baseline.counts + half) % COUNTS_ON_CIRCLE - half
-    return np.where(scan_counts == ABSENT, np.float32(np.nan), signed)
+    signed = scan_counts.astype(np.float32)
+    signed -= baseline.counts
+    if not (signed.min() >= -half and signed.max() < half):  # beyond half a turn, or a taxel not zeroed: hardly ever
+        signed += half
+        signed %= COUNTS_ON_CIRCLE
+        signed -= half
+    if scan_counts.min() == ABSENT:
+        signed[scan_counts == ABSENT] = np.nan
+    return signed
 
 
 class BaselineEstimator:
@@ -134,28 +141,45 @@ class BaselineEstimator:
         self._reference = reference
         self._clock = clock
         self._taken: list[NDArray[np.int32]] = []
+        self._silent: NDArray[np.bool_] | None = None
 
     @property
     def scans(self) -> int:
         """How many scans it has so far."""
         return len(self._taken)
 
-    def push(self, scan: Scan) -> Baseline | None:
+    def push(self, scan: Scan, silent: NDArray[np.bool_] | None = None) -> Baseline | None:
         """Take one more scan; the baseline once there are enough.
+
+        Args:
+            scan: of the sensor.
+            silent: taxels (rows, cols) that are given up: a scan is complete without them, the baseline NaN there. What
+                was given up once stays so until there is a baseline, or one that comes and goes would put it off for
+                ever.
 
         Raises:
             BaselineRefusedError: the pad moved or was loaded. The estimator has begun again.
         """
+        if silent is not None and silent.any():
+            self._silent = silent.copy() if self._silent is None else self._silent | silent
+        silent = self._silent
         # A scan sent again is no second sample, and would hide a spread.
-        if not scan.complete or scan.repeated:
+        complete = scan.complete if silent is None else bool((scan.fresh | silent).all())
+        if not complete or not scan.renewed.any():
             return None
         self._taken.append(scan.counts)
         if len(self._taken) < self._min_scans:
             return None
         counts = np.stack(self._taken)
+        if silent is not None:
+            counts[:, :, silent] = 0
         self._taken.clear()
+        self._silent = None
         _refuse_motion(counts)
         baseline = Baseline.from_counts(scan.sensor, counts, self._clock())
+        if silent is not None:
+            known = np.where(silent, np.float32(np.nan), baseline.counts)
+            baseline = Baseline.of(scan.sensor, known, baseline.created_unix_s, baseline.scans, baseline.origin)
         if self._reference is not None:
             _refuse_load(baseline, self._reference)
         return baseline

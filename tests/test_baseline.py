@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from edge_samples import make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -325,3 +326,40 @@ def test_files_that_are_no_json(tmp_path, text):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(RecordingError, match="cannot be read: No such file"):
         load_baselines(tmp_path / "zero.json")
+
+
+def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
+    counts = still(200)
+    counts[:, :, 1, 1] = ABSENT
+    counts[:20, :, 2, 2] = ABSENT
+    one, two = np.zeros((2, 4, 4), dtype=bool)
+    one[1, 1] = two[1, 1] = two[2, 2] = True
+    estimator = BaselineEstimator()
+    found = [estimator.push(scan, two if number < 20 else one) for number, scan in enumerate(scans_of(counts))]
+    assert [number for number, baseline in enumerate(found) if baseline is not None] == [99, 199]
+    for baseline, given_up in ((found[99], two), (found[199], one)):
+        assert baseline is not None
+        np.testing.assert_array_equal(np.isnan(baseline.counts), np.broadcast_to(given_up, (3, 4, 4)))
+        np.testing.assert_allclose(baseline.counts[:, ~given_up], REST[:, ~given_up], atol=2)
+
+
+def test_a_taxel_that_was_not_zeroed_does_not_keep_others_from_wrapping_round():
+    counts = np.full((3, 4, 4), 65_500, dtype=np.float32)
+    counts[:, 0, 0] = np.nan
+    scan = np.full((3, 4, 4), 100, dtype=np.int32)
+    zeroed = deformation(scan, Baseline.of("4", counts, 0.0, 100, "file"))
+    assert np.isnan(zeroed[:, 0, 0]).all() and (zeroed[:, 1:, :] == 136).all()
+
+
+def test_a_taxel_that_comes_and_goes_does_not_put_zeroing_off_for_ever():
+    estimator = BaselineEstimator()
+    silent = np.zeros((4, 4), dtype=bool)
+    silent[0, 0] = True
+    for number in range(1000):
+        gone = number // 60 % 2 == 1
+        scan = make_scan(number, absent=(0,) if gone else (), noise=3)
+        baseline = estimator.push(scan, silent if gone else None)
+        if baseline is not None:
+            break
+    assert baseline is not None and number < 110
+    assert np.isnan(baseline.counts[:, 0, 0]).all() and np.isfinite(baseline.counts[:, 1:, :]).all()
