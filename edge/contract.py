@@ -9,16 +9,23 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.confidence import is_confidence
 from edge.errors import ModelError
 from firmware_bridge.geometry import SensorGeometry
 
-CONTRACT_VERSION: Final = 3
+CONTRACT_VERSION: Final = 4
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
+ANY_BATCH: Final = "any"
+"""Of a graph that takes as many windows in one run as it is given; its first dimension bears this name."""
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
+STAND_IN_KEYS: Final = (
+    *("scale", "angle_step_deg", "output_unit", "output_full_scale", "sensor", "rows", "cols", "pitch_mm"),
+)
+"""What two models must share for one to take over from the other: the same taps, and patterns of one meaning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +34,7 @@ class Contract:
 
     Attributes:
         version: of this agreement.
-        batch: windows in one run.
+        batch: windows in one run, or ANY_BATCH.
         taps: K, the number of taps in the window.
         scale: pattern pixels per taxel pitch.
         tap_order: order of the taps in the window.
@@ -43,13 +50,15 @@ class Contract:
         arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are float32 always.
         interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
             None where the model gives no deviation.
+        confidence: number of taps given -> what the deviations say of the pattern's error, see edge.confidence; empty
+            where the model gives no deviation.
         training_sha256: of the training configuration.
         test_set_sha256: of the frozen test set that `test_error` was measured on.
         test_error: number of taps given -> metric name -> value; empty where the test set has another scale.
     """
 
     version: int
-    batch: int
+    batch: int | str
     taps: int
     scale: int
     tap_order: str
@@ -64,13 +73,14 @@ class Contract:
     pitch_mm: float
     arithmetic: str
     interval_factor: float | None
+    confidence: dict[str, dict[str, list[float]]]
     training_sha256: str
     test_set_sha256: str
     test_error: dict[str, dict[str, float]]
 
     @property
-    def window_shape(self) -> tuple[int, int, int, int]:
-        """Shape of the network's input: (batch, 3 taps, rows, cols), a tap's x, y, z side by side."""
+    def window_shape(self) -> tuple[int | str, int, int, int]:
+        """Shape of the graph's input: (batch, 3 taps, rows, cols), a tap's x, y, z side by side."""
         return (self.batch, 3 * self.taps, self.rows, self.cols)
 
     @property
@@ -79,8 +89,8 @@ class Contract:
         return (self.rows * self.scale, self.cols * self.scale)
 
     @property
-    def output_shapes(self) -> dict[str, tuple[int, int, int]]:
-        """Shapes (batch, H, W) of the network's outputs by name: the pattern, and its deviation if there is one."""
+    def output_shapes(self) -> dict[str, tuple[int | str, int, int]]:
+        """Shapes (batch, H, W) of the graph's outputs by name: the pattern, and its deviation if there is one."""
         names = (OUTPUT_NAME,) if self.interval_factor is None else (OUTPUT_NAME, DEVIATION_NAME)
         return dict.fromkeys(names, (self.batch, *self.pattern_shape))
 
@@ -120,6 +130,18 @@ class Contract:
             if got != expected:
                 raise ModelError(f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}")
 
+    def check_stands_in(self, other: "Contract") -> None:
+        """Refuse to take over from a model whose patterns mean something else.
+
+        Raises:
+            ModelError: a key differs; it is named.
+        """
+        keys = {key: (getattr(self, key), getattr(other, key)) for key in STAND_IN_KEYS}
+        keys["interval_factor"] = (self.interval_factor is not None, other.interval_factor is not None)
+        for key, (got, expected) in keys.items():
+            if got != expected:
+                raise ModelError(f"contract key '{key}' is {got!r}, that of the model before {expected!r}")
+
     def scale_window(self, deformation_counts: NDArray[np.float32]) -> NDArray[np.float32]:
         """Zeroed counts (taps, 3, rows, cols) to network input units, same shape."""
         divisor = np.asarray(self.counts_per_unit, dtype=np.float32)[None, :, None, None]
@@ -141,7 +163,8 @@ def _check(values: Mapping[str, Any]) -> None:
         raise ModelError(f"contract key '{key}' is {values[key]!r}, expected {expected}")
 
     for key in ("batch", "taps", "scale", "rows", "cols"):
-        if type(values[key]) is not int or values[key] < 1:
+        any_batch = key == "batch" and values[key] == ANY_BATCH
+        if not any_batch and (type(values[key]) is not int or values[key] < 1):
             refuse(key, "a whole number from 1")
     if values["tap_order"] != TAP_ORDER:
         refuse("tap_order", repr(TAP_ORDER))
@@ -157,6 +180,8 @@ def _check(values: Mapping[str, Any]) -> None:
     factor = values["interval_factor"]
     if factor is not None and not (_is_number(factor) and factor > 0):
         refuse("interval_factor", "a positive number, or null for a model without deviations")
+    if not is_confidence(values["confidence"], values["taps"]):
+        refuse("confidence", "for each number of taps doubt, error and gain, lists of equal length, doubt rising")
     scaling = values["counts_per_unit"]
     if not isinstance(scaling, list) or len(scaling) != 3 or not all(_is_number(v) and v > 0 for v in scaling):
         refuse("counts_per_unit", "three positive numbers, for x, y, z")

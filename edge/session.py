@@ -1,4 +1,4 @@
-"""One model in onnxruntime: checked against its contract, arrays bound once."""
+"""One model in onnxruntime: checked against its contract, arrays bound once for every number of windows."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -10,10 +10,11 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright: ignore[reportAttributeAccessIssue]
 
-from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
+from edge.contract import ANY_BATCH, DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
 from edge.errors import ModelError, WindowError
 
-WARM_UP_RUNS: Final = 20
+WARM_UP_RUNS: Final = 10
+"""The first takes 3 to 10 times as long as the tenth, after which run times stay."""
 LOG_FATAL_ONLY: Final = 4
 LOAD_ERRORS: Final = (
     ort_errors.Fail,
@@ -25,55 +26,51 @@ LOAD_ERRORS: Final = (
     ort_errors.RuntimeException,
 )
 
+onnxruntime.disable_telemetry_events()  # where it was imported before `edge`, which is too late for all of it
+
 
 class ModelSession:
-    """A model ready to run, one window at a time, on one thread without spinning.
+    """A model ready to run, on one thread unless told otherwise, without spinning.
 
     Build it on the thread that runs it: onnxruntime makes denormals zero once in a process, on the thread that builds
     the first session and on threads which that one starts later. Everything else on them computes like this as well.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, threads: int = 1) -> None:
         """Load, check and warm up.
+
+        Args:
+            path: of the model.
+            threads: that share the work of one run.
 
         Raises:
             ModelError: no such file, not a model, weights in a side file, no contract, or a graph
                 that does not keep the contract; the key or tensor is named.
         """
-        self.name = path.stem
-        session = _load(path)
+        self.name = path.stem.encode(errors="replace").decode()  # records are UTF-8, file names need not be
+        self._session = load_session(path, threads)
         try:
-            self.contract = Contract.from_metadata(session.get_modelmeta().custom_metadata_map)
-            if self.contract.batch != 1:
+            self.contract = Contract.from_metadata(self._session.get_modelmeta().custom_metadata_map)
+            if self.contract.batch not in (1, ANY_BATCH):
                 raise ModelError(
-                    f"contract key 'batch' is {self.contract.batch}, but windows are run one at a time here: export it "
-                    "without --batch"
+                    f"contract key 'batch' is {self.contract.batch}, but here the number of windows changes from run "
+                    "to run: export it with --batch any"
                 )
-            _check_tensors("input", session.get_inputs(), {INPUT_NAME: self.contract.window_shape})
-            _check_tensors("output", session.get_outputs(), self.contract.output_shapes)
+            _check_tensors("input", self._session.get_inputs(), {INPUT_NAME: self.contract.window_shape})
+            _check_tensors("output", self._session.get_outputs(), self.contract.output_shapes)
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
-        self._input = np.zeros(self.contract.window_shape, dtype=np.float32)
-        self._session = session
-        self._binding = session.io_binding()
-        self._bind(self._binding.bind_input, INPUT_NAME, self._input)
-        outputs = {}
-        for name, shape in self.contract.output_shapes.items():
-            output = np.zeros(shape, dtype=np.float32)
-            self._bind(self._binding.bind_output, name, output)
-            outputs[name] = output[0]
-            outputs[name].setflags(write=False)
-        self._pattern: NDArray[np.float32] = outputs[OUTPUT_NAME]
-        self._deviation: NDArray[np.float32] | None = outputs.get(DEVIATION_NAME)
-        window = np.zeros((self.contract.taps, 3, self.contract.rows, self.contract.cols), dtype=np.float32)
+        self._runs: dict[int, _Run] = {}
+        self._deviation: NDArray[np.float32] | None = None
         for _ in range(WARM_UP_RUNS):
-            self.run(window)
+            self.run(np.zeros(self._shape, dtype=np.float32))
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
         """Standard deviation of each pixel of the last run's pattern, in its unit, or None where the model has none.
 
-        (H, W) float32 above zero: the session's own array, read-only, and overwritten by the next run.
+        (H, W) float32 above zero, or (n, H, W) after n windows were run together: the session's own array, read-only,
+        and overwritten by the next run.
         """
         return self._deviation
 
@@ -91,31 +88,86 @@ class ModelSession:
             WindowError: wrong shape or type, or not finite.
             ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
         """
-        expected = (self.contract.taps, 3, self.contract.rows, self.contract.cols)
-        if window.shape != expected or window.dtype != np.float32:
-            raise WindowError(f"window is {window.shape} {window.dtype}, expected {expected} float32")
-        if not np.isfinite(window).all():
-            raise WindowError("window has values that are not finite")
-        self._input[...] = window.reshape(self._input.shape)
-        self._session.run_with_iobinding(self._binding)
-        if not np.isfinite(self._pattern).all():
+        pattern = self.run_together([window])[0]
+        if self._deviation is not None:
+            self._deviation = self._deviation[0]
+        return pattern
+
+    def run_together(self, windows: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Infer the patterns of several windows in one call, as `run` does of one.
+
+        A graph of one window a run is called once for each.
+
+        Args:
+            windows: one or more, of different sensors.
+
+        Returns:
+            (n, H, W).
+        """
+        for window in windows:
+            if window.shape != self._shape or window.dtype != np.float32:
+                raise WindowError(f"window is {window.shape} {window.dtype}, expected {self._shape} float32")
+            if not np.isfinite(window).all():
+                raise WindowError("window has values that are not finite")
+        count = len(windows)
+        run = self._runs.get(count) or self._runs.setdefault(count, _Run(self._session, self.contract, count))
+        for index, window in enumerate(windows):
+            run.input[index] = window.reshape(run.input.shape[1:])
+        run()
+        pattern, self._deviation = run.pattern, run.deviation
+        if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
         deviation = self._deviation
         # Not a number is neither above nor below anything, so it fails here too.
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
-        return self._pattern
+        return pattern
 
-    @staticmethod
-    def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
-        bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+    @property
+    def _shape(self) -> tuple[int, int, int, int]:
+        return (self.contract.taps, 3, self.contract.rows, self.contract.cols)
 
 
-def _load(path: Path) -> onnxruntime.InferenceSession:
+class _Run:
+    """Arrays for so many windows, and what fills them."""
+
+    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int) -> None:
+        self.input = np.zeros((count, *contract.window_shape[1:]), dtype=np.float32)
+        outputs = {
+            name: np.zeros((count, *shape[1:]), dtype=np.float32) for name, shape in contract.output_shapes.items()
+        }
+        at_once = count if contract.batch == ANY_BATCH else 1
+        self._session = session
+        self._bindings = [session.io_binding() for _ in range(0, count, at_once)]
+        for index, binding in enumerate(self._bindings):
+            part = slice(index * at_once, (index + 1) * at_once)
+            _bind(binding.bind_input, INPUT_NAME, self.input[part])
+            for name, output in outputs.items():
+                _bind(binding.bind_output, name, output[part])
+        for output in outputs.values():
+            output.setflags(write=False)
+        self.pattern = outputs[OUTPUT_NAME]
+        self.deviation = outputs.get(DEVIATION_NAME)
+
+    def __call__(self) -> None:
+        for binding in self._bindings:
+            self._session.run_with_iobinding(binding)
+
+
+def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
+    bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+
+
+def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
+    """Any ONNX file in the runtime's own settings, its contract not asked for.
+
+    Raises:
+        ModelError: no such file, not a model, or weights in a side file.
+    """
     options = onnxruntime.SessionOptions()
     options.log_severity_level = LOG_FATAL_ONLY
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.intra_op_num_threads = 1
+    options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
@@ -135,7 +187,7 @@ def _load(path: Path) -> onnxruntime.InferenceSession:
         raise ModelError(f"{path}: not a model that onnxruntime can load: {error}") from error
 
 
-def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int, ...]]) -> None:
+def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int | str, ...]]) -> None:
     got = ", ".join(f"{tensor.name} {tensor.type} {list(tensor.shape)}" for tensor in tensors)
     expected = ", ".join(f"{name} tensor(float) {list(shape)}" for name, shape in shapes.items())
     if got != expected:

@@ -23,7 +23,7 @@ BASELINE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file
 
 def make_contract(**changes) -> Contract:
     values = {
-        "version": 3,
+        "version": 4,
         "batch": 1,
         "taps": 4,
         "scale": 10,
@@ -39,6 +39,7 @@ def make_contract(**changes) -> Contract:
         "pitch_mm": 4.7,
         "arithmetic": "float32",
         "interval_factor": None,
+        "confidence": {},
         "training_sha256": "ab" * 32,
         "test_set_sha256": "cd" * 32,
         "test_error": {"1": {"psnr_db": 30.1}, "4": {"psnr_db": 33.2, "rmse_percent": 2.1}},
@@ -69,7 +70,7 @@ def write_model(
     weights = np.zeros((3 * taps, 1, scale, scale), dtype=np.float32)
     for tap in range(taps):
         weights[3 * tap + 2] = gain * 10.0**-tap
-    shape = [(input_shape or [1])[0], *contract.pattern_shape]
+    shape = [(input_shape or [contract.batch])[0], *contract.pattern_shape]
     doubts = [
         helper.make_node("Abs", [output_name], ["size"]),
         helper.make_node("Mul", ["size", "doubt"], ["doubted"]),
@@ -151,6 +152,14 @@ class FakeModel:
         if self.contract.interval_factor is not None:
             self.deviation = tiny_deviation(pattern)
         return pattern
+
+    def run_together(self, windows: list[np.ndarray]) -> np.ndarray:
+        patterns, deviations = [], []
+        for window in windows:
+            patterns.append(self.run(window))
+            deviations.append(self.deviation)
+        self.deviation = None if deviations[0] is None else np.stack(deviations)
+        return np.stack(patterns)
 
 
 class FakeLink:

@@ -7,7 +7,7 @@ import pytest
 from edge_samples import make_contract, tiny_deviation, tiny_pattern, write_model
 from onnx import TensorProto
 
-from edge.contract import KEY_PREFIX, Contract
+from edge.contract import ANY_BATCH, KEY_PREFIX, Contract
 from edge.errors import ModelError, WindowError
 from edge.session import ModelSession
 
@@ -39,9 +39,34 @@ def test_output_is_one_read_only_array_bound_once(session):
     first = session.run(random_window(1))
     kept = first.copy()
     second = session.run(random_window(2))
-    assert first is second and not np.array_equal(kept, second)
+    assert np.shares_memory(first, second) and not np.array_equal(kept, second)
     with pytest.raises(ValueError, match="read-only"):
         first[0, 0] = 1
+
+
+@pytest.mark.parametrize("batch", [1, ANY_BATCH])
+def test_windows_run_together_give_what_each_gives_alone(tmp_path, batch):
+    contract = make_contract(batch=batch, interval_factor=1.6)
+    session = ModelSession(write_model(tmp_path / "several.onnx", contract))
+    windows = [random_window(seed) for seed in range(3)]
+    alone = [(session.run(window).copy(), session.deviation.copy()) for window in windows]
+    for count in (3, 1, 2):
+        together = session.run_together(windows[:count])
+        assert together.shape == session.deviation.shape == (count, 40, 40)
+        for index in range(count):
+            np.testing.assert_array_equal(together[index], alone[index][0])
+            np.testing.assert_array_equal(session.deviation[index], alone[index][1])
+
+
+def test_one_bad_window_among_several_is_refused(session):
+    with pytest.raises(WindowError, match="not finite"):
+        session.run_together([random_window(1), np.full((4, 3, 4, 4), np.nan, dtype=np.float32)])
+
+
+def test_a_graph_of_several_windows_and_no_fewer_is_refused(tmp_path):
+    contract = make_contract(batch=3)
+    with pytest.raises(ModelError, match=r"'batch' is 3, .*: export it with --batch any"):
+        ModelSession(write_model(tmp_path / "three.onnx", contract))
 
 
 def test_non_contiguous_windows_are_right(session):
@@ -140,6 +165,7 @@ BROKEN_VALUES = {
     "pitch_mm": 0,
     "arithmetic": "int4",
     "interval_factor": 0,
+    "confidence": {"1": {"doubt": [0.1], "error": [0.1], "gain": [0.1, 0.2]}},
     "training_sha256": None,
     "test_set_sha256": "",
     "test_error": [],
@@ -166,7 +192,7 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
     metadata = make_contract(version=1).to_metadata()
     del metadata[KEY_PREFIX + "interval_factor"]
-    with pytest.raises(ModelError, match=r"'version' is 1, expected 3: export the model again"):
+    with pytest.raises(ModelError, match=r"'version' is 1, expected 4: export the model again"):
         ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
 
 

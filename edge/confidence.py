@@ -1,0 +1,89 @@
+"""How far off a pattern is expected to be, and whether another tap is expected to bring it nearer.
+
+A pattern's doubt is the RMS of its deviations over the RMS of the pattern itself, one number. What it meant on taps not
+trained on, by the number of taps given, is a table in the model's contract: the error that patterns of that doubt had,
+and the share of it that one more tap took away.
+"""
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+WORTH_A_TAP: Final = 0.02
+"""Share of the error that another tap must be expected to take away to be worth it: .2 dB."""
+
+Table = Mapping[str, Mapping[str, list[float]]]
+"""Number of taps given -> doubt, error and gain, lists of one length: at that doubt, the RMS error as a share of the
+pattern's RMS, and the share of the error that another tap takes away; no gain where no further tap can be given."""
+
+
+class Expected(NamedTuple):
+    """What is expected of a pattern.
+
+    Attributes:
+        rmse: RMS error over all its pixels, in its unit.
+        gain: share of it that another tap would take away; None where the network takes no further tap.
+    """
+
+    rmse: float
+    gain: float | None
+
+    @property
+    def another_tap(self) -> bool | None:
+        """Whether another tap is expected to be worth it; None where none can be given."""
+        return None if self.gain is None else self.gain >= WORTH_A_TAP
+
+
+def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple[float, float]:
+    """Doubt of a pattern (H, W), and its RMS in its unit; infinite and 0 where the pattern is nothing but zero."""
+    size = math.sqrt(float(np.vdot(pattern, pattern)) / pattern.size)
+    spread = math.sqrt(float(np.vdot(deviation, deviation)) / deviation.size)
+    return (spread / size, size) if size > 0 else (math.inf, 0.0)
+
+
+def expect(table: Table, taps: int, pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> Expected | None:
+    """What is expected of a pattern (H, W) made from so many taps; None where the table does not tell.
+
+    Nor does it of a pattern that is nothing but zero.
+    """
+    about, size = doubt(pattern, deviation)
+    return expect_of(table, taps, about, size) if size > 0 else None
+
+
+def expect_of(table: Table, taps: int, about: float, size: float) -> Expected | None:
+    """What is expected of a pattern of that doubt and RMS; None where the table does not tell.
+
+    Between two doubts it is interpolated; beyond the last the error grows with the doubt.
+    """
+    told = table.get(str(taps))
+    if told is None:
+        return None
+    known = told["doubt"]
+    error = float(np.interp(about, known, told["error"])) * max(1.0, about / known[-1])
+    gain = float(np.interp(about, known, told["gain"])) if told["gain"] else None
+    return Expected(error * size, gain)
+
+
+def is_confidence(value: Any, taps: int) -> bool:
+    """Whether a value read from a file is such a table for a model of so many taps, or empty."""
+    if not isinstance(value, dict):
+        return False
+    return all(key in map(str, range(1, taps + 1)) and _is_row(row) for key, row in value.items())
+
+
+def _is_row(row: Any) -> bool:
+    if not isinstance(row, dict) or set(row) != {"doubt", "error", "gain"}:
+        return False
+    if not all(isinstance(values, list) and all(_is_number(v) for v in values) for values in row.values()):
+        return False
+    known, count = row["doubt"], len(row["doubt"])
+    rising = count > 0 and known[0] > 0 and all(a < b for a, b in pairwise(known))
+    return rising and len(row["error"]) == count and len(row["gain"]) in (0, count)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
