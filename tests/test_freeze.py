@@ -6,7 +6,7 @@ from edge.judge import judge
 from edge.taps import ON_COUNTS
 from firmware_bridge.recording import load_recording
 from train.dataset import Sequences
-from train.freeze import SEED, TEST_FORCE_N, demo_recording, fit_classical, freeze, held_out, main
+from train.freeze import SEED, TEST_FORCE_N, demo_recording, fit_classical, fit_taxels, freeze, held_out, main
 from train.generation import Generation, solve_all
 from train.nuisances import Nuisances
 from train.simulation import FRAMES, MAX_INDENTATION_MM
@@ -90,3 +90,14 @@ def test_the_demo_presses_holds_and_lifts_four_times(tmp_path):
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
     with pytest.raises(SystemExit, match=r"^freeze: .*no such file"):
         main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
+
+
+def test_taxels_covary_as_their_readings_do(sequences):
+    covariance = fit_taxels(sequences, windows=400)["covariance"]
+    assert covariance.shape == (48, 48) and covariance.dtype == np.float32
+    np.testing.assert_array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance.astype(np.float64)).min() > -1e-3 * np.trace(covariance)
+    # The press is in z, and a neighbour shares more of it than the far corner does.
+    z = covariance[32:, 32:]
+    assert np.trace(z) > 5 * np.trace(covariance[:32, :32]) / 2
+    np.testing.assert_array_equal(covariance, fit_taxels(sequences, windows=400)["covariance"])

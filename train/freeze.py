@@ -1,4 +1,4 @@
-"""Make what every model is judged on: the frozen test set, the classical methods, and the demo's recording.
+"""Make what comes with the models: the frozen test set, classical methods, taxels' covariance, a recording.
 
 python -m train.freeze edge/models --data data/train.npz
 """
@@ -72,16 +72,27 @@ def freeze(
 
 def fit_classical(sequences: Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
     """Gains of bilinear and bicubic interpolation, in mm per count, and the linear map (48, pixels)."""
-    batches = WindowBatches(sequences.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
-    drawn = [batches.draw(number) for number in range(windows // 100)]
-    newest = np.concatenate([readings[:, 0] for readings, _ in drawn])
-    patterns = np.concatenate([truth for _, truth in drawn])
+    newest, patterns = _drawn(sequences, windows)
     matrix = fit_linear_map(newest.reshape(len(newest), -1), patterns.reshape(len(patterns), -1))
     return {
         "bilinear_gain": np.array(fit_gain(bilinear(newest[:, 2], SCALE), patterns)),
         "bicubic_gain": np.array(fit_gain(bicubic(newest[:, 2], SCALE), patterns)),
         "linear_map": matrix,
     }
+
+
+def fit_taxels(sequences: Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
+    """Covariance (48, 48) about zero of taxels' readings, x of all first, in zeroed counts; none of them dead."""
+    newest, _ = _drawn(sequences, windows)
+    flat = newest.reshape(len(newest), -1).astype(np.float64)
+    return {"covariance": (flat.T @ flat / len(flat)).astype(np.float32)}
+
+
+def _drawn(sequences: Sequences, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Readings (n, 3, rows, cols) of newest taps in zeroed counts, and their patterns (n, H, W) in [mm]."""
+    batches = WindowBatches(sequences.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
+    drawn = [batches.draw(number) for number in range(windows // 100)]
+    return np.concatenate([readings[:, 0] for readings, _ in drawn]), np.concatenate([truth for _, truth in drawn])
 
 
 def demo_recording() -> dict[str, NDArray]:
@@ -130,10 +141,12 @@ def demo_recording() -> dict[str, NDArray]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write frozen.npz, classical.npz and demo.npz."""
+    """Write frozen.npz, classical.npz, taxels.npz and demo.npz."""
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="where to write frozen.npz, classical.npz and demo.npz")
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="what the classical methods are fitted on")
+    parser.add_argument("folder", type=Path, help="where to write frozen.npz, classical.npz, taxels.npz and demo.npz")
+    parser.add_argument(
+        "--data", type=Path, nargs="+", required=True, help="what classical methods and taxels are fitted on"
+    )
     options = parser.parse_args(arguments)
     folder: Path = options.folder
     try:
@@ -143,7 +156,12 @@ def main(arguments: list[str] | None = None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     frozen = freeze(held_out("test"), Nuisances(), SEED)
     frozen.save(folder / "frozen.npz")
-    for name, arrays in (("classical", fit_classical(sequences)), ("demo", demo_recording())):
+    made = {
+        "classical": fit_classical(sequences),
+        "taxels": fit_taxels(sequences),
+        "demo": demo_recording(),
+    }
+    for name, arrays in made.items():
         np.savez_compressed(folder / f"{name}.npz", allow_pickle=False, **arrays)
     sys.stdout.write(f"{len(frozen)} frames of {len(frozen.surface)} taps, sha256 {frozen.sha256()}\n")
 

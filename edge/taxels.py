@@ -1,0 +1,250 @@
+"""Which taxels of a sensor can be believed: held readings, dead taxels and why, scan by scan."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.baseline import Baseline, deformation
+from firmware_bridge.scan import Scan
+
+HOLD_SCANS: Final = 5
+"""A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
+SILENT_SCANS: Final = 50
+"""A taxel not heard for so long is not lost for a moment: the user is told, and zeroing goes on without it."""
+STUCK_SCANS: Final = 20
+"""A living taxel sends the same three counts twice in a quarter of the scans in which a quarter of the taxels are new:
+so torn are real grips at their source, and no run in them is longer than 3. Were scans independent, twenty in a row
+came once in decades at 100 Hz; with noise of two counts alone, where it is one scan in 350, never."""
+FROZEN_SCANS: Final = 300
+"""Without a new count, whatever the others do: most are stuck at once, or one old scan is sent for ever. A
+server was seen that sends 507 scans a second of a sensor that renews a taxel four times: that makes 127."""
+FAR_SCANS: Final = 20
+BACK_SCANS: Final = 10
+"""Good scans after which a dead taxel is believed again, so that one that comes and goes does not flicker."""
+RANGE_ENDS: Final = (0, 65535)
+"""Of a chip. What stands there has left the range, and is no reading, unless the taxel rests nearby and wraps round."""
+NEAR_END_COUNTS: Final = 500.0
+LONE_COUNTS: Final = 1500.0
+"""As much as makes a contact."""
+LONE_SHARE: Final = 0.015
+"""What the second largest taxel reads of the largest: at least .030 where a small sphere stands on one taxel alone,
+.063 on simulated taps, .67 on real grips."""
+REST_COUNTS: Final = 500.0
+"""A taxel found far from rest is believed again below this."""
+REACH_COUNTS: Final = ((-2800.0, 2800.0), (-2800.0, 2800.0), (-2800.0, 27000.0))
+"""Of x, y, z: twice what sensors in the field have shown, whose z only rises when pressed."""
+REASONS: Final = ("silent", "saturated", "stuck", "far", "unzeroed")
+SILENT, SATURATED, STUCK, FAR, UNZEROED = range(1, 6)
+_LOW, _HIGH = np.array(REACH_COUNTS, dtype=np.float32).T[:, :, None, None]
+_WORDS: Final = {
+    "silent": "silent",
+    "saturated": "at the end of its range",
+    "stuck": "stuck",
+    "far": "far from rest where it cannot be",
+    "unzeroed": "not zeroed",
+}
+_OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
+
+
+class TaxelWatch:
+    """Follows the taxels of one sensor.
+
+    A taxel is dead while it is silent or saturated for longer than its last reading is held; stuck, when it repeats
+    itself while most others do not; far, when it reads what no contact makes; or was not heard while zeroing. It is
+    believed again after BACK_SCANS good scans. A taxel that is stuck only nearly, or wrong in a way that a contact
+    could be, is not found: a small sphere on one taxel looks to its neighbours like a fault.
+    """
+
+    def __init__(self, grid_shape: tuple[int, int]) -> None:
+        """Start with no reading of a grid (rows, cols)."""
+        self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)
+        self.dead: NDArray[np.bool_] = np.zeros(grid_shape, dtype=bool)
+        self._code = np.zeros(grid_shape, dtype=np.int8)
+        self._heard = np.zeros(grid_shape, dtype=bool)
+        self._saturated = np.zeros(grid_shape, dtype=bool)
+        self._unzeroed = np.zeros(grid_shape, dtype=bool)
+        self._age = np.zeros(grid_shape, dtype=np.int64)
+        self._still = np.zeros(grid_shape, dtype=np.int64)
+        self._far = np.zeros(grid_shape, dtype=np.int64)
+        self._well = np.zeros(grid_shape, dtype=np.int64)
+        self._size = np.zeros((3, *grid_shape), dtype=np.float32)
+        self._old = np.zeros(grid_shape, dtype=np.int64)
+        self._baseline: Baseline | None = None
+        self._sound = False
+        self._reasons: dict[int, str] = {}
+
+    @property
+    def waiting(self) -> bool:
+        """A taxel has not been heard yet, and is not given up."""
+        return not self._sound and not bool((self._heard | self.dead).all())
+
+    @property
+    def reasons(self) -> dict[int, str]:
+        """Dead taxels, row-major from the top left, and one of REASONS for each."""
+        return self._reasons
+
+    @property
+    def silent_long(self) -> NDArray[np.bool_]:
+        """Taxels (rows, cols) not heard for SILENT_SCANS."""
+        return (self._age >= SILENT_SCANS) & ~self._saturated
+
+    @property
+    def may_be_estimated(self) -> bool:
+        """Enough taxels live; half of them silent are no defect but a wrong id map."""
+        silent = sum(reason == "silent" for reason in self._reasons.values())
+        return len(self._reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
+
+    def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
+        """Follow one scan.
+
+        Args:
+            scan: the sensor's next one.
+            baseline: of the sensor, NaN where a taxel was not zeroed; None while there is none.
+
+        Returns:
+            The newest readings over the baseline, (3, rows, cols) in counts, NaN where not zeroed; None without one.
+        """
+        if baseline is not self._baseline and baseline is not None:
+            self._unzeroed = np.isnan(baseline.counts).any(axis=0)
+            self._sound = False
+        self._baseline = baseline
+        if self._sound and baseline is not None and scan.whole:
+            zeroed = np.subtract(scan.counts, baseline.counts, dtype=np.float32)
+            np.abs(zeroed, out=self._size)
+            largest = float(self._size.max())
+            # Where nothing touches: near its rest no taxel is far, or at an end that is not its rest. Where something
+            # does: none is at an end or far, as one that has gone round the circle is.
+            if largest <= NEAR_END_COUNTS or (
+                RANGE_ENDS[0] < scan.counts.min() <= scan.counts.max() < RANGE_ENDS[1]
+                and not self._may_be_far(zeroed, largest)
+            ):
+                np.copyto(self.held, scan.counts)
+                return zeroed
+        ends = self._find_saturated(scan, baseline)
+        zeroed = None
+        if not ends and self._sound and scan.whole:
+            np.copyto(self.held, scan.counts)
+            zeroed = None if baseline is None else deformation(scan.counts, baseline)
+            if zeroed is None:
+                return zeroed
+            np.abs(zeroed, out=self._size)
+            if not self._may_be_far(zeroed, float(self._size.max())):
+                return zeroed
+        read = scan.fresh & ~self._saturated
+        self._heard |= read
+        np.copyto(self.held, scan.counts, where=read)
+        if baseline is not None:
+            zeroed = deformation(self.held, baseline)
+        self._judge(scan, read, zeroed)
+        return zeroed
+
+    def note(self, filled: str | None) -> str | None:
+        """What to tell of taxels that are not believed; None while there is nothing to tell.
+
+        Args:
+            filled: what stands for dead ones, "rest" or "neighbours"; None where there is no pattern for them.
+        """
+        if self._sound:
+            return None
+        notes = []
+        overloaded = np.flatnonzero(self._saturated & ~self.dead)
+        if overloaded.size:
+            notes.append(f"its last reading is held, {_named(overloaded)} {_WORDS['saturated']}{_OVERLOADED}")
+        kinds = {reason: self._dead_by(reason) for reason in dict.fromkeys(self._reasons.values())}
+        if filled is not None and kinds:
+            dead = ", ".join(f"{_named(taxels)} {_WORDS[reason]}" for reason, taxels in kinds.items())
+            owner = "its" if len(self._reasons) == 1 else "their"
+            how = f"estimated from {owner} neighbours" if filled == "neighbours" else "taken as at rest"
+            notes.append(f"{dead}: {how}")
+            return "; ".join(notes)
+        silent_long = self.silent_long
+        id_map = 2 * np.count_nonzero(silent_long) == silent_long.size
+        remedies = {"saturated": _OVERLOADED, "unzeroed": ": zero again"}
+        for reason, taxels in kinds.items():
+            remedy = remedies.get(reason, ": it may be broken")
+            if reason == "silent":
+                remedy = ": try another --id-map" if id_map else remedy if silent_long.any() else ""
+            if taxels:
+                notes.append(f"no pattern, {_named(taxels)} {_WORDS[reason]}{remedy}")
+        return "; ".join(notes) or None
+
+    def _dead_by(self, reason: str) -> list[int]:
+        return [taxel for taxel, why in self._reasons.items() if why == reason]
+
+    def _find_saturated(self, scan: Scan, baseline: Baseline | None) -> bool:
+        """Keep which taxels stand, on some axis, at an end of the chip's range and far from rest; are there any?"""
+        low, high = RANGE_ENDS
+        ends = (scan.counts == low) | (scan.counts == high)
+        if not self._sound:
+            self._saturated &= ~scan.fresh
+        if baseline is not None and ends.any():
+            far = np.abs(deformation(scan.counts, baseline)) > NEAR_END_COUNTS
+            self._saturated |= (ends & far).any(axis=0)
+            return bool(self._saturated.any())
+        return False
+
+    def _may_be_far(self, zeroed: NDArray[np.float32], largest: float) -> bool:
+        """Quickly, of a sensor whose taxels are all alive; the full question is asked only where this is true.
+
+        Args:
+            zeroed: (3, rows, cols), its sizes being in `_size`.
+            largest: of those sizes.
+        """
+        if largest <= LONE_COUNTS:
+            return False
+        second, first = np.partition(self._size.max(axis=0), -2, axis=None)[-2:]
+        return bool(second < LONE_SHARE * first or (zeroed < _LOW).any() or (zeroed > _HIGH).any())
+
+    def _judge(self, scan: Scan, read: NDArray[np.bool_], zeroed: NDArray[np.float32] | None) -> None:
+        self._age += 1
+        self._age[read] = 0
+        # A scan in which few are new says nothing about one that is not: the adapter repeats itself.
+        if 4 * np.count_nonzero(scan.renewed) >= np.count_nonzero(~self.dead) > 0:
+            self._still += scan.fresh & ~scan.renewed
+        self._still[scan.renewed] = 0
+        self._old += scan.fresh
+        self._old[scan.renewed] = 0
+        size = self._follow_far(zeroed)
+
+        fault = np.zeros_like(self._code)
+        fault[self._unzeroed] = UNZEROED
+        fault[self._far >= FAR_SCANS] = FAR
+        fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS)] = STUCK
+        gone = self._age > HOLD_SCANS
+        fault[gone] = SILENT
+        fault[gone & self._saturated] = SATURATED
+
+        good = read & scan.renewed
+        if size is not None:
+            good &= (self._code != FAR) | (size < REST_COUNTS)
+        self._well += good
+        self._well[(fault > 0) | ~read | (self._still > 0)] = 0
+        code = np.where(fault > 0, fault, np.where(self._well >= BACK_SCANS, 0, self._code)).astype(np.int8)
+        if (code != self._code).any():
+            dead = code > 0
+            if (dead != self.dead).any():
+                self.dead = dead  # a new one, so that a change is seen by identity
+            self._code = code
+            self._reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
+        counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
+        self._sound = not counting and not self.dead.any() and bool(self._heard.all())
+
+    def _follow_far(self, zeroed: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        """Count scans in which a taxel reads what no contact makes; the largest of its axes, (rows, cols)."""
+        if zeroed is None:
+            return None
+        # Where a taxel is dead or was not zeroed its reading is none, and others may not be measured by it.
+        size = np.nan_to_num(np.abs(zeroed).max(axis=0))
+        beyond = ((zeroed < _LOW) | (zeroed > _HIGH)).any(axis=0)
+        living = np.where(self.dead, 0, size)
+        second, first = np.partition(living, -2, axis=None)[-2:]
+        if first > LONE_COUNTS and second < LONE_SHARE * first:
+            beyond |= living == first
+        self._far += 1
+        self._far[~beyond] = 0
+        return size
+
+
+def _named(taxels: list[int] | NDArray[np.integer]) -> str:
+    return f"taxel {', '.join(map(str, taxels))}"
