@@ -124,6 +124,16 @@ def _pixels_apart(height: int, width: int) -> NDArray[np.float32]:
     return np.hypot(rows[:, None] - rows, columns[:, None] - columns)
 
 
+def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:
+    """What patterns (..., H, W) in [mm] sum up to over their area, (...) in [mm3].
+
+    Args:
+        patterns: (..., H, W) in [mm].
+        pixel_mm: pixel size, in [mm].
+    """
+    return np.asarray(patterns).sum(axis=(-2, -1)) * pixel_mm**2
+
+
 def interval_coverage(pattern: ArrayLike, truth: ArrayLike, half_width: ArrayLike) -> NDArray[np.float64]:
     """Share of pixels whose truth lies no farther from the pattern than `half_width`, (..., H, W) in the same unit."""
     errors = np.abs(np.asarray(pattern) - np.asarray(truth))
@@ -169,3 +179,28 @@ def _blur(maps: NDArray[np.float64]) -> NDArray[np.float64]:
     windows = np.lib.stride_tricks.sliding_window_view
     rows = windows(maps, weights.size, axis=-2) @ weights
     return windows(rows, weights.size, axis=-1) @ weights
+
+
+def touched_patch(
+    pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
+) -> tuple[float, tuple[float, float] | None]:
+    """Area and centroid of the touched pixels.
+
+    Args:
+        pattern: (H, W).
+        touching: (H, W), which pixels are touched; their pattern is above zero.
+        pixel_pitch_mm: distance of neighbouring pixels, in [mm].
+
+    Returns:
+        Area in [mm2]; pattern-weighted centroid x, y in [mm] from the pattern's centre, x to the
+        right and y down, or None where nothing is touched.
+    """
+    rows, cols = np.nonzero(touching)
+    if rows.size == 0:
+        return 0.0, None
+    weights = pattern[rows, cols].astype(np.float64)
+    weights /= weights.sum()
+    height, width = pattern.shape
+    x_mm = (float(weights @ cols) - (width - 1) / 2) * pixel_pitch_mm
+    y_mm = (float(weights @ rows) - (height - 1) / 2) * pixel_pitch_mm
+    return rows.size * pixel_pitch_mm**2, (x_mm, y_mm)

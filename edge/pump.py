@@ -1,12 +1,16 @@
 """From a link through the runtime into sinks, with the reading beside the inference."""
 
+import gc
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from queue import Empty, SimpleQueue
 from typing import Final, NamedTuple, Protocol
 
+from edge.deadline import Deadline
 from edge.runtime import Runtime
 from edge.sinks.base import Sink
 from edge.statistics import Statistics
@@ -46,9 +50,9 @@ class ScanReader:
     def __init__(self, link: Link, capacity_scans: int = CAPACITY_SCANS) -> None:
         self.overruns = 0
         self._link = link
-        self._waiting: deque[Arrival] = deque()
+        # Unlike a Condition it wakes its reader without Python on either side: half of what a scan cost was waking.
+        self._waiting: SimpleQueue[Arrival | None] = SimpleQueue()
         self._capacity_scans = capacity_scans
-        self._changed = threading.Condition()
         self._through = False
         self._stop = threading.Event()
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="scan-reader")
@@ -68,12 +72,16 @@ class ScanReader:
         Raises:
             LinkLostError: and whatever else ended the reading, after all scans before it were taken.
         """
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._through, timeout_s)
-            arrivals = list(self._waiting)
-            self._waiting.clear()
-            through = self._through
-        if arrivals or not through:
+        arrivals: list[Arrival] = []
+        try:
+            arrival = None if self._through else self._waiting.get(timeout=timeout_s)
+            while arrival is not None:
+                arrivals.append(arrival)
+                arrival = self._waiting.get_nowait()
+            self._through = True
+        except Empty:
+            return arrivals
+        if arrivals:
             return arrivals
         if self._reading is not None:
             self._reading.result()
@@ -86,18 +94,35 @@ class ScanReader:
                 if scans:
                     self._put(scans)
         finally:
-            with self._changed:
-                self._through = True
-                self._changed.notify()
+            self._waiting.put(None)
 
     def _put(self, scans: Sequence[Scan]) -> None:
         counters = self._link.counters()
-        with self._changed:
-            self._waiting.extend(Arrival(scan, counters) for scan in scans)
-            while len(self._waiting) > self._capacity_scans:
-                self._waiting.popleft()
-                self.overruns += 1
-            self._changed.notify()
+        for scan in scans:
+            if self._waiting.qsize() >= self._capacity_scans:
+                with suppress(Empty):  # taken after all, that moment
+                    self._waiting.get_nowait()
+                    self.overruns += 1
+            self._waiting.put(Arrival(scan, counters))
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without garbage collection.
+
+    A full collection stops everything for tens of milliseconds, several periods of a sensor, and the loop makes no
+    cycles that would need one: what it makes is freed at once. What is there before is kept out of later collections.
+    """
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if enabled:
+            gc.enable()
 
 
 def pump(
@@ -110,7 +135,9 @@ def pump(
     duration_s: float | None = None,
     commands: Commands | None = None,
     capacity_scans: int = CAPACITY_SCANS,
+    rate_hz: float | None = None,
     clock_s: Callable[[], float] = time.monotonic,
+    clock_ns: Callable[[], int] = time.monotonic_ns,
 ) -> None:
     """Run until the link ends, `stop` is set or `duration_s` is over.
 
@@ -120,21 +147,24 @@ def pump(
     Args:
         link: open.
         runtime: makes the results.
-        sinks: get every result and the counters: the link's, `dropped` and `overruns`.
+        sinks: get every result and the counters: the link's, `dropped`, `overruns` and `late`.
         statistics: filled on the way, so that they are there however the run ends.
         stop: ends the run after the scans in hand.
         duration_s: longest time to run, in [s].
         commands: "reset" resets the runtime.
         capacity_scans: how many scans may wait.
+        rate_hz: of each sensor, for the deadline of its patterns; by default as its scans come.
         clock_s: monotonic, in [s].
+        clock_ns: the clock of the scans, in [ns].
 
     Raises:
         LinkLostError: after every scan before it got its record.
         SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
         ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
     """
-    end_s = None if duration_s is None else clock_s() + duration_s
-    with ScanReader(link, capacity_scans) as reader:
+    deadlines: dict[str, Deadline] = {}
+    with ScanReader(link, capacity_scans) as reader, _uncollected():
+        end_s = None if duration_s is None else clock_s() + duration_s
         while not stop.is_set() and (end_s is None or clock_s() < end_s):
             arrivals = reader.take(POLL_S)
             statistics.overruns = reader.overruns
@@ -145,10 +175,24 @@ def pump(
                     runtime.reset()
                 statistics.commands_refused = commands.refused
             newest = {arrival.scan.sensor: index for index, arrival in enumerate(arrivals)}
-            for index, arrival in enumerate(arrivals):
-                result = runtime.push(arrival.scan, infer=newest[arrival.scan.sensor] == index)
+            scans = [(a.scan, newest[a.scan.sensor] == index) for index, a in enumerate(arrivals)]
+            results = runtime.push_together(scans)
+            done_ns = clock_ns()
+            for arrival, result in zip(arrivals, results, strict=True):
+                deadline = deadlines.get(arrival.scan.sensor)
+                if deadline is None:
+                    deadline = deadlines[arrival.scan.sensor] = Deadline(rate_hz)
+                deadline.follow(arrival.scan.time_ns)
+                if result.pattern is not None:
+                    statistics.late += deadline.check(arrival.scan.time_ns, done_ns)
+                    result = replace(result, latency_us=(done_ns - arrival.scan.time_ns) / 1e3)
                 statistics.add(result)
-                counters = {**arrival.counters, "dropped": statistics.dropped, "overruns": statistics.overruns}
+                counters = {
+                    **arrival.counters,
+                    "dropped": statistics.dropped,
+                    "overruns": statistics.overruns,
+                    "late": statistics.late,
+                }
                 for sink in sinks:
                     sink.write(result, counters)
             if not arrivals:

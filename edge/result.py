@@ -1,7 +1,8 @@
 """What the runtime says about one scan."""
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,14 @@ from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scan import Scan
 
+MADE: Final = (
+    *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),
+    *("expected_rmse_mm", "another_tap"),
+)
+"""Of a result, what is made of a pattern."""
+
 State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
+Filled = Literal["rest", "neighbours"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,11 +29,12 @@ class Result:
         scan: as it came.
         source: what kind of source it came from; "emulated" is not a sensor.
         model: name of the model.
-        state: "zeroing" while there is no baseline, "incomplete" when a taxel was not heard for
-            too long, "idle" without contact, "contact" with a pattern, "dropped" when there was
-            contact but a newer scan was already waiting.
+        state: "zeroing" while there is no baseline, "incomplete" when a taxel was not heard yet, or more are dead than
+            can be made up for, "idle" without contact, "contact" with a pattern, "dropped" when there was contact but
+            a newer scan was already waiting.
         contact: None while it cannot be known.
-        taps_used: taps that the pattern was made from; 0 without contact.
+        taps_used: taps that the pattern was made from; 0 without contact. Fewer than there were where no more were
+            expected to help.
         pattern: (H, W) float32 in `pattern_unit`, or None.
         pattern_unit: unit of the pattern.
         deviation: (H, W) float32, standard deviation of each pixel of the pattern, in `pattern_unit`; None without a
@@ -37,10 +46,23 @@ class Result:
             and y down, in [mm].
         interval_mm: how far a touched pixel may be off: half of the interval that holds 90 % of pixels, mean over the
             touched ones, in [mm]; None without a deviation.
-        run_time_us: of the inference, scaling of the input included, in [us].
+        reused_from: number of the scan whose pattern this is, where nothing had changed beyond noise since; else None.
+        expected_rmse_mm: RMS error that patterns so doubtful had on taps not trained on, in [mm]; None where not known.
+        another_tap: whether another tap is expected to lower that error enough to be worth it; None where the model
+            takes no further tap, or it is not known.
+        run_time_us: of the inference, of all sensors' that ran in one call, scaling of the input included, in [us];
+            None where the pattern was there already.
+        latency_us: from the read that gave the scan's last byte to the pattern being ready, in [us]; what the adapter
+            and the kernel took before that read is not in it. None without a pattern.
         baseline: subtracted from the scan, or None.
         baseline_age_s: how long ago the baseline was taken, in [s].
+        dead: taxels that are not believed, row-major from the top left, and why: "silent", "saturated", "stuck", "far"
+            (reads what no contact makes) or "unzeroed"; empty where all are. A pattern made meanwhile is made without
+            them.
+        filled: what stood for the dead ones: "rest", which networks are trained to make up for, or an estimate from
+            their "neighbours"; None where none is dead, or no pattern can be made.
         note: what the user should know, such as why zeroing started over.
+        event: why there is another model from this scan on; None where it is that of the scan before.
     """
 
     scan: Scan
@@ -57,18 +79,28 @@ class Result:
     area_mm2: float | None = None
     centroid_mm: tuple[float, float] | None = None
     interval_mm: float | None = None
+    reused_from: int | None = None
+    expected_rmse_mm: float | None = None
+    another_tap: bool | None = None
     run_time_us: float | None = None
+    latency_us: float | None = None
     baseline: Baseline | None = None
     baseline_age_s: float | None = None
+    dead: Mapping[int, str] = field(default_factory=dict)
+    filled: Filled | None = None
     note: str | None = None
+    event: str | None = None
 
     def baseline_text(self) -> str:
         """Which baseline, how old."""
         if self.baseline is None or self.baseline_age_s is None:
             return "no baseline"
-        age_s = self.baseline_age_s
-        age = f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
-        return f"baseline {self.baseline.id} {age} old"
+        return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)} old"
+
+
+def age_text(age_s: float) -> str:
+    """An age in [s], in seconds, minutes or hours."""
+    return f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
 
 
 def mask_bits(taxels: NDArray[np.bool_]) -> int:

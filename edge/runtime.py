@@ -1,31 +1,25 @@
 """Scan in, result out: the only state there is between scans, kept per sensor."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.confidence import expect
 from edge.contract import Contract
-from edge.errors import UsageError, WindowError
-from edge.metrics import touched
-from edge.result import Result
-from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapState, TapTracker
-from firmware_bridge.baseline import Baseline, BaselineEstimator, deformation
-from firmware_bridge.errors import BaselineRefusedError
+from edge.errors import ModelError, UsageError, WindowError
+from edge.estimate import WIDENING, TaxelEstimator
+from edge.metrics import touched, touched_patch
+from edge.result import MADE, Result
+from edge.sensor import Sensor
+from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
+from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scan import Scan
-
-HOLD_SCANS: Final = 5
-"""A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
-SILENT_SCANS: Final = 50
-"""A taxel not heard for so long is not lost for a moment: the user is told."""
-RANGE_ENDS: Final = (0, 65535)
-"""Of a chip. What stands there has left the range, and is no reading, unless the taxel rests nearby and wraps round."""
-NEAR_END_COUNTS: Final = 500.0
 
 
 class Model(Protocol):
@@ -38,9 +32,13 @@ class Model(Protocol):
         """Pattern (H, W) of a window (taps, 3, rows, cols) in network input units."""
         ...
 
+    def run_together(self, windows: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Patterns (n, H, W) of several windows in one call."""
+        ...
+
     @property
     def deviation(self) -> NDArray[np.float32] | None:
-        """Standard deviation (H, W) of each pixel of the last run's pattern; None where the model gives none."""
+        """Standard deviation of each pixel of the last run's patterns, of their shape; None where there is none."""
         ...
 
 
@@ -50,6 +48,7 @@ class Runtime:
     Args:
         model: the loaded model.
         source: what kind of source the scans come from; every result says it.
+        estimator: of dead taxels; without it there is no pattern while one is dead.
         geometry: of the sensors; refused if the model was not trained for it.
         baselines: stored baselines by sensor name; a sensor without one is zeroed from its first
             scans, during which its pad must be still and free.
@@ -57,6 +56,9 @@ class Runtime:
         on_counts: summed z at which a tap begins.
         off_counts: summed z at which it ends.
         idle_timeout_s: time without contact after which earlier taps are forgotten.
+        reuse: give the pattern before where nothing has changed beyond noise.
+        every_tap: use all taps there are, also those that are not expected to help.
+        most_taps: taps to remember for a model that may take over; the model's own if it takes more.
         clock_ns: measures run time.
         unix_time_s: tells a baseline's age.
 
@@ -70,12 +72,16 @@ class Runtime:
         model: Model,
         *,
         source: SourceKind,
+        estimator: TaxelEstimator | None = None,
         geometry: SensorGeometry = USPA44,
         baselines: Mapping[str, Baseline] | None = None,
         counts_per_newton: float | None = None,
         on_counts: float = ON_COUNTS,
         off_counts: float = OFF_COUNTS,
         idle_timeout_s: float = IDLE_TIMEOUT_S,
+        reuse: bool = True,
+        every_tap: bool = False,
+        most_taps: int = 1,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
@@ -85,14 +91,19 @@ class Runtime:
                 got = f"baseline of sensor {baseline.sensor} has shape {baseline.counts.shape}"
                 raise UsageError(f"{got}, expected {geometry.scan_shape}: zero again")
         self._model = model
+        self._most_taps = max(most_taps, model.contract.taps)
+        self._event: str | None = None
         self._source: SourceKind = source
+        self._estimator = estimator
         self._geometry = geometry
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._thresholds = (on_counts, off_counts, idle_timeout_s)
+        self._reuse = reuse
+        self._every_tap = every_tap
         self._clock_ns = clock_ns
         self._unix_time_s = unix_time_s
-        self._sensors: dict[str, _Sensor] = {}
+        self._sensors: dict[str, Sensor] = {}
         self._new_tracker()
 
     def reset(self) -> None:
@@ -100,164 +111,163 @@ class Runtime:
         for sensor in self._sensors.values():
             sensor.taps.reset()
 
-    def push(self, scan: Scan, *, infer: bool = True) -> Result:
-        """Make the result of one scan.
-
-        Args:
-            scan: the sensor's next one.
-            infer: False spares the inference, for a scan that a newer one has overtaken; taps are
-                followed all the same.
+    def change_model(self, model: Model, why: str) -> None:
+        """Let another model take over from the next scan on, whose result tells why; taps and zeroing stay.
 
         Raises:
-            WindowError: the scan is not of this sensor geometry.
+            ModelError: its patterns are not of the same meaning and shape, or it takes more taps than are remembered.
+        """
+        model.contract.check_stands_in(self._model.contract)
+        if model.contract.taps > self._most_taps:
+            raise ModelError(f"contract key 'taps' is {model.contract.taps}, but {self._most_taps} are remembered")
+        self._model = model
+        self._event = why
+
+    def push(self, scan: Scan, *, infer: bool = True) -> Result:
+        """Make the result of one scan; see `push_together`."""
+        return self.push_together([(scan, infer)])[0]
+
+    def push_together(self, scans: Sequence[tuple[Scan, bool]]) -> list[Result]:
+        """Make the results of scans, in their order; what is to be inferred is inferred in one call.
+
+        Args:
+            scans: each with whether it is inferred if it touches. A scan that a newer one of its sensor has overtaken
+                is spared; its tap is followed all the same.
+
+        Raises:
+            WindowError: a scan is not of this sensor geometry.
             ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
         """
+        results: list[Result] = []
+        due: dict[int, _Due] = {}
+        for scan, infer in scans:
+            result, touch = self._follow(scan)
+            if touch is not None:
+                if not infer:
+                    result = replace(result, state="dropped")
+                elif (same := self._unchanged(result, touch)) is not None:
+                    result = same
+                else:
+                    due[len(results)] = touch
+            results.append(result)
+        if due:
+            for index, made in self._infer(due, results):
+                results[index] = made
+        return results
+
+    def _follow(self, scan: Scan) -> tuple[Result, "_Due | None"]:
+        """The result without a pattern, and what a pattern is to be made from."""
         if scan.counts.shape != self._geometry.scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._geometry.scan_shape}")
         sensor = self._sensors.get(scan.sensor) or self._meet(scan.sensor)
-        counts = sensor.hold(scan)
-        if sensor.baseline is None:
-            sensor.zero(scan)
+        zeroed = sensor.hear(scan)
+        readings = None if zeroed is None else sensor.fill(zeroed)
+        filled = None if readings is None else readings.filled
+        note = "; ".join(text for text in (sensor.watch.note(filled), sensor.note) if text) or None
 
-        unit, note = self._model.contract.output_unit, sensor.silence() or sensor.note
-        result = Result(scan, self._source, self._model.name, "zeroing", pattern_unit=unit, note=note)
-        if sensor.baseline is None:
-            return result
+        unit, dead = self._model.contract.output_unit, sensor.watch.reasons
+        known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "note": note, "event": self._event}
+        self._event = None
+        if sensor.baseline is None or zeroed is None:
+            return Result(scan, self._source, self._model.name, "zeroing", **known), None
         age_s = sensor.baseline.age_s(self._unix_time_s())
-        result = replace(result, state="incomplete", baseline=sensor.baseline, baseline_age_s=age_s)
-        if counts is None:
-            return result
+        known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "filled": filled}
+        if sensor.watch.waiting or (dead and readings is None):
+            return Result(scan, self._source, self._model.name, "incomplete", **known), None
 
-        zeroed = deformation(counts, sensor.baseline)
-        tap = sensor.taps.push(zeroed, scan.time_ns)
-        force_counts = float(zeroed[2].sum())
+        force_counts = float(np.add.reduce(zeroed[2], axis=None)) if readings is None else readings.z_counts
+        tap = sensor.taps.push(zeroed if readings is None else readings.counts, scan.time_ns, force_counts)
+        taps_used = sensor.taps_that_matter.of(tap)
+        if self._every_tap:
+            taps_used = tap.taps_used
+        taps_used = min(taps_used, self._model.contract.taps)
         force_n = None if self._counts_per_newton is None else force_counts / self._counts_per_newton
-        result = replace(
-            result,
-            state="idle",
+        result = Result(
+            scan,
+            self._source,
+            self._model.name,
+            "idle",
             contact=tap.contact,
-            taps_used=tap.taps_used,
+            taps_used=taps_used,
             force_counts=force_counts,
             force_n=force_n,
+            **known,
         )
-        if not tap.contact:
-            return result
-        if not infer:
-            return replace(result, state="dropped")
-        return self._infer(result, tap)
+        made_by = (self._model.name, tap.tap, taps_used, filled)
+        # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
+        return result, _Due(sensor, tap.window.copy(), made_by) if tap.contact else None
 
-    def _infer(self, result: Result, tap: TapState) -> Result:
+    def _unchanged(self, result: Result, due: "_Due") -> Result | None:
+        """The result with the pattern before, where there is no need of another."""
+        before = due.sensor.last
+        if not self._reuse or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
+            return None
+        result = replace(result, **{name: getattr(before, name) for name in MADE})
+        return replace(result, reused_from=before.scan.number)
+
+    def _infer(self, due: Mapping[int, "_Due"], results: Sequence[Result]) -> Iterator[tuple[int, Result]]:
         contract = self._model.contract
         start_ns = self._clock_ns()
-        pattern = self._model.run(contract.scale_window(tap.window))
+        windows = []
+        for index, touch in due.items():
+            window = contract.scale_window(touch.window[: contract.taps])
+            window[results[index].taps_used :] = 0
+            windows.append(window)
+        patterns = self._model.run_together(windows)
         run_time_us = (self._clock_ns() - start_ns) / 1e3
-        deviation = self._model.deviation
+        deviations = self._model.deviation
+        for row, (index, touch) in enumerate(due.items()):
+            deviation = None if deviations is None else deviations[row].copy()
+            made = self._made(results[index], patterns[row].copy(), deviation, run_time_us)
+            touch.sensor.keep(made, touch.window[0], touch.made_by)
+            yield index, made
+
+    def _made(
+        self,
+        result: Result,
+        pattern: NDArray[np.float32],
+        deviation: NDArray[np.float32] | None,
+        run_time_us: float,
+    ) -> Result:
+        contract = self._model.contract
+        if deviation is not None and result.dead:
+            deviation *= np.float32(WIDENING[len(result.dead)])
         touching = touched(pattern, contract.contact_level)
         area_mm2, centroid_mm = touched_patch(pattern, touching, self._geometry.pixel_pitch_mm(contract.scale))
-        interval_mm = None
-        if deviation is not None and contract.interval_factor is not None and touching.any():
-            interval_mm = contract.interval_factor * float(deviation[touching].mean())
+        interval_mm = expected = None
+        if deviation is not None:
+            expected = expect(contract.confidence, result.taps_used, pattern, deviation)
+            if contract.interval_factor is not None and touching.any():
+                interval_mm = contract.interval_factor * float(deviation[touching].mean())
         return replace(
             result,
             state="contact",
-            pattern=pattern.copy(),
+            pattern=pattern,
             area_mm2=area_mm2,
             centroid_mm=centroid_mm,
-            deviation=None if deviation is None else deviation.copy(),
+            deviation=deviation,
             interval_mm=interval_mm,
+            expected_rmse_mm=None if expected is None else expected.rmse,
+            another_tap=None if expected is None else expected.another_tap,
             run_time_us=run_time_us,
         )
 
-    def _meet(self, name: str) -> "_Sensor":
+    def _meet(self, name: str) -> Sensor:
         baseline = self._baselines.get(name)
         note = None
         if baseline is None and self._baselines:
             note = f"no stored baseline for sensor {name}, only for {', '.join(sorted(self._baselines))}: zeroing"
-        self._sensors[name] = sensor = _Sensor(self._geometry, self._new_tracker(), baseline, note)
+        self._sensors[name] = sensor = Sensor(self._geometry, self._new_tracker(), self._estimator, baseline, note)
         return sensor
 
     def _new_tracker(self) -> TapTracker:
-        contract = self._model.contract
-        return TapTracker(contract.taps, *self._thresholds, grid_shape=(self._geometry.rows, self._geometry.cols))
+        grid_shape = (self._geometry.rows, self._geometry.cols)
+        return TapTracker(self._most_taps, *self._thresholds, grid_shape=grid_shape)
 
 
-class _Sensor:
-    """What is remembered of one sensor."""
+class _Due(NamedTuple):
+    """What a pattern is to be made from: the sensor's window, and what makes it a pattern of its own."""
 
-    def __init__(self, geometry: SensorGeometry, taps: TapTracker, baseline: Baseline | None, note: str | None) -> None:
-        self.taps = taps
-        self.baseline = baseline
-        self.note = note
-        self._estimator = BaselineEstimator()
-        self._held = np.zeros(geometry.scan_shape, dtype=np.int32)
-        self._age_scans = np.full((geometry.rows, geometry.cols), HOLD_SCANS + 1)
-        self._oldest_scans = 0
-        self._saturated = np.zeros((geometry.rows, geometry.cols), dtype=bool)
-
-    def hold(self, scan: Scan) -> NDArray[np.int32] | None:
-        """The newest reading of every taxel, or None if one is too old or was never heard."""
-        self._find_saturated(scan)
-        read = scan.fresh & ~self._saturated
-        np.copyto(self._held, scan.counts, where=read)
-        self._age_scans += 1
-        self._age_scans[read] = 0
-        self._oldest_scans = int(self._age_scans.max())
-        return self._held if self._oldest_scans <= HOLD_SCANS else None
-
-    def _find_saturated(self, scan: Scan) -> None:
-        """Keep which taxels stand, on some axis, at an end of the chip's range and far from rest."""
-        low, high = RANGE_ENDS
-        self._saturated &= ~scan.fresh
-        ends = (scan.counts == low) | (scan.counts == high)
-        if self.baseline is not None and ends.any():
-            far = np.abs(deformation(scan.counts, self.baseline)) > NEAR_END_COUNTS
-            self._saturated |= (ends & far).any(axis=0)
-
-    def silence(self) -> str | None:
-        """What to tell of taxels that are not heard, or say nothing; None while there are none."""
-        notes = []
-        if self._saturated.any():
-            held = "its last reading is held" if self._oldest_scans <= HOLD_SCANS else "no pattern"
-            saturated = ", ".join(map(str, np.flatnonzero(self._saturated)))
-            notes.append(f"{held}, taxel {saturated} at the end of its range: overloaded, too near a magnet, or broken")
-        if self._oldest_scans >= SILENT_SCANS:
-            silent = np.flatnonzero((self._age_scans >= SILENT_SCANS) & ~self._saturated)
-            remedy = "try another --id-map" if 2 * silent.size == self._age_scans.size else "it may be broken"
-            if silent.size:
-                notes.append(f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}")
-        return "; ".join(notes) or None
-
-    def zero(self, scan: Scan) -> None:
-        """Use the scan for the baseline; a refusal becomes the note, and zeroing starts over."""
-        try:
-            self.baseline = self._estimator.push(scan)
-        except BaselineRefusedError as refusal:
-            self.note = f"zeroing started over: {refusal}"
-        else:
-            if self.baseline is not None:
-                self.note = None
-
-
-def touched_patch(
-    pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
-) -> tuple[float, tuple[float, float] | None]:
-    """Area and centroid of the touched pixels.
-
-    Args:
-        pattern: (H, W).
-        touching: (H, W), which pixels are touched; their pattern is above zero.
-        pixel_pitch_mm: distance of neighbouring pixels, in [mm].
-
-    Returns:
-        Area in [mm2]; pattern-weighted centroid x, y in [mm] from the pattern's centre, x to the
-        right and y down, or None where nothing is touched.
-    """
-    rows, cols = np.nonzero(touching)
-    if rows.size == 0:
-        return 0.0, None
-    weights = pattern[rows, cols].astype(np.float64)
-    weights /= weights.sum()
-    height, width = pattern.shape
-    x_mm = (float(weights @ cols) - (width - 1) / 2) * pixel_pitch_mm
-    y_mm = (float(weights @ rows) - (height - 1) / 2) * pixel_pitch_mm
-    return rows.size * pixel_pitch_mm**2, (x_mm, y_mm)
+    sensor: Sensor
+    window: NDArray[np.float32]
+    made_by: Hashable

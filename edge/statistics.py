@@ -42,42 +42,66 @@ class Statistics:
     Attributes:
         scans: results made, one for every scan.
         patterns: of these, with a pattern.
+        reused: of these, with the pattern before, since nothing had changed.
         dropped: in contact, but overtaken by a newer scan before the inference.
+        late: patterns that were ready later than one period after their scan.
         overruns: scans thrown away unseen because nobody took them in time.
         torn_wire: scans with taxels missing.
         torn_source: complete scans that were only partly renewed.
         repeated: complete scans with nothing renewed.
         run_time_us: histogram of the inference's run time.
+        latency_us: histogram of the time from scan to pattern.
         commands_refused: lines on stdin that were no command.
+        model_patterns: of the patterns, how many each model made.
+        model_changes: how often the model was another than before.
     """
 
     def __init__(self) -> None:
         self.scans = 0
         self.patterns = 0
+        self.reused = 0
         self.dropped = 0
+        self.late = 0
         self.overruns = 0
         self.torn_wire = 0
         self.torn_source = 0
         self.repeated = 0
         self.run_time_us = Histogram()
+        self.latency_us = Histogram()
         self.commands_refused = 0
+        self.model_patterns: dict[str, int] = {}
+        self.model_changes = 0
+        self._model: str | None = None
+        self._last_event: str | None = None
         self._spans: dict[str, _Span] = {}
-        self._baselines: dict[str, str] = {}
+        self._zeroed: dict[str, Result] = {}
 
     def add(self, result: Result) -> None:
         """Count one result."""
         scan = result.scan
         self.scans += 1
         self.dropped += result.state == "dropped"
-        self.torn_wire += not scan.complete
-        self.torn_source += scan.complete and scan.torn
-        self.repeated += scan.repeated
+        if not scan.whole:
+            self.torn_wire += not scan.complete
+            self.torn_source += scan.complete and scan.torn
+            self.repeated += scan.repeated
+        self.patterns += result.pattern is not None
+        self.reused += result.reused_from is not None
         if result.run_time_us is not None:
-            self.patterns += 1
             self.run_time_us.add(result.run_time_us)
+            self.model_patterns[result.model] = self.model_patterns.get(result.model, 0) + 1
+        if self._model not in (None, result.model):
+            self.model_changes += 1
+            self._last_event = result.event
+        self._model = result.model
+        if result.latency_us is not None:
+            self.latency_us.add(result.latency_us)
         if result.baseline is not None:
-            self._baselines[scan.sensor] = f"{result.baseline_text()}, from {result.baseline.origin}"
-        self._spans.setdefault(scan.sensor, _Span(scan.time_ns)).add(scan.time_ns)
+            self._zeroed[scan.sensor] = result
+        span = self._spans.get(scan.sensor)
+        if span is None:
+            span = self._spans[scan.sensor] = _Span(scan.time_ns)
+        span.add(scan.time_ns)
 
     def rate_hz(self) -> dict[str, float]:
         """Scans a second of each sensor over the whole run, where there were two or more."""
@@ -91,17 +115,27 @@ class Statistics:
             wanted_rate_hz: the rate that was asked for, to be held against.
         """
         lines = [
-            f"{source}: {self.scans} scans, {self.patterns} patterns, {self.dropped} dropped, {self.overruns} overrun",
+            f"{source}: {self.scans} scans, {self.patterns} patterns ({self.reused} reused), {self.dropped} dropped, "
+            f"{self.overruns} overrun",
             f"torn: {self.torn_wire} on the wire, {self.torn_source} renewed in part; {self.repeated} repeated",
         ]
-        p50_us, p99_us = self.run_time_us.quantile(0.5), self.run_time_us.quantile(0.99)
-        if p50_us is not None and p99_us is not None:
-            lines.append(f"run time: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {self.run_time_us.max:.0f} us")
+        late = f", {self.late} later than a period" if self.late else ""
+        for name, times, more in (("run time", self.run_time_us, ""), ("scan to pattern", self.latency_us, late)):
+            p50_us, p99_us = times.quantile(0.5), times.quantile(0.99)
+            if p50_us is not None and p99_us is not None:
+                lines.append(f"{name}: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {times.max:.0f} us{more}")
+        if self.model_changes:
+            patterns = ", ".join(f"{name} {count}" for name, count in self.model_patterns.items())
+            lines.append(f"model changes: {self.model_changes} (patterns: {patterns}); at last {self._last_event}")
         rates = [f"{rate_hz:.1f} Hz (sensor {name})" for name, rate_hz in sorted(self.rate_hz().items())]
         if rates:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
-        lines += [f"sensor {name}: {text}" for name, text in sorted(self._baselines.items())]
+        lines += [
+            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}"
+            for name, result in sorted(self._zeroed.items())
+            if result.baseline is not None
+        ]
         if self.commands_refused:
             lines.append(f"stdin: {self.commands_refused} lines were no command")
         return "\n".join(lines)

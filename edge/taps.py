@@ -28,12 +28,14 @@ class TapState:
 
     Attributes:
         contact: a tap is going on.
+        tap: number of the tap, from 0; of the last one without contact.
         taps_used: taps in the window, the current one included; 0 without contact.
         window: (K, 3, rows, cols) float32, newest first, zeros where there was no tap. It is the
             tracker's own array: read-only, and overwritten by the next push.
     """
 
     contact: bool
+    tap: int
     taps_used: int
     window: NDArray[np.float32]
 
@@ -75,17 +77,19 @@ class TapTracker:
         self._shown.setflags(write=False)
         self._peak = np.zeros((3, *grid_shape), dtype=np.float32)
         self._contact = False
+        self._tap = -1
         self._last_contact_ns = 0
         self.reset()
 
     def reset(self) -> None:
-        """Forget every tap. A tap in progress goes on, as the first one."""
+        """Forget every tap. A tap in progress goes on, as the first one, under a number of its own."""
+        self._tap += self._contact
         self._window.fill(0)
         self._earlier = 0
         self._tap_scans = 0
         self._peak_counts = -math.inf
 
-    def push(self, deformation: NDArray[np.float32], time_ns: int) -> TapState:
+    def push(self, deformation: NDArray[np.float32], time_ns: int, z_counts: float | None = None) -> TapState:
         """Follow one scan.
 
         The idle time is measured between scans, from the last one in contact. Time that runs
@@ -94,8 +98,9 @@ class TapTracker:
         Args:
             deformation: (3, rows, cols) float32, zeroed counts.
             time_ns: of the scan, in [ns].
+            z_counts: its summed z, where that is known better than from `deformation`.
         """
-        z_counts = float(deformation[2].sum())
+        z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
         if self._contact:
             self._contact = z_counts >= self._off_counts
             if not self._contact:
@@ -103,6 +108,7 @@ class TapTracker:
         elif z_counts >= self._on_counts:
             self._forget_if_idle(time_ns)
             self._contact = True
+            self._tap += 1
 
         if self._contact:
             self._last_contact_ns = time_ns
@@ -114,7 +120,7 @@ class TapTracker:
         else:
             self._forget_if_idle(time_ns)
         taps_used = 1 + self._earlier if self._contact else 0
-        return TapState(self._contact, taps_used, self._shown)
+        return TapState(self._contact, self._tap, taps_used, self._shown)
 
     def _release(self) -> None:
         if self._tap_scans >= MIN_TAP_SCANS and len(self._window) > 1:

@@ -15,7 +15,7 @@ BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
 
 
 def scans(numbers, sensor="4", press=3000):
-    return [make_scan(number, sensor=sensor, press_counts=press) for number in numbers]
+    return [make_scan(number, sensor=sensor, press_counts=press + 20 * number) for number in numbers]
 
 
 def run(link, *sinks, model=None, statistics=None, **settings):

@@ -7,10 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import ModelError, UsageError, WindowError
-from edge.metrics import touched
+from edge.metrics import touched, touched_patch
 from edge.result import mask_bits
-from edge.runtime import HOLD_SCANS, RANGE_ENDS, SILENT_SCANS, Runtime, touched_patch
+from edge.runtime import Runtime
 from edge.session import ModelSession
+from edge.taxels import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 
@@ -154,8 +155,21 @@ def test_torn_scans_do_not_count_for_zeroing():
     for number in range(150):
         result = runtime.push(make_scan(number, noise=4, absent=(3,) if number % 3 == 0 else ()))
     assert result.state == "idle"
+
+
+def test_a_taxel_silent_from_the_start_does_not_stop_the_others_from_being_zeroed_but_half_of_them_do():
     runtime = make_runtime(baselines=None)
-    assert {runtime.push(make_scan(n, absent=(0,))).state for n in range(150)} == {"zeroing"}
+    results = [runtime.push(make_scan(n, noise=4, absent=(0,))) for n in range(SILENT_SCANS + 100)]
+    assert [result.state for result in results] == ["zeroing"] * (SILENT_SCANS + 98) + ["incomplete"] * 2
+    baseline = results[-1].baseline
+    assert baseline is not None
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(baseline.counts[2])), [0])
+    back = [runtime.push(make_scan(500 + n, noise=4)) for n in range(2 * BACK_SCANS)][-1]
+    assert (back.state, back.dead) == ("incomplete", {0: "unzeroed"})
+    assert back.note == "no pattern, taxel 0 not zeroed: zero again"
+    runtime = make_runtime(baselines=None)
+    half = tuple(range(8))
+    assert {runtime.push(make_scan(n, noise=4, absent=half)).state for n in range(400)} == {"zeroing"}
 
 
 def test_a_sensor_without_a_stored_baseline_says_so_and_is_zeroed():
@@ -175,7 +189,8 @@ def test_an_absent_taxel_keeps_its_last_reading_for_a_while():
     result = runtime.push(make_scan(9, press_counts=PRESS, absent=(5,)))
     assert result.state == "incomplete"
     assert result.pattern is result.contact is result.force_counts is None and result.baseline is BASELINE
-    assert runtime.push(make_scan(10, press_counts=PRESS)).state == "contact"
+    states = [runtime.push(make_scan(10 + n, press_counts=PRESS)).state for n in range(BACK_SCANS)]
+    assert states == ["incomplete"] * (BACK_SCANS - 1) + ["contact"]
 
 
 def test_the_held_reading_is_the_newest_not_the_first():
@@ -298,9 +313,12 @@ def test_any_scans_give_one_result_each_and_a_pattern_only_in_contact(scans):
 def test_a_taxel_that_stays_silent_is_named(silent, remedy, baselines):
     runtime = make_runtime(baselines=baselines)
     notes = [runtime.push(make_scan(number, absent=tuple(silent))).note for number in range(SILENT_SCANS)]
-    assert notes[HOLD_SCANS] is None
+    named = f"no pattern, taxel {', '.join(map(str, silent))} silent"
+    assert notes[HOLD_SCANS - 1] is None and notes[HOLD_SCANS] == named
     assert notes[-1] == f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}"
-    assert "silent" not in (runtime.push(make_scan(SILENT_SCANS)).note or "")
+    for number in range(BACK_SCANS):
+        back = runtime.push(make_scan(SILENT_SCANS + number))
+    assert back.note is None
 
 
 def saturated(number, counts, taxel=5):
@@ -325,8 +343,9 @@ def test_a_chip_at_the_end_of_its_range_has_no_reading(counts):
     gone = runtime.push(saturated(HOLD_SCANS + 1, counts))
     assert (gone.state, gone.pattern, gone.contact) == ("incomplete", None, None)
     assert gone.note == "no pattern, taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
-    back = runtime.push(make_scan(HOLD_SCANS + 2, press_counts=PRESS))
-    assert back.state == "contact" and back.note is None
+    for number in range(BACK_SCANS):
+        back = runtime.push(make_scan(HOLD_SCANS + 2 + number, press_counts=PRESS))
+    assert back.state == "contact" and back.note is None and back.dead == {}
 
 
 def test_a_count_from_the_end_is_a_reading():
@@ -346,3 +365,62 @@ def test_taxels_that_are_silent_are_named_beside_one_at_the_end_of_its_range():
         note = runtime.push(dataclasses.replace(scan, counts=raw)).note
     assert "taxel 5 at the end of its range" in note
     assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")
+
+
+def fake(name, **changes):
+    model = FakeModel(make_contract(**changes))
+    model.name = name
+    return model
+
+
+class TestChangeModel:
+    def test_it_takes_over_between_scans_with_the_taps_there_were(self):
+        four, one = fake("four"), fake("one", taps=1)
+        runtime = make_runtime(one, most_taps=4)
+        for number, press in enumerate([2000, 2500, 0, 3000]):
+            result = runtime.push(make_scan(number, press_counts=press))
+        assert (result.model, result.taps_used, result.event) == ("one", 1, None)
+        assert [window.shape for window in one.windows] == [(1, 3, 4, 4)] * 3
+        runtime.change_model(four, "for a reason")
+        result = runtime.push(make_scan(4, press_counts=3500))
+        assert (result.model, result.taps_used, result.event) == ("four", 2, "for a reason")
+        assert four.windows[-1][:, 2, 1, 1].tolist() == [3.5, 2.5, 0.0, 0.0]
+        runtime.change_model(one, "for another")
+        result = runtime.push(make_scan(5, press_counts=4000))
+        assert (result.model, result.taps_used, result.event) == ("one", 1, "for another")
+        assert one.windows[-1][:, 2, 1, 1].tolist() == [4.0]
+        assert runtime.push(make_scan(6)).event is None
+
+    def test_without_contact_it_is_told_too(self):
+        runtime = make_runtime()
+        runtime.change_model(fake("other"), "for a reason")
+        assert runtime.push(make_scan()).event == "for a reason"
+
+    @pytest.mark.parametrize(
+        ("key", "value"),
+        [
+            ("scale", 5), ("angle_step_deg", 4.0), ("output_unit", "N"), ("output_full_scale", 0.5),
+            ("sensor", "other"), ("rows", 5), ("cols", 5), ("pitch_mm", 5.0), ("interval_factor", 1.6),
+        ],
+    )  # fmt: skip
+    def test_patterns_of_another_meaning_are_refused(self, key, value):
+        runtime = make_runtime()
+        with pytest.raises(ModelError, match=rf"contract key '{key}' is .*, that of the model before "):
+            runtime.change_model(fake("other", **{key: value}), "for a reason")
+        result = runtime.push(make_scan())
+        assert (result.model, result.event) == ("fake", None)
+
+    def test_more_taps_than_are_remembered_are_refused(self):
+        runtime = make_runtime(fake("one", taps=1), most_taps=2)
+        runtime.change_model(fake("two", taps=2), "for a reason")
+        with pytest.raises(ModelError, match=r"'taps' is 3, but 2 are remembered"):
+            runtime.change_model(fake("three", taps=3), "for a reason")
+
+
+def test_two_scans_of_one_sensor_in_one_call_get_patterns_of_their_own():
+    model = FakeModel()
+    runtime = Runtime(model, source="device", baselines={"4": BASELINE})
+    first, second = runtime.push_together(
+        [(make_scan(0, press_counts=3000), True), (make_scan(1, press_counts=6000), True)]
+    )
+    assert second.pattern.max() == pytest.approx(2 * first.pattern.max())

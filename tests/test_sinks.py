@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ def make_results(count=6, runtime=None, **settings):
     for number in range(count):
         for sensor in ("4", "6"):
             absent = (3, 7) if number % 4 == 2 else ()
-            press = 3000 if number % 4 > 1 else 0
+            press = 3000 + 40 * (3 - number % 4) if number % 4 > 1 else 0
             scan = make_scan(number, sensor=sensor, press_counts=press, absent=absent, noise=3)
             results.append(runtime.push(scan))
     return results
@@ -49,7 +50,43 @@ def make_sure_results(count=6, **settings):
     return make_results(count, Runtime(FakeModel(make_contract(interval_factor=1.6)), **settings))
 
 
+class TestModelChange:
+    def results(self, name):
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        runtime.push(make_scan(0))
+        other = FakeModel()
+        other.name = name
+        runtime.change_model(other, "for a reason")
+        return [runtime.push(make_scan(number)) for number in (1, 2)]
+
+    def test_the_first_record_of_a_model_tells_why(self):
+        records = [json.loads(record_line(result, RUN)) for result in self.results("other")]
+        assert [(record["model"], record["event"]) for record in records] == [
+            ("other", "for a reason"),
+            ("other", None),
+        ]
+
+    def test_an_npz_tells_the_model_of_each_row_however_long_its_name(self, tmp_path):
+        sink = NpzSink(tmp_path / "out.npz", *SHAPES)
+        sink.write(self.results("n" * 100)[0], RUN)
+        sink.close()
+        assert np.load(tmp_path / "out.npz")["model"].tolist() == ["n" * npz.MODEL_CHARACTERS]
+
+
 class TestJsonLines:
+    def test_what_is_written_is_each_result_in_itself_however_patterns_are_given_again(self, tmp_path):
+        """A pattern given again is the same array, of one sensor; between them come others and none."""
+        baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "6")}
+        runtime = Runtime(FakeModel(make_contract(interval_factor=1.6)), source="device", baselines=baselines)
+        presses = [(3000, "4"), (5000, "6"), (3000, "4"), (5000, "6"), (0, "4"), (3000, "4"), (7000, "4"), (7000, "4")]
+        results = [runtime.push(make_scan(n, press_counts=z, sensor=name)) for n, (z, name) in enumerate(presses)]
+        assert [result.reused_from for result in results] == [None, None, 0, 1, None, None, None, 6]
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"))
+        for result in results:
+            sink.write(result, RUN)
+        sink.close()
+        assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, RUN) for result in results)
+
     def test_a_record_says_all_of_a_contact(self):
         ticks = iter([0, 123_456])
         runtime = Runtime(
@@ -82,12 +119,19 @@ class TestJsonLines:
             "force_n": 2.5,
             "area_mm2": 22.09,
             "interval_mm": None,
+            "expected_rmse_mm": None,
+            "another_tap": None,
+            "reused_from": None,
             "run_time_us": 123.5,
+            "latency_us": None,
             "baseline": BASELINE.id,
             "baseline_origin": "file",
             "baseline_age_s": 12.3,
             "model": "fake",
+            "dead": {},
+            "filled": None,
             "note": None,
+            "event": None,
             "counters": RUN,
             "pattern_unit": "mm",
         }
@@ -107,22 +151,21 @@ class TestJsonLines:
         result = make_sure_results(3)[4]
         record = json.loads(record_line(result, {}))
         for name in ("pattern", "deviation"):
-            expected = [[float(f"{value:.5g}") for value in row] for row in getattr(result, name).tolist()]
-            assert record[name] == expected
+            np.testing.assert_allclose(record[name], getattr(result, name), rtol=2e-7, atol=0.51e-7)
         assert record["pattern"] != record["deviation"]
         assert record["interval_mm"] == pytest.approx(1.6 * 0.04, abs=1e-3)
         assert record["interval_mm"] == round(result.interval_mm, 5)
 
     @settings(max_examples=50, deadline=None)
     @given(st.lists(st.floats(-(2.0**99), 2.0**99, width=32, allow_subnormal=False), min_size=4, max_size=4))
-    def test_patterns_keep_five_digits_and_are_json(self, values):
+    def test_patterns_keep_seven_decimals_and_are_json(self, values):
         result = make_results(3)[4]
         pattern = np.array(values, dtype=np.float32).reshape(2, 2)
         object.__setattr__(result, "pattern", pattern)
         line = record_line(result, {})
         got = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))["pattern"]
-        assert got == [[float(f"{value:.5g}") for value in row] for row in pattern.tolist()]
-        assert line.endswith("}\n") and line.count("\n") == 1
+        np.testing.assert_allclose(got, pattern, rtol=2e-7, atol=0.51e-7)
+        assert line.endswith(b"}\n") and line.count(b"\n") == 1
 
     def test_a_file_holds_a_record_a_line_there_as_soon_as_written(self, tmp_path):
         path = tmp_path / "out.jsonl"
@@ -187,7 +230,7 @@ class TestNpz:
         for i, result in enumerate(results):
             row = {name: column[i] for name, column in data.items()}
             assert row["scan"] == result.scan.number and row["sensor"] == result.scan.sensor
-            assert row["source"] == "emulated" and row["state"] == result.state
+            assert row["source"] == "emulated" and row["state"] == result.state and row["model"] == "fake"
             assert row["contact"] == {None: -1, False: 0, True: 1}[result.contact]
             assert row["taps_used"] == result.taps_used
             assert row["has_pattern"] == (result.pattern is not None)
@@ -360,6 +403,12 @@ class TestStatus:
         for result in make_sure_results(4, clock_ns=lambda: next(ticks)):
             sink.write(result, {})
         assert " counts 22 mm2 +-0.064 mm 250 us 100 Hz" in sink.line() and sink.line().isascii()
+
+    def test_dead_taxels_are_named(self):
+        sink = self.make()
+        result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan())
+        sink.write(replace(result, dead={3: "stuck", 7: "silent"}, filled="rest"), RUN)
+        assert "4 idle without taxel 3,7 " in sink.line() + " "
 
     def test_a_note_while_zeroing_is_shown(self):
         sink = self.make()

@@ -8,8 +8,9 @@ from edge.result import Result
 from edge.statistics import Histogram, Statistics
 
 
-def result(scan, state="idle", run_time_us=None):
-    return Result(scan, "device", "m", state, run_time_us=run_time_us)
+def result(scan, state="idle", run_time_us=None, reused_from=None):
+    pattern = np.zeros((40, 40), dtype=np.float32) if state == "contact" else None
+    return Result(scan, "device", "m", state, pattern=pattern, reused_from=reused_from, run_time_us=run_time_us)
 
 
 @pytest.mark.parametrize(("age_s", "age"), [(12.4, "12 s"), (599, "599 s"), (660, "11 min"), (40000, "11 h")])
@@ -48,12 +49,13 @@ def test_counts_what_happened():
     statistics = Statistics()
     statistics.add(result(make_scan(0), "contact", 200.0))
     statistics.add(result(make_scan(1), "dropped"))
+    statistics.add(result(make_scan(1), "contact", reused_from=0))
     statistics.add(result(make_scan(2, absent=(1, 2))))
     statistics.add(result(make_scan(3, stale=(1,))))
     statistics.add(result(make_scan(4, stale=tuple(range(16)))))
     statistics.add(result(make_scan(5, absent=(0,), stale=tuple(range(16)))))
-    got = {name: getattr(statistics, name) for name in ("scans", "patterns", "dropped")}
-    assert got == {"scans": 6, "patterns": 1, "dropped": 1}
+    got = {name: getattr(statistics, name) for name in ("scans", "patterns", "reused", "dropped")}
+    assert got == {"scans": 7, "patterns": 2, "reused": 1, "dropped": 1} and statistics.run_time_us.count == 1
     assert (statistics.torn_wire, statistics.torn_source, statistics.repeated) == (2, 1, 1)
 
 
@@ -76,7 +78,7 @@ def test_summary_tells_all_of_it():
     statistics.commands_refused = 2
     text = statistics.summary(source="EMULATED demo", wanted_rate_hz=100)
     assert text.splitlines() == [
-        "EMULATED demo: 4 scans, 3 patterns, 0 dropped, 7 overrun",
+        "EMULATED demo: 4 scans, 3 patterns (0 reused), 0 dropped, 7 overrun",
         "torn: 3 on the wire, 0 renewed in part; 0 repeated",
         "run time: p50 200 us, p99 200 us, max 200 us",
         "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
@@ -87,6 +89,20 @@ def test_summary_tells_all_of_it():
 
 def test_summary_of_nothing():
     assert Statistics().summary(source="x").splitlines() == [
-        "x: 0 scans, 0 patterns, 0 dropped, 0 overrun",
+        "x: 0 scans, 0 patterns (0 reused), 0 dropped, 0 overrun",
         "torn: 0 on the wire, 0 renewed in part; 0 repeated",
     ]
+
+
+def test_a_change_of_model_is_counted_and_told():
+    statistics = Statistics()
+    for number, (model, event) in enumerate(
+        [("a", "chosen"), ("a", None), ("b", "stepped down"), ("b", None), ("a", "stepped up"), ("a", None)]
+    ):
+        statistics.add(Result(make_scan(number), "device", model, "contact", run_time_us=9.0, event=event))
+    assert statistics.model_changes == 2 and statistics.model_patterns == {"a": 4, "b": 2}
+    lines = statistics.summary(source="x").splitlines()
+    assert "model changes: 2 (patterns: a 4, b 2); at last stepped up" in lines
+    statistics = Statistics()
+    statistics.add(Result(make_scan(), "device", "a", "contact", run_time_us=9.0, event="chosen"))
+    assert "model changes" not in statistics.summary(source="x")

@@ -6,9 +6,6 @@ from typing import Final
 from edge.contract import Contract
 from edge.errors import UsageError
 from edge.sinks.base import Sink
-from edge.sinks.jsonl import JsonLinesSink
-from edge.sinks.npz import NpzSink
-from edge.sinks.status import StatusSink
 
 FORMS: Final = ("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz")
 
@@ -20,12 +17,19 @@ def open_sink(text: str, contract: Contract) -> Sink:
         UsageError: no such form; the forms are listed.
         SinkError: it cannot be opened.
     """
+    # Each loaded only where it is used: start-up time and memory are for what runs.
     form, _, target = text.partition(":")
     if text == "status":
+        from edge.sinks.status import StatusSink
+
         return StatusSink()
     if form == "jsonl" and target:
+        from edge.sinks.jsonl import JsonLinesSink
+
         return JsonLinesSink(target)
     if form == "npz" and target.endswith(".npz"):
+        from edge.sinks.npz import NpzSink
+
         scan_shape, deviations = (3, contract.rows, contract.cols), contract.interval_factor is not None
         return NpzSink(Path(target), scan_shape, contract.pattern_shape, deviations=deviations)
     raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")

@@ -1,20 +1,24 @@
 """One JSON record a line, flushed as it is written, since a robot reads it live."""
 
-import json
 import os
 import sys
 from collections.abc import Mapping
 from io import BufferedWriter
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from edge.errors import SinkClosedError, SinkError
 from edge.result import Result, mask_bits
 from edge.sinks.base import Sink
 from firmware_bridge.scan import Scan
+
+_OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
+_DECIMALS: Final = 7
+"""Of maps in [mm]: what is less than a nanometre apart is noise of the arithmetic."""
 
 
 class JsonLinesSink(Sink):
@@ -35,7 +39,7 @@ class JsonLinesSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record."""
         try:
-            self._file.write(record_line(result, counters).encode())
+            self._file.write(record_line(result, counters))
             self._file.flush()
         except BrokenPipeError as error:
             raise SinkClosedError(f"the reader of {self._target} has gone") from error
@@ -51,7 +55,7 @@ class JsonLinesSink(Sink):
             return
 
 
-def record_line(result: Result, counters: Mapping[str, int]) -> str:
+def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
     """A result as one line of JSON; absent is null, masks have bit i for taxel i."""
     scan, baseline = result.scan, result.baseline
     record: dict[str, Any] = {
@@ -69,21 +73,30 @@ def record_line(result: Result, counters: Mapping[str, int]) -> str:
         "area_mm2": _rounded(result.area_mm2, 3),
         "centroid_mm": None if result.centroid_mm is None else [round(value, 4) for value in result.centroid_mm],
         "interval_mm": _rounded(result.interval_mm, 5),
+        "expected_rmse_mm": _rounded(result.expected_rmse_mm, 5),
+        "another_tap": result.another_tap,
+        "reused_from": result.reused_from,
         "run_time_us": _rounded(result.run_time_us, 1),
+        "latency_us": _rounded(result.latency_us, 1),
         "baseline": None if baseline is None else baseline.id,
         "baseline_origin": None if baseline is None else baseline.origin,
         "baseline_age_s": _rounded(result.baseline_age_s, 1),
         "model": result.model,
+        "dead": {str(taxel): reason for taxel, reason in result.dead.items()},
+        "filled": result.filled,
         "note": result.note,
+        "event": result.event,
         "counters": dict(counters),
         "counts": _readings(scan),
         "pattern_unit": result.pattern_unit,
     }
-    maps = f'"pattern": {_map_text(result.pattern)}, "deviation": {_map_text(result.deviation)}'
-    return f"{json.dumps(record, allow_nan=False)[:-1]}, {maps}}}\n"
+    record["pattern"], record["deviation"] = _map(result.pattern), _map(result.deviation)
+    return orjson.dumps(record, option=_OPTIONS)
 
 
-def _readings(scan: Scan) -> list[list[list[int | None]]]:
+def _readings(scan: Scan) -> NDArray[np.int32] | list[list[list[int | None]]]:
+    if scan.complete:
+        return np.ascontiguousarray(scan.counts)
     readings = scan.counts.astype(object)
     readings[:, ~scan.fresh] = None
     return readings.tolist()
@@ -93,13 +106,8 @@ def _rounded(value: float | None, decimals: int) -> float | None:
     return None if value is None else round(value, decimals)
 
 
-def _map_text(values: NDArray[np.float32] | None) -> str:
-    """Nested lists with five significant digits; two and a half times as fast as json.dumps."""
-    if values is None:
-        return "null"
-    height, width = values.shape
-    row = "[" + ", ".join(["%.5g"] * width) + "]"
-    return ("[" + ", ".join([row] * height) + "]") % tuple(values.ravel().tolist())
+def _map(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+    return None if values is None else np.round(values, _DECIMALS)
 
 
 def _open(target: str) -> BufferedWriter:

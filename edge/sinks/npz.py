@@ -26,16 +26,20 @@ from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 LAYOUT: Final = "layout.json"
 FLUSH_SCANS: Final = 100
 CHUNK_BYTES: Final = 1 << 20
+MODEL_CHARACTERS: Final = 32
+"""Of a model's name: files may have longer ones, and a record must not fail for that."""
 
 
 class NpzSink(Sink):
     """Records into `path`, by way of parts beside it.
 
     Arrays, one row a scan: sensor, scan, time_ns, counts (3, rows, cols; -1 absent), source, state,
-    contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros
-    where there is none), deviation (the same, only if the model gives it), interval_mm and
-    run_time_us (NaN where there is none), baseline (its id, or empty), baseline_age_s (NaN without)
-    and baseline_counts (3, rows, cols; NaN without).
+    model, contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros
+    where there is none), deviation (the same, only if the model gives it), interval_mm, expected_rmse_mm
+    and run_time_us (NaN where there is none), another_tap and reused_from (-1 where there is none),
+    dead (bit i: taxel i is not believed), filled (what stood for them, or empty), baseline (its id, or
+    empty), baseline_age_s (NaN without) and baseline_counts (3, rows, cols; NaN without, and where a
+    taxel was not zeroed).
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class NpzSink(Sink):
             "counts": ("<i4", scan_shape),
             "source": ("<U8", ()),
             "state": ("<U10", ()),
+            "model": (f"<U{MODEL_CHARACTERS}", ()),
             "contact": ("|i1", ()),
             "taps_used": ("<i2", ()),
             "force_counts": ("<f4", ()),
@@ -71,7 +76,12 @@ class NpzSink(Sink):
             "pattern": ("<f4", pattern_shape),
             **({"deviation": ("<f4", pattern_shape)} if deviations else {}),
             "interval_mm": ("<f4", ()),
+            "expected_rmse_mm": ("<f4", ()),
+            "another_tap": ("|i1", ()),
+            "reused_from": ("<i8", ()),
             "run_time_us": ("<f4", ()),
+            "dead": ("<u8", ()),
+            "filled": ("<U10", ()),
             "baseline": ("<U16", ()),
             "baseline_age_s": ("<f4", ()),
             "baseline_counts": ("<f4", scan_shape),
@@ -100,6 +110,7 @@ class NpzSink(Sink):
             "counts": scan.counts,
             "source": result.source,
             "state": result.state,
+            "model": result.model[:MODEL_CHARACTERS],
             "contact": -1 if result.contact is None else result.contact,
             "taps_used": result.taps_used,
             "force_counts": np.nan if result.force_counts is None else result.force_counts,
@@ -107,7 +118,12 @@ class NpzSink(Sink):
             "pattern": self._no_pattern if pattern is None else pattern,
             "deviation": self._no_pattern if result.deviation is None else result.deviation,
             "interval_mm": np.nan if result.interval_mm is None else result.interval_mm,
+            "expected_rmse_mm": np.nan if result.expected_rmse_mm is None else result.expected_rmse_mm,
+            "another_tap": -1 if result.another_tap is None else result.another_tap,
+            "reused_from": -1 if result.reused_from is None else result.reused_from,
             "run_time_us": np.nan if result.run_time_us is None else result.run_time_us,
+            "dead": sum(1 << taxel for taxel in result.dead),
+            "filled": result.filled or "",
             "baseline": "" if baseline is None else baseline.id,
             "baseline_age_s": np.nan if result.baseline_age_s is None else result.baseline_age_s,
             "baseline_counts": self._no_baseline if baseline is None else baseline.counts,

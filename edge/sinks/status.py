@@ -92,6 +92,8 @@ class StatusSink(Sink):
         words = [name, result.state]
         if result.state in ("zeroing", "incomplete") and result.note is not None:
             return f"{name} {result.note}"
+        if result.dead:
+            words.append(f"without taxel {','.join(map(str, result.dead))}")
         if result.contact:
             words.append(f"tap {result.taps_used}")
         if result.force_n is not None:
@@ -102,7 +104,9 @@ class StatusSink(Sink):
             words.append(f"{result.area_mm2:.0f} mm2")
         if result.interval_mm is not None:
             words.append(f"+-{result.interval_mm:.3f} mm")
-        if result.run_time_us is not None:
+        if result.reused_from is not None:
+            words.append("unchanged")
+        elif result.run_time_us is not None:
             words.append(f"{result.run_time_us:.0f} us")
         rate_hz = self._rates[name].rate_hz
         if rate_hz is not None:

@@ -1,0 +1,60 @@
+"""The deadline of a pattern: one period of its sensor after its scan. No I/O, no clock."""
+
+from bisect import bisect_left, insort
+from collections import deque
+from typing import Final
+
+REMEMBERED_INTERVALS: Final = 31
+FEWEST_INTERVALS: Final = 5
+"""Before so many, nobody knows the period."""
+NS_PER_S: Final = 1_000_000_000
+
+
+class Deadline:
+    """Judges the patterns of one sensor by its own grid: scans come when the sensor sends them, not when we ask.
+
+    The period is the running median of the intervals between scans, which neither jitter nor a gap moves, unless a
+    rate is given.
+
+    Attributes:
+        missed: patterns that came later than one period after their scan.
+    """
+
+    def __init__(self, rate_hz: float | None = None) -> None:
+        """Start without a scan; `rate_hz` is the sensor's rate if it is known, in [Hz]."""
+        self.missed = 0
+        self._known_period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
+        self._intervals: deque[int] = deque()
+        self._sorted: list[int] = []
+        self._last_ns: int | None = None
+
+    @property
+    def period_ns(self) -> int | None:
+        """Between scans, in [ns]; None as long as too few have come."""
+        if self._known_period_ns is not None:
+            return self._known_period_ns
+        if len(self._sorted) < FEWEST_INTERVALS:
+            return None
+        return self._sorted[len(self._sorted) // 2]
+
+    def follow(self, scan_time_ns: int) -> None:
+        """Take the arrival of the next scan, pattern or not, in [ns]. Time that stands is no interval."""
+        last_ns, self._last_ns = self._last_ns, scan_time_ns
+        if last_ns is None or scan_time_ns <= last_ns:
+            return
+        if len(self._intervals) == REMEMBERED_INTERVALS:
+            del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
+        self._intervals.append(scan_time_ns - last_ns)
+        insort(self._sorted, scan_time_ns - last_ns)
+
+    def check(self, scan_time_ns: int, done_ns: int) -> bool:
+        """Whether a pattern missed its deadline; without a period none does.
+
+        Args:
+            scan_time_ns: arrival of its scan's last reading, in [ns].
+            done_ns: when the pattern was ready, on the same clock.
+        """
+        period_ns = self.period_ns
+        late = period_ns is not None and done_ns - scan_time_ns > period_ns
+        self.missed += late
+        return late

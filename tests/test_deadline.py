@@ -1,0 +1,127 @@
+import gc
+import itertools
+import threading
+import tracemalloc
+
+import pytest
+from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
+from test_pump import run, scans
+
+from edge.deadline import FEWEST_INTERVALS, Deadline
+from edge.runtime import Runtime
+from edge.statistics import Statistics
+
+MS = 1_000_000
+
+
+def followed(intervals_ms, rate_hz=None):
+    deadline = Deadline(rate_hz)
+    deadline.follow(0)
+    for time_ms in itertools.accumulate(intervals_ms):
+        deadline.follow(round(time_ms * MS))
+    return deadline
+
+
+def test_the_period_is_the_median_of_what_came():
+    assert followed([10] * (FEWEST_INTERVALS - 1)).period_ns is None
+    assert followed([10] * FEWEST_INTERVALS).period_ns == 10 * MS
+    assert followed([9, 11, 10, 10, 900, 10, 1, 9, 11]).period_ns == 10 * MS
+    assert followed([20] * 40 + [5] * 31).period_ns == 5 * MS
+
+
+def test_scans_of_one_read_are_no_interval():
+    assert followed([10, 0, 10, 0, 10, 0, 10, 0, 10]).period_ns == 10 * MS
+
+
+def test_a_given_rate_is_the_period_from_the_start():
+    assert Deadline(100).period_ns == followed([3] * 50, rate_hz=100).period_ns == 10 * MS
+
+
+def test_a_pattern_is_late_after_one_period_and_not_before():
+    deadline = followed([10] * 9)
+    assert not deadline.check(90 * MS, 100 * MS) and deadline.missed == 0
+    assert deadline.check(90 * MS, 100 * MS + 1) and deadline.missed == 1
+    assert not Deadline().check(0, 10**12)
+
+
+def test_the_loop_counts_late_patterns_and_tells_every_latency():
+    """The clock gives 4 ms after each scan, 11 ms after the last; each comes when the one before is written."""
+    contact = scans(range(10))
+    written = [threading.Event() for _ in contact]
+    sink, statistics = ListSink(on_write=lambda result: written[result.scan.number].set()), Statistics()
+    done_ms = dict.fromkeys(range(10), 4.0) | {9: 11.0}
+    link = FakeLink([part for scan, event in zip(contact, written, strict=True) for part in ([scan], event)])
+    run(
+        link,
+        sink,
+        statistics=statistics,
+        clock_ns=lambda: contact[len(sink.results)].time_ns + round(done_ms[len(sink.results)] * MS),
+        rate_hz=100,
+    )
+    assert [result.latency_us for result in sink.results] == [1000 * done_ms[n] for n in range(10)]
+    assert [counters["late"] for counters in sink.counters] == [0] * 9 + [1]
+    assert statistics.late == 1 and statistics.latency_us.count == 10 and statistics.dropped == 0
+
+
+def test_collection_stands_still_in_the_loop_only():
+    seen = []
+    run(
+        FakeLink([scans([0])]),
+        ListSink(on_write=lambda result: seen.append((gc.isenabled(), gc.get_freeze_count() > 0))),
+    )
+    assert seen == [(False, True)]
+    assert gc.isenabled() and gc.get_freeze_count() == 0
+
+
+@pytest.mark.parametrize("press", [0, 1400])
+def test_the_loop_makes_no_cycles_and_holds_no_more_memory(press):
+    """Patterns are copied for the sinks, and freed with their result."""
+    # One taxel alone is believed up to 1500 counts.
+    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, on_counts=1000, reuse=False)
+    runtime._model.windows = _Nothing()  # the fake keeps them
+    batches = [[make_scan(n, press_counts=press, noise=3)] for n in range(2300)]
+    held, patterns, written = {}, 0, threading.Semaphore(1)
+    link = FakeLink(batches)
+    read = link.read
+
+    def read_one(timeout_s):
+        written.acquire(timeout=10)  # or what waits to be taken would be counted
+        return read(timeout_s)
+
+    link.read = read_one
+
+    def watch(result):
+        nonlocal patterns
+        patterns += result.pattern is not None
+        written.release()
+        if result.scan.number == 1200:
+            gc.collect()
+            tracemalloc.start(1)
+        if result.scan.number in (1300, 2250):
+            snapshot = tracemalloc.take_snapshot().filter_traces(
+                [tracemalloc.Filter(True, "*/edge/*"), tracemalloc.Filter(True, "*/firmware_bridge/*")]
+            )
+            held[result.scan.number] = sum(trace.size for trace in snapshot.traces)
+        if result.scan.number == 2290:
+            tracemalloc.stop()
+            cycles.append(gc.collect())
+
+    cycles: list[int] = []
+    sink = _Watcher(watch)
+    run(link, sink, runtime=runtime, capacity_scans=10_000)
+    assert cycles == [0] and patterns == (2300 if press else 0)
+    assert held[2250] - held[1300] < 4096
+
+
+class _Nothing:
+    def append(self, window):
+        pass
+
+
+class _Watcher(ListSink):
+    def __init__(self, watch):
+        super().__init__()
+        self._watch = watch
+
+    def write(self, result, counters):
+        self._watch(result)

@@ -1,0 +1,196 @@
+"""What a scan needs: nothing, the pattern before, or one from the taps that matter."""
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, FakeModel, make_contract, make_scan
+
+from edge.runtime import Runtime
+from edge.scene import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
+from edge.taps import TapState
+
+SHAPE = (3, 4, 4)
+
+
+def reading(seed=0, size=2000.0):
+    return (size * np.random.default_rng(seed).random(SHAPE)).astype(np.float32)
+
+
+def noise(seed):
+    return NOISE_COUNTS * np.random.default_rng([seed, 1]).standard_normal(SHAPE, dtype=np.float32)
+
+
+class TestLastReading:
+    def test_noise_is_no_change(self):
+        last, still = LastReading(SHAPE), reading()
+        last.keep(still + noise(0), "model")
+        assert sum(last.holds(still + noise(seed), "model") for seed in range(1, 2001)) >= 1990
+
+    def test_one_taxel_that_changed_is_seen(self):
+        last, before = LastReading(SHAPE), reading()
+        last.keep(before, "model")
+        for place in np.ndindex(SHAPE):
+            after = before.copy()
+            after[place] -= CHANGED_COUNTS + 1
+            assert not last.holds(after, "model")
+
+    def test_a_little_everywhere_is_seen(self):
+        last, before = LastReading(SHAPE), reading()
+        last.keep(before, "model")
+        assert last.holds(before + np.float32(3.9), "model")
+        assert not last.holds(before + np.float32(4.0), "model")
+
+    def test_what_creeps_is_followed_however_slowly(self):
+        last, counts = LastReading(SHAPE), reading()
+        last.keep(counts, "model")
+        made = 0
+        for _ in range(400):
+            counts = counts + np.float32(0.1)
+            if not last.holds(counts, "model"):
+                last.keep(counts, "model")
+                made += 1
+        assert made == 10
+
+    def test_another_maker_or_none_makes_it_anew(self):
+        last, before = LastReading(SHAPE), reading()
+        assert not last.holds(before, "model")
+        last.keep(before, ("model", 0, 1))
+        assert last.holds(before, ("model", 0, 1))
+        assert not last.holds(before, ("model", 1, 1))
+        last.keep(before, None)
+        assert not last.holds(before, ("model", 0, 1))
+
+
+def tap(number, taps_used):
+    return TapState(taps_used > 0, number, taps_used, np.zeros((4, 3, 4, 4), dtype=np.float32))
+
+
+class TestTapsThatMatter:
+    def run(self, *verdicts, force_counts=1000.0):
+        """Taps used in each of a row of taps, of whose patterns this was said."""
+        matter, used = TapsThatMatter(), []
+        for number, verdict in enumerate(verdicts):
+            used.append(matter.of(tap(number, min(number + 1, 4))))
+            if verdict != "dropped":
+                matter.judge(force_counts, verdict)
+            assert matter.of(tap(number, 0)) == 0
+        return used
+
+    def test_it_stops_at_the_first_tap_that_needs_no_other(self):
+        assert self.run(True, True, False, True, True) == [1, 2, 3, 3, 4]
+        assert self.run(False, False, False) == [1, 1, 1]
+
+    @pytest.mark.parametrize("verdict", [None, "dropped"])
+    def test_where_it_is_not_known_every_tap_is_used(self, verdict):
+        assert self.run(*[verdict] * 6) == [1, 2, 3, 4, 4, 4]
+
+    def test_the_strongest_scan_of_a_tap_decides(self):
+        for order in ([(100, True), (900, False), (200, True)], [(900, False), (100, True)]):
+            matter = TapsThatMatter()
+            matter.of(tap(0, 1))
+            for force_counts, verdict in order:
+                matter.judge(force_counts, verdict)
+            matter.of(tap(0, 0))
+            assert matter.of(tap(1, 2)) == 1
+
+    def test_forgotten_taps_start_it_over(self):
+        matter = TapsThatMatter()
+        for number, there in enumerate((1, 2, 3, 1, 2)):
+            used = matter.of(tap(number, there))
+            matter.judge(1000.0, True)
+            matter.of(tap(number, 0))
+            assert used == there
+
+
+def make_runtime(contract=None, **settings):
+    model = FakeModel(contract or make_contract(interval_factor=1.6))
+    return Runtime(model, source="device", baselines={"4": BASELINE}, **settings), model
+
+
+def test_a_still_grip_is_inferred_once_and_says_whose_pattern_it_is():
+    runtime, model = make_runtime()
+    results = [runtime.push(make_scan(number, press_counts=3000, noise=3)) for number in range(15)]
+    assert len(model.windows) == 1
+    assert [result.reused_from for result in results] == [None] + [0] * 14
+    for result in results[1:]:
+        assert result.state == "contact" and result.run_time_us is None and result.pattern is results[0].pattern
+        assert result.interval_mm == results[0].interval_mm and result.area_mm2 == results[0].area_mm2
+    moved = runtime.push(make_scan(15, press_counts=3020))
+    assert moved.reused_from is None and moved.run_time_us is not None and len(model.windows) == 2
+
+
+def test_every_scan_is_inferred_where_that_is_asked_for():
+    runtime, model = make_runtime(reuse=False)
+    assert all(runtime.push(make_scan(number, press_counts=3000)).reused_from is None for number in range(5))
+    assert len(model.windows) == 5
+
+
+def test_the_same_touch_in_the_next_tap_is_inferred_anew():
+    runtime, model = make_runtime()
+    for number, press in enumerate((3000, 3000, 0, 3000, 3000)):
+        last = runtime.push(make_scan(number, press_counts=press))
+    assert len(model.windows) == 2 and last.reused_from == 3 and last.taps_used == 2
+
+
+def test_a_reset_in_a_tap_is_inferred_anew():
+    runtime, model = make_runtime()
+    runtime.push(make_scan(0, press_counts=3000))
+    runtime.reset()
+    assert runtime.push(make_scan(1, press_counts=3000)).reused_from is None and len(model.windows) == 2
+
+
+def taps_used(runtime, presses):
+    """Of one scan in each of a row of taps pressed so hard."""
+    used, number = [], 0
+    for press in presses:
+        for counts in (press - 50, press, 0):
+            result = runtime.push(make_scan(number, press_counts=counts))
+            used += [result.taps_used] * (counts == press)
+            number += 1
+    return used
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(0.5, [1, 2, 3]), (0.0, [1, 1, 1])])
+@pytest.mark.parametrize("every_tap", [False, True])
+def test_earlier_taps_that_would_not_help_are_kept_from_the_network(gain, expected, every_tap):
+    told = {"doubt": [0.1, 1.0], "error": [0.1, 0.2], "gain": [gain, gain]}
+    contract = make_contract(interval_factor=1.6, confidence={"1": told, "2": told, "3": told})
+    runtime, model = make_runtime(contract, every_tap=every_tap)
+    expected = [1, 2, 3] if every_tap else expected
+    assert taps_used(runtime, (2000, 3000, 4000)) == expected
+    for used, window in zip(np.repeat(expected, 2), model.windows, strict=True):
+        assert window[:used].any(axis=(1, 2, 3)).all() and not window[used:].any()
+
+
+def test_two_sensors_are_inferred_in_one_call_in_the_order_they_came():
+    calls = []
+
+    class Together(FakeModel):
+        def run_together(self, windows):
+            calls.append(len(windows))
+            return super().run_together(windows)
+
+    model = Together(make_contract(interval_factor=1.6))
+    baselines = dict.fromkeys(("4", "6"), BASELINE)
+    runtime = Runtime(model, source="device", baselines=baselines)
+    alone = {
+        name: Runtime(FakeModel(make_contract(interval_factor=1.6)), source="device", baselines=baselines).push(
+            make_scan(1, sensor=name, press_counts=press)
+        )
+        for name, press in (("4", 3000), ("6", 5000))
+    }
+    scans = [(make_scan(0, press_counts=2000), False)]
+    scans += [(make_scan(1, sensor=name, press_counts=press), True) for name, press in (("4", 3000), ("6", 5000))]
+    dropped, *results = runtime.push_together(scans)
+    assert calls == [2] and dropped.state == "dropped" and dropped.pattern is None
+    for result in results:
+        np.testing.assert_array_equal(result.pattern, alone[result.scan.sensor].pattern)
+        np.testing.assert_array_equal(result.deviation, alone[result.scan.sensor].deviation)
+
+
+def test_after_a_reset_the_tap_that_goes_on_is_judged_by_its_own_patterns():
+    matter = TapsThatMatter()
+    matter.of(tap(0, 1))
+    matter.judge(9000.0, False)
+    matter.of(tap(1, 1))  # a reset while it touched
+    matter.judge(3000.0, True)
+    assert matter.of(tap(2, 2)) == 2
