@@ -5,11 +5,15 @@ from typing import Final
 
 from edge.errors import ModelError, UsageError
 
-BUNDLE_DIR: Final = Path(__file__).parent / "models"
-DEFAULT_MODEL: Final = "stsr"
+BUNDLE_DIR: Final = Path(__file__).resolve().parent / "models"
+TAXELS: Final = BUNDLE_DIR / "taxels.npz"
+"""What dead taxels are estimated by."""
+DEFAULT_MODEL: Final = "stsr-int8"
 """Takes nothing for granted: a model of several taps is wrong, and looks right, where the taps before were of another
 object or the pad was not turned."""
-DEMO_MODEL: Final = "mtsr4"
+INT8_SUFFIX: Final = "-int8"
+"""Of the file name of a model in integers, beside that of the same network in float32."""
+DEMO_MODEL: Final = "mtsr4-int8"
 """The demo's taps are turned as this one expects."""
 
 
@@ -32,6 +36,18 @@ def find_model(name: str | Path) -> Path:
             return model
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")
+
+
+def alternatives(model: Path) -> list[Path]:
+    """Files of models that may be able to do a model's work: the bundled ones for one of them, else its own integers.
+
+    Another network than the bundled ones was trained on other surfaces, and these cannot stand in for it.
+    """
+    bundled = bundled_models()
+    if model.resolve() in bundled:
+        return [path for path in bundled if path != model.resolve()]
+    in_integers = model.with_name(f"{model.stem}{INT8_SUFFIX}{model.suffix}")
+    return [in_integers] if in_integers.is_file() else []
 
 
 def demo_recording() -> Path:

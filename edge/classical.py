@@ -49,6 +49,18 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
     return methods
 
 
+def method_macs(name: str, scale: int, rows: int = 4, cols: int = 4) -> int:
+    """Multiply-accumulates of one scan in a method of `fitted_methods`.
+
+    Interpolation is counted as it is computed here, as two matrix products, along the rows and along the columns, and
+    the gain.
+    """
+    pixels = rows * scale * cols * scale
+    if name == "linear map":
+        return 3 * rows * cols * pixels
+    return rows * scale * rows * cols + pixels * cols + pixels
+
+
 def bilinear(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
     """Interpolate taxels (..., rows, cols) to (..., rows*scale, cols*scale).
 

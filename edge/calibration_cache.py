@@ -1,0 +1,144 @@
+"""Calibrated run times, kept from one run to the next: for this machine, these versions and this model file only."""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import onnxruntime
+
+from edge.calibration import ROUND_TICKS, ROUNDS, RunTime
+
+FILE_NAME: Final = "calibration.json"
+MOST: Final = 1e12
+"""In [us] or [s]: no figure here can be more."""
+CPU_KEYS: Final = ("model name", "CPU implementer", "CPU part")
+"""Of /proc/cpuinfo; the first on x86, the others on ARM."""
+
+
+class CalibrationCache:
+    """Run times by model file, in one JSON file. What goes wrong with it costs a calibration, never the run.
+
+    Attributes:
+        notes: what went wrong, a line each.
+    """
+
+    def __init__(self, path: Path | None, rate_hz: float, unix_time_s: Callable[[], float] = time.time) -> None:
+        """Read it.
+
+        Args:
+            path: of the file; None keeps nothing.
+            rate_hz: at which run times are taken, in [Hz].
+            unix_time_s: tells when.
+        """
+        self.notes: list[str] = []
+        self._path = path
+        if path is None:
+            self.notes.append("there is no home folder to keep run times in: measured at each start")
+        self._place = {**machine(), "rate_hz": rate_hz, "ticks": ROUNDS * ROUND_TICKS}
+        self._unix_time_s = unix_time_s
+        self._entries = self._read()
+
+    def find(self, model: Path) -> tuple[RunTime, float] | None:
+        """What was kept of a model file, and its age in [s]; None where there is nothing, or nothing that can be.
+
+        Raises:
+            OSError: the model file cannot be read.
+        """
+        entry = self._entries.get(self._key(model))
+        if entry is None:
+            return None
+        p50_us, p99_us, unix_s = (_positive(entry, key) for key in ("p50_us", "p99_us", "unix_s"))
+        if p50_us is None or p99_us is None or unix_s is None or p50_us > p99_us:
+            self.notes.append(f"{self._path} is damaged at {model.stem}: measured anew")
+            return None
+        return RunTime(p50_us, p99_us), max(self._unix_time_s() - unix_s, 0.0)
+
+    def keep(self, run_times: Mapping[Path, RunTime]) -> None:
+        """Add run times by model file, and write if there are any.
+
+        Raises:
+            OSError: a model file cannot be read.
+        """
+        now_s = self._unix_time_s()
+        for model, run_time in run_times.items():
+            self._entries[self._key(model)] = {"model": model.stem, **asdict(run_time), "unix_s": now_s}
+        if self._path is None or not run_times:
+            return
+        # Beside it and then renamed, so that another run never reads half of it.
+        draft = self._path.with_name(f"{self._path.name}.{os.getpid()}")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            draft.write_text(json.dumps(self._entries, indent=1))
+            draft.replace(self._path)
+        except OSError as error:
+            self.notes.append(f"run times are not kept: {self._path}: {error.strerror}")
+            with contextlib.suppress(OSError):
+                draft.unlink()
+
+    def _key(self, model: Path) -> str:
+        facts = {**self._place, "model_sha256": hashlib.sha256(model.read_bytes()).hexdigest()}
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            entries = {} if self._path is None else json.loads(self._path.read_bytes())
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            self.notes.append(f"run times are measured at each start: {self._path}: {error.strerror}")
+            self._path = None
+            return {}
+        except (ValueError, RecursionError):
+            entries = None
+        if not isinstance(entries, dict):
+            self.notes.append(f"{self._path} is damaged: measured anew")
+            return {}
+        return entries
+
+
+def _positive(entry: object, key: str) -> float | None:
+    value = entry.get(key) if isinstance(entry, dict) else None
+    return value if isinstance(value, (int, float)) and 0 < value < MOST else None
+
+
+def cache_path(environment: Mapping[str, str] = os.environ) -> Path | None:
+    """Where run times are kept: below $XDG_CACHE_HOME, else ~/.cache; None without a home.
+
+    Source: XDG Base Directory Specification 0.8, by which a relative path is ignored.
+    """
+    folder = Path(environment.get("XDG_CACHE_HOME", ""))
+    try:
+        folder = folder if folder.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return folder / "edge-sr" / FILE_NAME
+
+
+def machine() -> dict[str, str | int | None]:
+    """What run times hang on beside the model: processor, cores, host and versions."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    cpu = sorted({line.strip() for line in lines if line.partition(":")[0].strip() in CPU_KEYS})
+    try:
+        version = importlib.metadata.version("tactile-edge-sr")
+    except importlib.metadata.PackageNotFoundError:
+        version = None  # run from a checkout that is not installed
+    return {
+        "cpu": "; ".join(cpu) or platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "host": platform.node(),
+        "onnxruntime": onnxruntime.__version__,
+        "numpy": np.__version__,
+        "version": version,
+    }
