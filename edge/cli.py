@@ -1,25 +1,18 @@
 """`edge-sr`: taxel scans in, super-resolved patterns out."""
 
 import argparse
-import contextlib
 import os
-import shutil
-import signal
+import shlex
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Final, TextIO
+from collections.abc import Sequence
+from typing import Final
 
-from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, bundled_models, demo_recording, find_model
-from edge.errors import EdgeError, ModelError, SinkClosedError, SinkError
+from edge.bundle import bundled_models, demo_recording
+from edge.errors import EdgeError, ModelError, SinkError, UsageError
 from edge.options import EXIT_USAGE, baseline_parser, bench_parser, models_parser, run_parser
 from firmware_bridge.errors import BaselineRefusedError, BridgeError, DeviceError
 from firmware_bridge.links.base import Link
 from firmware_bridge.xela import ID_MAPS
-
-if TYPE_CHECKING:
-    from edge.demo import DemoScore
-    from edge.statistics import Statistics
 
 STDOUT: Final = 1
 EXIT_DEVICE: Final = 3
@@ -57,85 +50,13 @@ def _exit_code(error: BridgeError | EdgeError) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     options = run_parser().parse_args(arguments)
+    if options.recalibrate and options.budget_us is None:
+        raise UsageError("--recalibrate measures for --budget-us, which is not there: add it, or leave both")
     # Here and not above, so that --help does not wait for onnxruntime.
-    from edge.commands import stdin_commands
-    from edge.demo import DemoScore
-    from edge.pump import pump
-    from edge.runtime import Runtime
-    from edge.session import ModelSession
-    from edge.sinks.base import Sink
-    from edge.sinks.forms import open_sink
-    from edge.statistics import Statistics
-    from firmware_bridge.baseline import load_baselines
+    from edge.run import run
 
-    stdout_taken = "jsonl:-" in options.sink
-    with _stop_on_signals() as stop:
-        link = _open_source(options)
-        baselines = load_baselines(options.baseline) if options.baseline else None
-        default = DEMO_MODEL if options.source == "demo" else DEFAULT_MODEL
-        model = ModelSession(find_model(options.model or default))
-        score = DemoScore(demo_recording(), model.contract) if options.source == "demo" else None
-        statistics = Statistics()
-        if score is not None:
-            print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
-        with link, _summary(statistics, link, options.rate_hz), contextlib.ExitStack() as closing:
-            runtime = Runtime(
-                model,
-                source=link.kind,  # known once the link is open
-                baselines=baselines,
-                counts_per_newton=options.counts_per_newton,
-                on_counts=options.contact_on_counts,
-                off_counts=options.contact_off_counts,
-                idle_timeout_s=options.idle_reset_s,
-            )
-            sinks: list[Sink] = [] if score is None else [score]
-            for text in _with_status(options.sink):
-                sinks.append(open_sink(text, model.contract))
-                closing.callback(sinks[-1].close)
-            pump(
-                link,
-                runtime,
-                sinks,
-                statistics,
-                stop=stop,
-                duration_s=options.duration_s,
-                commands=stdin_commands(),
-            )
-        if score is not None:
-            _print_score(score, sys.stderr if stdout_taken else sys.stdout)
+    run(options, _open_source(options))
     return 0
-
-
-@contextlib.contextmanager
-def _summary(statistics: "Statistics", link: Link, rate_hz: float | None) -> Iterator[None]:
-    """Tells at the end what the run did; a reader that has gone is an ordinary end, like Ctrl-C."""
-    try:
-        with contextlib.suppress(SinkClosedError):
-            yield
-    finally:
-        if statistics.scans or sys.exception() is None:
-            source = link.name if link.kind == "device" else f"{link.kind.upper()} {link.name}"
-            with contextlib.suppress(OSError):  # the terminal may have gone, which must not spoil a clean end
-                print(statistics.summary(source=source, wanted_rate_hz=rate_hz), file=sys.stderr)
-
-
-def _with_status(sinks: Sequence[str]) -> list[str]:
-    """The sinks asked for, and the live line, unless records may go to the same terminal."""
-    return list(sinks) if {"status", "jsonl:-"} & set(sinks) else [*sinks, "status"]
-
-
-def _print_score(score: "DemoScore", stream: TextIO) -> None:
-    from edge.demo import score_picture, score_table
-    from edge.draw import choose_palette
-
-    scores = score.scores()
-    print(f"\n{len(scores)} of {score.taps} taps scored at their peak, against the known truth:", file=stream)
-    if not scores:
-        return
-    palette = choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)
-    columns = shutil.get_terminal_size().columns
-    print(score_table(scores), file=stream)
-    print(f"\ntap {scores[-1].tap + 1}:\n{score_picture(scores[-1], columns, palette)}", file=stream)
 
 
 def _models(arguments: Sequence[str]) -> int:
@@ -161,10 +82,11 @@ def _models(arguments: Sequence[str]) -> int:
 
 def _baseline(arguments: Sequence[str]) -> int:
     options = baseline_parser().parse_args(arguments)
+    from edge.signals import stop_on_signals
     from edge.zeroing import take_baselines
     from firmware_bridge.baseline import save_baselines
 
-    with _stop_on_signals() as stop, _open_source(options) as link:
+    with stop_on_signals() as stop, _open_source(options) as link:
         kind = link.kind
         baselines = take_baselines(link, scans=options.scans, skip=options.skip, stop=stop)
     save_baselines(options.out, baselines.values())
@@ -176,16 +98,26 @@ def _baseline(arguments: Sequence[str]) -> int:
 
 def _bench(arguments: Sequence[str]) -> int:
     options = bench_parser().parse_args(arguments)
-    from edge.bench import bench, header, surface_table, table_line
+    if options.soak is not None and not options.system:
+        raise UsageError("--soak is a part of --system: add it")
+    from edge.bench.command import Settings, run
 
-    rows = []
-    print(header(options.rate_hz, options.ticks), flush=True)
-    for row in bench(bundled_models(), options.rate_hz, options.ticks):
-        rows.append(row)
-        print(table_line(row), flush=True)
-    if options.by_surface:
-        print(f"\n{surface_table(rows)}")
-    return 0
+    settings = Settings(
+        out=options.out,
+        rate_hz=options.rate_hz,
+        ticks=options.ticks,
+        threads=tuple(sorted(set(options.threads))),
+        load=options.load,
+        models=options.models,
+        peers=tuple(options.against),
+        earlier=options.compare,
+        by_surface=options.by_surface,
+        only=options.only,
+        system=options.system,
+        soak_minutes=options.soak,
+        command=shlex.join(["edge-sr", "bench", *arguments]),
+    )
+    return run(settings, sys.stdout, sys.stderr)
 
 
 COMMANDS: Final = {"models": _models, "baseline": _baseline, "bench": _bench}
@@ -196,24 +128,6 @@ def _open_source(options: argparse.Namespace) -> Link:
 
     recording = demo_recording() if options.source == "demo" else None
     return open_source(options.source, options.rate_hz, recording, ID_MAPS[options.id_map])
-
-
-@contextlib.contextmanager
-def _stop_on_signals() -> Iterator[threading.Event]:
-    """An event that the first signal sets; a second signal ends the program at once."""
-    stop = threading.Event()
-
-    def handle(number: int, frame: object) -> None:
-        stop.set()
-        signal.signal(number, signal.SIG_DFL)
-
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {getattr(signal, name): signal.signal(getattr(signal, name), handle) for name in names}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 if __name__ == "__main__":

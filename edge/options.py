@@ -56,9 +56,19 @@ example:
 
 
 BENCH_HELP: Final = """\
-One inference a tick, idle in between,
-as on a robot. Nothing else should run
-meanwhile.
+Run time is taken back to back, and one
+inference a tick, idle in between, as on
+a robot. Half a minute a row: nothing
+else should run meanwhile.
+
+examples:
+  edge-sr bench --out today
+  edge-sr bench --load --only stsr mtsr4
+  edge-sr bench --threads 1 \\
+          --compare before/bench.json
+
+Ctrl-C ends it with exit code 130; what
+was measured is written.
 """
 
 
@@ -83,6 +93,13 @@ def run_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL}; for the demo {DEMO_MODEL})")
+    add(
+        "--budget-us",
+        metavar="N",
+        type=_positive,
+        help="run time a pattern may take: of models with no more taps than M, the best that fits",
+    )
+    add("--recalibrate", action="store_true", help="measure run times anew for --budget-us")
     _add_source(parser)
     add("--sink", metavar="S", action="append", default=[], help="where results go; may be repeated")
     add("--duration-s", metavar="T", type=_positive, help="stop after this time")
@@ -109,6 +126,9 @@ def run_parser() -> argparse.ArgumentParser:
         default=IDLE_TIMEOUT_S,
         help=f"forget earlier taps after so long without contact (default {IDLE_TIMEOUT_S:g})",
     )
+    add("--every-scan", action="store_true", help="infer also where nothing has changed since the pattern before")
+    add("--every-tap", action="store_true", help="use also taps that are not expected to help")
+    add("--realtime", action="store_true", help="SCHED_FIFO, a processor of its own, locked memory; as permitted")
     return parser
 
 
@@ -131,12 +151,24 @@ def bench_parser() -> argparse.ArgumentParser:
     """Options of `edge-sr bench`."""
     parser = Parser(
         prog="edge-sr bench",
+        usage="edge-sr bench [options]",
         description="Error against run time of the\nbundled models and of methods without a\nnetwork.",
         epilog=BENCH_HELP,
     )
-    parser.add_argument("--rate-hz", metavar="R", type=_positive, default=100.0, help="pace (default 100)")
-    parser.add_argument("--ticks", metavar="N", type=_whole(10), default=1000, help="runs a row (default 1000)")
-    parser.add_argument("--by-surface", action="store_true", help="a second table: PSNR of each surface")
+    add = parser.add_argument
+    add("--out", metavar="DIR", type=Path, help="write bench.json, .csv, .md and .png there")
+    add("--rate-hz", metavar="R", type=_positive, default=100.0, help="pace (default 100)")
+    add("--ticks", metavar="N", type=_whole(10), default=3000, help="paced ticks a row (default 3000)")
+    add("--threads", metavar="N", type=_whole(1), nargs="+", default=[1, 2], help="threads of one run (default 1 2)")
+    add("--load", action="store_true", help="each row again with the last core busy")
+    add("--models", metavar="DIR", type=Path, help="your own models too")
+    against_help = "ratios to the run times of any ONNX files on floats"
+    add("--against", metavar="FILE", type=Path, nargs="+", default=[], help=against_help)
+    add("--compare", metavar="OLD.json", type=Path, help="ratios to an earlier bench of --out")
+    add("--by-surface", action="store_true", help="PSNR of each surface")
+    add("--system", action="store_true", help="the whole program and nothing else: 6 minutes with 3000 ticks")
+    add("--soak", metavar="MINUTES", type=_positive, help="with --system: run it for so long, does it grow or drift?")
+    add("--only", metavar="NAME", nargs="+", help="these methods alone")
     return parser
 
 

@@ -1,8 +1,11 @@
 """What the runtime really loads, in a process of its own."""
 
+import ast
+import os
 import subprocess
 import sys
 
+from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT
 
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
@@ -29,3 +32,45 @@ def test_the_runtime_loads_no_training_library():
 
 def test_contract_and_cli_load_no_onnxruntime():
     assert "onnxruntime" not in loaded("edge.contract", "edge.cli", "edge.runtime", "edge.pump", "edge.sinks.forms")
+
+
+UNUSED_IN_A_REPLAY = {
+    "edge.sinks.jsonl",
+    "edge.sinks.npz",
+    "edge.bench",
+    "edge.demo",
+    "edge.draw",
+    "edge.realtime",
+    "firmware_bridge.emulator",
+    "firmware_bridge.links.demo",
+    "firmware_bridge.links.slcan_serial",
+    "usb",
+    "subprocess",
+}
+RUN = """
+import sys, threading
+from edge import cli, pump
+within = []
+taken = pump.ScanReader.take
+pump.ScanReader.take = lambda *a: within.append([t.name for t in threading.enumerate()]) or taken(*a)
+code = cli.main(["--source", "replay:" + sys.argv[1], "--rate-hz", "1000", "--sink", "status"])
+print(code, within[0], sorted(sys.modules), sep="\\n")
+"""
+
+
+def test_a_run_loads_what_it_uses_and_starts_one_thread(tmp_path):
+    write_recording(tmp_path / "rest.csv", make_counts(20))
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, str(tmp_path / "rest.csv")],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    code, threads, modules = done.stdout.splitlines()
+    assert code == "0", done.stderr
+    assert ast.literal_eval(threads) == ["MainThread", "scan-reader_0"]
+    assert not set(ast.literal_eval(modules)) & (UNUSED_IN_A_REPLAY | FORBIDDEN)
+    assert "edge.sinks.status" in ast.literal_eval(modules)
