@@ -48,8 +48,19 @@ def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> di
 
     One run a frame gives the patterns and, where the model has them, the deviations.
     """
+    patterns, half_width_mm = infer_with_intervals(model, frozen, given)
+    return judge(patterns, frozen, model.contract.contact_level, half_width_mm)
+
+
+def infer_with_intervals(
+    model: Model, frozen: FrozenSet, given: int | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Patterns (n, H, W) of every frame, and half of the intervals that are to hold 90 % of pixels, both in [mm].
+
+    The intervals are None where the model gives no deviations.
+    """
     contract = model.contract
-    half_widths_mm = []
+    half_widths_mm: list[NDArray[np.float32]] = []
 
     def run(window: NDArray[np.float32]) -> NDArray[np.float32]:
         pattern = model.run(window)
@@ -58,7 +69,7 @@ def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> di
         return pattern
 
     patterns = infer_all(run, contract, frozen, given)
-    return judge(patterns, frozen, contract.contact_level, np.stack(half_widths_mm) if half_widths_mm else None)
+    return patterns, np.stack(half_widths_mm) if half_widths_mm else None
 
 
 def mean_error(errors: dict[str, NDArray[np.float64]]) -> dict[str, float]:

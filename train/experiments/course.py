@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge import metrics
 from edge.classical import fit_gain
 from edge.taps import TapTracker
 from firmware_bridge.geometry import USPA44
@@ -118,7 +119,7 @@ def loop_percent(true_n: NDArray[np.floating], found_n: NDArray[np.floating], co
 
 def volume_mm3(patterns: NDArray[np.floating], scale: int) -> NDArray[np.floating]:
     """What patterns (n, H, W) in [mm] sum up to over their area, (n,) in [mm3]."""
-    return patterns.sum(axis=(1, 2)) * USPA44.pixel_pitch_mm(scale) ** 2
+    return metrics.volume_mm3(patterns, USPA44.pixel_pitch_mm(scale))
 
 
 def _rms_percent(error_n: NDArray[np.floating]) -> float:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import CONTACT_LEVEL, fitted_methods
+from edge.classical import CONTACT_LEVEL, fitted_methods, method_macs
 from edge.frozen import FrozenSet
 from edge.judge import judge
 from firmware_bridge.geometry import USPA44
@@ -72,18 +72,17 @@ def classical_methods(bench: Workbench, data: Sequences, names: tuple[str, ...])
         np.savez_compressed(path, allow_pickle=False, **fitted)
     by_name = fitted_methods(path, SCALE)
     with np.load(path, allow_pickle=False) as arrays:
-        map_size = arrays["linear_map"].size
-    rows, cols = USPA44.rows, USPA44.cols
-    # Along the rows, along the columns, and the gain.
-    interpolated = rows * SCALE * rows * cols + rows * SCALE * cols * cols * SCALE + rows * SCALE * cols * SCALE
-    sizes = {"linear map": (map_size, map_size)}
+        sizes = {"linear map": arrays["linear_map"].size}
     methods: list[Method] = []
     for name in names:
         if name not in by_name:
             raise TrainError(f"no classical method {name!r}: expected one of {', '.join(by_name)}")
-        parameters, macs = sizes.get(name, (1, interpolated))
-        run = by_name[name]
-        cost: Row = {"parameters": parameters, "MMAC": round(macs / 1e6, 3), "run time ms": _run_time_ms(run)}
+        run, macs = by_name[name], method_macs(name, SCALE)
+        cost: Row = {
+            "parameters": sizes.get(name, 1),
+            "MMAC": round(macs / 1e6, 3),
+            "run time ms": _run_time_ms(run),
+        }
         methods.append(Method(name, 1, CONTACT_LEVEL, cost, lambda windows, run=run: run(windows[:, 0])))
     return methods
 

@@ -1,0 +1,92 @@
+"""Error on the frozen test set, every metric of a subject with some taps given."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.bench.subjects import Subject
+from edge.bundle import BUNDLE_DIR
+from edge.classical import CONTACT_LEVEL, fit_gain, fitted_methods
+from edge.errors import ModelError
+from edge.frozen import FrozenSet
+from edge.judge import by_surface, infer_with_intervals, judge, mean_error
+from edge.metrics import volume_mm3
+from edge.session import ModelSession
+from firmware_bridge.geometry import USPA44
+
+FORCE_RANGE_N: Final = 5.0
+"""At which, or as deep as the sensor allows, every tap of a frozen set ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorRow:
+    """Errors of a subject.
+
+    Attributes:
+        name: of the subject.
+        given: newest taps that it was given.
+        error: metric to its mean over all frames; "force_percent" as `force_error_percent` has it.
+        psnr_db_by_surface: surface to PSNR in [dB].
+    """
+
+    name: str
+    given: int
+    error: dict[str, float]
+    psnr_db_by_surface: dict[str, float]
+
+
+def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
+    """A classical method with the newest tap, a model with one and with all it takes; a peer has no error.
+
+    Raises:
+        ModelError: the model cannot be used, or was made for another scale than the test set.
+        FrozenSetError: the model takes more taps than the test set has.
+    """
+    if subject.kind == "classical":
+        newest = frozen.newest.astype(np.float32)
+        patterns = fitted_methods(BUNDLE_DIR / "classical.npz", frozen.scale)[subject.name](newest)
+        yield _row(subject, 1, patterns, judge(patterns, frozen, CONTACT_LEVEL), frozen)
+    elif subject.path is not None and subject.kind == "model":
+        session = ModelSession(Path(subject.path))
+        contract = session.contract
+        if contract.scale != frozen.scale:
+            raise ModelError(
+                f"{subject.path}: contract key 'scale' is {contract.scale}, the test set's is {frozen.scale}"
+            )
+        for given in sorted({1, contract.taps}):
+            patterns, half_width_mm = infer_with_intervals(session, frozen, given)
+            yield _row(subject, given, patterns, judge(patterns, frozen, contract.contact_level, half_width_mm), frozen)
+
+
+def _row(
+    subject: Subject,
+    given: int,
+    patterns: NDArray[np.floating],
+    errors: dict[str, NDArray[np.float64]],
+    frozen: FrozenSet,
+) -> ErrorRow:
+    error = mean_error(errors) | {"force_percent": round(force_error_percent(patterns, frozen), 4)}
+    return ErrorRow(subject.name, given, error, by_surface(errors["psnr_db"], frozen))
+
+
+def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:
+    """RMS error of the force that patterns (n, H, W) in [mm] sum up to, in [% of FORCE_RANGE_N].
+
+    A pattern's deformation summed over its area becomes newtons by one factor, the same for every subject: the one that
+    brings the true patterns nearest to the true forces, least squares, no offset. It is not fitted to what is judged:
+    a pattern that is too deep on the whole is an error. Shapes have factors of their own: true patterns are off too,
+    which is the least that can be asked for (`force_floor_percent`).
+    """
+    pixel_mm = USPA44.pixel_pitch_mm(frozen.scale)
+    newtons_per_mm3 = fit_gain(volume_mm3(frozen.patterns(), pixel_mm), frozen.force_n)
+    error_n = newtons_per_mm3 * volume_mm3(patterns, pixel_mm) - frozen.force_n
+    return 100 * float(np.sqrt(np.mean(np.square(error_n, dtype=np.float64)))) / FORCE_RANGE_N
+
+
+def force_floor_percent(frozen: FrozenSet) -> float:
+    """What `force_error_percent` says of the truth itself."""
+    return force_error_percent(frozen.patterns(), frozen)

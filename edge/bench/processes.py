@@ -1,0 +1,105 @@
+"""Processes of their own to measure in: threads, memory and start-up are properties of a process."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any, Final, TextIO, cast
+
+import numpy as np
+
+from edge.bench.errors import BenchError
+from edge.errors import UsageError
+
+_THREAD_VARIABLES: Final = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+STARTS: Final = 5
+"""Of which a start-up is the median."""
+
+
+def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
+    """What a child says of a job of `edge.bench.child`, numpy's BLAS on as many threads.
+
+    Raises:
+        BenchError: it failed; the last line that it said is in it.
+    """
+    with _child(threads) as child:
+        said, complaint = child.communicate(json.dumps(job))
+    if child.returncode != 0:
+        last = (complaint.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+        raise BenchError(f"{job['do']} of {job.get('subject', {}).get('name', 'the machine')} failed: {last}")
+    return json.loads(said)
+
+
+def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None]:
+    """Median time from the spawn of a process to its first pattern, imports included, in [ms]; and its memory.
+
+    Returns:
+        Time in [ms], and the most memory resident until then, median, in [MB]; None where the system does not tell.
+    """
+    took_ms: list[float] = []
+    resident_mb: list[float] = []
+    for _ in range(STARTS):
+        spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
+        told = measured(job, threads)
+        took_ms.append((told["first_ns"] - spawned_ns) / 1e6)
+        if told["resident_mb"] is not None:
+            resident_mb.append(told["resident_mb"])
+    return float(np.median(took_ms)), float(np.median(resident_mb)) if resident_mb else None
+
+
+@contextlib.contextmanager
+def busy_core() -> Iterator[str]:
+    """Keeps the last core busy that this process may use; gives a line that says how.
+
+    Only the load is held to its core: what is measured goes where the scheduler puts it, as on a robot.
+
+    Raises:
+        UsageError: there is one core alone.
+    """
+    cores = usable_cores()
+    if len(cores) < 2:
+        raise UsageError("--load keeps another core busy, but this process may use one: bench without it")
+    pinned = hasattr(os, "sched_setaffinity")
+    with _child(1) as child:
+        asked, said = cast(TextIO, child.stdin), cast(TextIO, child.stdout)
+        asked.write(json.dumps({"do": "spin", "core": cores[-1] if pinned else None}))
+        asked.close()
+        if not said.readline():
+            raise BenchError("the load could not be started: its process ended at once")
+        yield f"core {cores[-1]} kept busy" if pinned else "a process that keeps a core busy, not held to one"
+
+
+def usable_cores() -> list[int]:
+    """Numbers of the cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
+@contextlib.contextmanager
+def _child(threads: int) -> Iterator[subprocess.Popen[str]]:
+    # The same modules as here, whichever way this process came to find them.
+    script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.child import main; sys.exit(main())"
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | dict.fromkeys(_THREAD_VARIABLES, str(threads)),
+    ) as child:
+        try:
+            yield child
+        finally:
+            # Does nothing to one that has ended; after a Ctrl-C, Popen itself would leave one behind.
+            child.kill()
+            child.wait()

@@ -1,0 +1,233 @@
+"""What a bench keeps: one JSON file, which a later bench can be compared with."""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from edge.bench.accuracy import ErrorRow
+from edge.bench.errors import BenchError
+from edge.bench.front import front
+from edge.bench.intervals import Ratio
+from edge.bench.machine import Machine
+from edge.bench.scene import Saving
+from edge.bench.soak import Soak
+from edge.bench.system import StartUp, SystemRow
+from edge.bench.timing import Pace, Times
+from edge.bench.verdicts import Verdict
+
+FORMAT: Final = "tactile bench"
+VERSION: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What is true of a subject wherever it runs.
+
+    Attributes:
+        name: of the subject.
+        kind: "classical", "model" or "peer".
+        macs: multiply-accumulates of one window.
+        uncounted: operators of which they are not counted.
+        weights: what a peer says of weights that nobody trained, or None.
+    """
+
+    name: str
+    kind: str
+    macs: int
+    uncounted: tuple[str, ...] = ()
+    weights: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunTimeRow:
+    """Run time of a subject on some threads.
+
+    Attributes:
+        name: of the subject.
+        threads: of one run.
+        load: whether the other core was kept busy.
+        back_to_back: without a pause.
+        paced: at the rate.
+        gmac_s: back to back, in [10^9 multiply-accumulates per second].
+        peak_percent: of the machine's peak on as many threads, in [%].
+        start_up_ms: from the process's spawn to its first pattern, in [ms].
+        resident_mb: most memory resident until then, in [MB]; None where the system does not tell.
+    """
+
+    name: str
+    threads: int
+    load: bool
+    back_to_back: Times
+    paced: Pace
+    gmac_s: float
+    peak_percent: float
+    start_up_ms: float
+    resident_mb: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class FrontRow:
+    """A subject's error against its run time, and whether it is on the Pareto front of the two."""
+
+    name: str
+    given: int
+    rmse_percent: float
+    psnr_db: float
+    paced_p50_us: float
+    back_to_back_p50_us: float
+    on_front: bool
+
+
+@dataclass(slots=True)
+class SystemRecord:
+    """The whole program, as far as it was measured: its rows, its starts, what both are held against, and a soak."""
+
+    rows: list[SystemRow] = field(default_factory=list[SystemRow])
+    start_up: StartUp | None = None
+    verdicts: list[Verdict] = field(default_factory=list[Verdict])
+    soak: Soak | None = None
+
+
+@dataclass(slots=True)
+class Record:
+    """All of a bench, as far as it came.
+
+    Attributes:
+        date: when it began, ISO 8601 in UTC.
+        command: as it was called.
+        machine: where.
+        settings: rate, ticks, threads, load, seeds.
+        complete: whether it came to its end.
+        peak_gmac_s: threads to the machine's peak.
+        force_floor_percent: force error of true patterns.
+        facts: of each subject.
+        errors: on the frozen test set.
+        run_times: of each subject, on each number of threads, alone and under load.
+        against: peer to subject to the ratio of the subject's run time to the peer's.
+        savings: what a scene spares.
+        system: the whole program, if that was asked for.
+    """
+
+    date: str
+    command: str
+    machine: Machine
+    settings: dict[str, Any]
+    complete: bool = False
+    peak_gmac_s: dict[int, float] = field(default_factory=dict[int, float])
+    force_floor_percent: float | None = None
+    facts: list[Facts] = field(default_factory=list[Facts])
+    errors: list[ErrorRow] = field(default_factory=list[ErrorRow])
+    run_times: list[RunTimeRow] = field(default_factory=list[RunTimeRow])
+    against: dict[str, dict[str, Ratio]] = field(default_factory=dict[str, dict[str, Ratio]])
+    savings: list[Saving] = field(default_factory=list[Saving])
+    system: SystemRecord | None = None
+
+    def fact(self, name: str) -> Facts:
+        """Of the subject of this name."""
+        return next(fact for fact in self.facts if fact.name == name)
+
+    def front_rows(self) -> list[FrontRow]:
+        """Every error with a run time on the fewest threads, alone; the fastest at the rate first."""
+        if not self.run_times:
+            return []
+        fewest = min(row.threads for row in self.run_times)
+        times = {row.name: row for row in self.run_times if row.threads == fewest and not row.load}
+        judged = [row for row in self.errors if row.name in times]
+        points = [(row.error["rmse_percent"], times[row.name].paced.times.p50_us) for row in judged]
+        rows = [
+            FrontRow(
+                name=row.name,
+                given=row.given,
+                rmse_percent=row.error["rmse_percent"],
+                psnr_db=row.error["psnr_db"],
+                paced_p50_us=times[row.name].paced.times.p50_us,
+                back_to_back_p50_us=times[row.name].back_to_back.p50_us,
+                on_front=on_front,
+            )
+            for row, on_front in zip(judged, front(points), strict=True)
+        ]
+        return sorted(rows, key=lambda row: row.paced_p50_us)
+
+    def to_json(self) -> str:
+        """The record, with the front in it."""
+        told = {"format": FORMAT, "version": VERSION} | asdict(self)
+        told["front"] = [asdict(row) for row in self.front_rows()]
+        return json.dumps(told, indent=1) + "\n"
+
+    def to_csv(self) -> str:
+        """A flat line for each error and run time of a subject, each row of the whole program and of a scene's savings.
+
+        A cell is empty where there is no figure.
+        """
+        lines: list[dict[str, Any]] = []
+        columns: dict[str, None] = {}
+        on_front = {(row.name, row.given) for row in self.front_rows() if row.on_front}
+        for fact in self.facts:
+            errors = [row for row in self.errors if row.name == fact.name] or [None]
+            times = [row for row in self.run_times if row.name == fact.name] or [None]
+            for error in errors:
+                about = {"method": fact.name, "kind": fact.kind, "weights": fact.weights, "macs": fact.macs}
+                if error is not None:
+                    about |= {"taps_given": error.given, **error.error}
+                    about["on_front"] = (fact.name, error.given) in on_front
+                columns |= dict.fromkeys(about)
+                lines += [about | ({} if row is None else _time_cells(row)) for row in times]
+        lines += [{"method": row.model, "kind": "scene"} | asdict(row) for row in self.savings]
+        lines += (
+            [{"method": row.name, "kind": "system"} | _system_cells(row) for row in self.system.rows]
+            if self.system
+            else []
+        )
+        columns |= dict.fromkeys(column for line in lines for column in line)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+        return text.getvalue()
+
+
+def _time_cells(row: RunTimeRow) -> dict[str, Any]:
+    cells: dict[str, Any] = {"threads": row.threads, "load": row.load}
+    for name, times in (("back_to_back", row.back_to_back), ("paced", row.paced.times)):
+        for figure in ("runs", "p50_us", "p99_us", "p999_us", "max_us"):
+            cells[f"{name}_{figure}"] = getattr(times, figure)
+    cells |= {"ticks": row.paced.ticks, "missed": row.paced.missed, "cpu_percent": row.paced.cpu_percent}
+    for figure in ("gmac_s", "peak_percent", "start_up_ms", "resident_mb"):
+        cells[figure] = getattr(row, figure)
+    return cells
+
+
+def _system_cells(row: SystemRow) -> dict[str, Any]:
+    cells: dict[str, Any] = {"scans": row.scans, "cpu_percent": row.cpu_percent, "resident_mb": row.resident_mb}
+    for name, times in (("run_time", row.run_time), ("latency", row.latency)):
+        if times is not None:
+            cells |= {
+                f"{name}_{figure}": getattr(times, figure) for figure in ("p50_us", "p99_us", "p999_us", "max_us")
+            }
+    return cells | ({} if row.losses is None else asdict(row.losses))
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """An earlier bench's JSON.
+
+    Raises:
+        BenchError: no such file, no bench, or one of another version.
+    """
+    try:
+        told = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BenchError(
+            f"{path} cannot be read ({error}): expected the bench.json of 'edge-sr bench --out'"
+        ) from error
+    kind: Sequence[object] = (told.get("format"), told.get("version")) if isinstance(told, dict) else (None, None)
+    if kind[0] != FORMAT:
+        raise BenchError(f"{path} is no bench: expected the bench.json of 'edge-sr bench --out'")
+    if kind[1] != VERSION:
+        raise BenchError(
+            f"{path} is of version {kind[1]!r}, expected {VERSION}: run that bench again with this release"
+        )
+    return told

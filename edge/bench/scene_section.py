@@ -1,0 +1,40 @@
+"""The bench's section on what a scene spares."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from edge.bench.page import Page
+from edge.bench.record import Record
+from edge.bench.scene import Saving, savings
+from edge.bench.subjects import Subject
+from edge.bench.tables import head, line
+from edge.bundle import DEFAULT_MODEL
+from edge.frozen import FrozenSet
+from edge.session import ModelSession
+
+MODELS: Final = (DEFAULT_MODEL, "mtsr4-int8")
+COLUMNS: Final = ("left out", "model", "scans", "inferred %", "CPU us a scan", "taps used", "PSNR dB")
+_TEXT: Final = (
+    "Taps of the test set through the runtime, held for a second, with a second of rest after each; back to back, so "
+    "that CPU is that of warm caches. Each row leaves out one thing more."
+)
+
+
+def show_savings(everyone: Sequence[Subject], frozen: FrozenSet, record: Record, page: Page) -> None:
+    """Measure, show and keep it, for those of MODELS that are among `everyone`."""
+    shown = [Path(subject.path) for subject in everyone if subject.name in MODELS and subject.path is not None]
+    if not shown:
+        return
+    page.section("What a scene spares", _TEXT, head(COLUMNS))
+    for path in shown:
+        page.progress(f"what a scene spares {path.stem}")
+        for saving in savings(ModelSession(path), frozen):
+            record.savings.append(saving)
+            page.say(saving_line(saving))
+
+
+def saving_line(row: Saving) -> str:
+    """A row of the table."""
+    shares = (f"{100 * row.inferred / row.scans:.1f}", f"{row.cpu_us:.0f}", f"{row.taps_used:.2f}")
+    return line((row.left_out, row.model, str(row.scans), *shares, f"{row.psnr_db:.2f}"))

@@ -1,0 +1,113 @@
+"""The whole program for minutes, taking turns between rest and contact: does memory grow, or latency drift?
+
+    python -m edge.bench.soak MINUTES
+
+writes what it found as JSON.
+"""
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge.bench.program import Play, Program, edge_sr
+
+WARM_UP_S: Final = 6.0
+"""Both phases, so that everything has been used once."""
+WINDOW_S: Final = 5.0
+"""One turn of rest and contact, so that windows can be compared."""
+_PLAY: Final = Play(pressed=250, moving=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Some seconds of a soak.
+
+    Attributes:
+        end_s: since the first began, in [s].
+        resident_mb: memory at its end, in [MB].
+        quiet_us: lower quartile of the latency from scan to pattern, in [us]: of what else the machine does it shows
+            the least.
+        threads: at its end.
+        descriptors: open ones, at its end.
+        overruns: scans thrown away unseen, so far.
+    """
+
+    end_s: float
+    resident_mb: float
+    quiet_us: float
+    threads: int
+    descriptors: int
+    overruns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Soak:
+    """What a soak showed.
+
+    Attributes:
+        minutes: it lasted.
+        memory_mb_per_minute: least-squares slope of the memory.
+        memory_half: half of that slope's 95 % interval, in [MB per minute].
+        latency_ratio: of quiet latencies, last third to first, medians of windows.
+        windows: what it is made from.
+    """
+
+    minutes: float
+    memory_mb_per_minute: float
+    memory_half: float
+    latency_ratio: float
+    windows: tuple[Window, ...]
+
+
+def soak(minutes: float, tell: Callable[[str], None] = lambda text: None) -> Soak:
+    """Run the program for so long; at least three windows.
+
+    Raises:
+        BenchError: it ended before.
+    """
+    with tempfile.TemporaryDirectory() as folder, edge_sr(Path(folder), _PLAY) as program:
+        program.lines(WARM_UP_S)
+        windows: list[Window] = []
+        for window in _windows(program, max(3, round(60 * minutes / WINDOW_S))):
+            windows.append(window)
+            tell(f"soak: {window.end_s / 60:.1f} of {minutes:g} minutes")
+    return judged(windows)
+
+
+def judged(windows: Sequence[Window]) -> Soak:
+    """What so many windows, three at least, say."""
+    third = len(windows) // 3
+    first, last = (np.median([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))
+    slope, half = _slope([w.end_s / 60 for w in windows], [w.resident_mb for w in windows])
+    return Soak(windows[-1].end_s / 60, slope, half, float(last / first), tuple(windows))
+
+
+def _windows(program: Program, count: int) -> Iterator[Window]:
+    start_s = time.monotonic()
+    for _ in range(count):
+        lines = program.lines(WINDOW_S)
+        latencies_us = [line.record["latency_us"] for line in lines if line.record["latency_us"] is not None]
+        threads, descriptors = program.threads_and_descriptors()
+        overruns = lines[-1].record["counters"]["overruns"]
+        quiet_us = float(np.percentile(latencies_us, 25))
+        end_s = time.monotonic() - start_s
+        yield Window(end_s, program.resident_mb(), quiet_us, threads, descriptors, overruns)
+
+
+def _slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
+    """Least-squares slope, and half of its 95 % interval."""
+    centred = np.asarray(times) - np.mean(times)
+    slope = float(centred @ np.asarray(values) / (centred @ centred))
+    rest = np.asarray(values) - np.mean(values) - slope * centred
+    return slope, float(1.96 * np.sqrt(rest @ rest / (len(times) - 2) / (centred @ centred)))
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(asdict(soak(float(sys.argv[1])))))

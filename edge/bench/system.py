@@ -1,0 +1,214 @@
+"""The whole program, last byte of a scan to record: processor time, latency, losses, start-up, memory; row by row."""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge.bench.processes import STARTS, busy_core
+from edge.bench.program import Line, Play, Program, edge_sr, plain_loop
+from edge.bench.timing import Times, summary
+
+SETTLE_S: Final = 2.0
+ALL: Final = 500
+PLAIN, PLAIN_FAST = "plain loop, 100 Hz", "plain loop, 1000 Hz"
+IDLE, FAST = "at rest", "at rest, 1000 Hz"
+HELD, MOVING = "held still", "every scan new"
+TWO, TWO_RECORDED = "two sensors, every scan new", "two sensors, every scan new, recorded"
+TWO_BUSY = "two sensors, every scan new, recorded, other core busy"
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """Of the scans of a row: records without a pattern of their own, or none at all.
+
+    Attributes:
+        late: patterns later than one period after their scan.
+        dropped: overtaken by a newer scan before the inference.
+        overruns: scans thrown away unseen.
+        torn: taxels missing on the wire.
+    """
+
+    late: int
+    dropped: int
+    overruns: int
+    torn: int
+
+
+@dataclass(frozen=True, slots=True)
+class SystemRow:
+    """A run of the whole program.
+
+    Attributes:
+        name: what was played.
+        scans: in so many.
+        cpu_percent: processor time of all its threads, in [% of one core].
+        thread_percent: the same of each thread that takes any, the most first.
+        resident_mb: memory at the end, in [MB].
+        run_time: of the inference; None where there was none.
+        latency: from the last byte of a scan handed on to its record read by the bench; None where no records are read,
+            or scans were lost, so that nobody knows which is which.
+        losses: None where no records are read.
+        preempted: how often a thread lost its processor against its will.
+        others_percent: processor time of everything else on the machine, in [% of one core].
+        stolen_percent: what the host took away of all cores, in [% of one core].
+    """
+
+    name: str
+    scans: int
+    cpu_percent: float
+    thread_percent: tuple[float, ...]
+    resident_mb: float
+    run_time: Times | None
+    latency: Times | None
+    losses: Losses | None
+    preempted: int
+    others_percent: float
+    stolen_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class StartUp:
+    """Starts of the program: each from its spawn to the record of its first pattern, in [s], and the memory then."""
+
+    first_pattern_s: tuple[float, ...]
+    resident_mb: float
+
+
+def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
+    """Every row, of so many scans at 100 Hz and as much time at 1000; `tell` hears what is being measured.
+
+    Raises:
+        BenchError: a process ended.
+        UsageError: there is no second core to keep busy.
+    """
+    seconds = scans / 100
+    moving, two = Play(pressed=ALL, moving=True), Play(sensors=2, pressed=ALL, moving=True)
+    with tempfile.TemporaryDirectory() as folder_name:
+        folder = Path(folder_name)
+        for name, play in ((PLAIN, Play()), (PLAIN_FAST, Play(rate_hz=1000.0)), (IDLE, Play()), (TWO, two)):
+            tell(name)
+            plain, options = name in (PLAIN, PLAIN_FAST), ("--every-scan",) if play.moving else ()
+            with plain_loop(folder, play) if plain else edge_sr(folder, play, *options, sink="status") as program:
+                time.sleep(SETTLE_S)
+                usage = _Usage(program)
+                time.sleep(seconds)
+                yield _row(name, round(seconds * play.rate_hz * play.sensors), usage.since())
+        for name, play, options, busy in (
+            (HELD, Play(pressed=ALL), (), False),
+            (MOVING, moving, ("--every-scan",), False),
+            (TWO_RECORDED, two, ("--every-scan",), False),
+            (TWO_BUSY, two, ("--every-scan",), True),
+            (FAST, Play(rate_hz=1000.0), (), False),
+        ):
+            tell(name)
+            with busy_core() if busy else nullcontext(), edge_sr(folder, play, *options) as program:
+                program.lines(60.0, most=1)
+                program.lines(SETTLE_S)
+                usage, lines = _Usage(program), program.lines(seconds)
+                used = usage.since()
+            yield _recorded(name, lines, used, program.stamps_ns())
+
+
+def start_up() -> StartUp:
+    """Median of some starts, one after the other."""
+    took_s: list[float] = []
+    resident_mb: list[float] = []
+    with tempfile.TemporaryDirectory() as folder_name:
+        for _ in range(STARTS):
+            with edge_sr(Path(folder_name), Play(pressed=ALL)) as program:
+                took_s.append(program.first_pattern_s())
+                resident_mb.append(program.resident_mb())
+    return StartUp(tuple(took_s), float(np.median(resident_mb)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Used:
+    cpu_percent: float
+    thread_percent: tuple[float, ...]
+    resident_mb: float
+    preempted: int
+    others_percent: float
+    stolen_percent: float
+
+
+class _Usage:
+    """What a process takes from now on."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._threads, self._preempted, self._machine = program.thread_cpu_s(), program.preemptions(), _machine_s()
+        self._start_s = time.monotonic()
+
+    def since(self) -> _Used:
+        """Until now."""
+        took_s = time.monotonic() - self._start_s
+        now = self._program.thread_cpu_s()
+        percent = sorted((100 * (cpu_s - self._threads.get(task, 0.0)) / took_s for task, cpu_s in now.items()))[::-1]
+        busy, stolen = (
+            100 * (after - before) / took_s for after, before in zip(_machine_s(), self._machine, strict=True)
+        )
+        return _Used(
+            sum(percent),
+            tuple(share for share in percent if share >= 0.01),
+            self._program.resident_mb(),
+            self._program.preemptions() - self._preempted,
+            max(busy - sum(percent), 0.0),
+            stolen,
+        )
+
+
+def _machine_s() -> tuple[float, float]:
+    """Time that all cores were busy for this machine, and that the host took away, in [s]."""
+    ticks = [int(text) for text in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
+    user, nice, system, _, _, interrupts, soft_interrupts, stolen = (tick / 100 for tick in ticks[:8])
+    return user + nice + system + interrupts + soft_interrupts, stolen
+
+
+def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, list[int]]) -> SystemRow:
+    first, last = lines[0].record["counters"], lines[-1].record["counters"]
+    lost = {key: last[key] - first[key] for key in ("late", "dropped", "overruns", "torn_wire")}
+    run_times_us = [line.record["run_time_us"] for line in lines if line.record["run_time_us"] is not None]
+    told_apart = not (last["overruns"] or last["missing_taxels"] or last["duplicates"])
+    return _row(
+        name,
+        len(lines),
+        used,
+        run_time=summary([round(1e3 * run_time_us) for run_time_us in run_times_us]) if run_times_us else None,
+        latency=summary(latencies_ns(lines, stamps_ns)) if told_apart else None,
+        losses=Losses(lost["late"], lost["dropped"], lost["overruns"], lost["torn_wire"]),
+    )
+
+
+def latencies_ns(lines: list[Line], stamps_ns: dict[str, list[int]]) -> list[int]:
+    """From the handing on of each scan's last byte to its record, in [ns]; by number, so no scan may have been lost."""
+    return [line.time_ns - stamps_ns[line.record["sensor"]][line.record["scan"]] for line in lines]
+
+
+def _row(
+    name: str,
+    scans: int,
+    used: _Used,
+    *,
+    run_time: Times | None = None,
+    latency: Times | None = None,
+    losses: Losses | None = None,
+) -> SystemRow:
+    return SystemRow(
+        name=name,
+        scans=scans,
+        cpu_percent=used.cpu_percent,
+        thread_percent=used.thread_percent,
+        resident_mb=used.resident_mb,
+        run_time=run_time,
+        latency=latency,
+        losses=losses,
+        preempted=used.preempted,
+        others_percent=used.others_percent,
+        stolen_percent=used.stolen_percent,
+    )

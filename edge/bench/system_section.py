@@ -1,0 +1,96 @@
+"""The bench's section on the whole program."""
+
+from typing import Final
+
+from edge.bench.page import Page
+from edge.bench.record import Record, SystemRecord
+from edge.bench.soak import Soak, soak
+from edge.bench.system import SystemRow, rows, start_up
+from edge.bench.tables import head, line
+from edge.bench.timing import Times
+from edge.bench.verdicts import Verdict, verdicts
+
+COLUMNS: Final = (
+    *("played", "scans", "CPU %", "by threads", "MB"),
+    *("inference p50 us", "p99", "p99.9", "max"),
+    *("last byte to record p50 us", "p99", "p99.9", "max"),
+    *("late", "dropped", "overrun", "torn", "preempted", "others %", "host took %"),
+)
+_TEXT: Final = (
+    "edge-sr in a process of its own reads emulated sensors, a process too, over a pseudo-terminal; STSR, on one "
+    "thread. CPU is of all its threads, by the scheduler, in % of one core. Times are from the moment the last byte of "
+    "a scan is handed on to the moment the bench has read its record, some 25 kB of JSON, from a pipe; rows without "
+    "them have the status line alone. The plain loop reads the same bytes with pyserial and does nothing with them. "
+    "Others: what all else on this machine took, emulator and bench included."
+)
+
+
+def show_system(scans: int, soak_minutes: float | None, record: Record, page: Page) -> None:
+    """Measure, show and keep it.
+
+    Raises:
+        BenchError: a process ended.
+        UsageError: there is no second core to keep busy.
+    """
+    told = record.system = SystemRecord()
+    page.section("The whole program", _TEXT, head(COLUMNS))
+    for row in rows(scans, page.progress):
+        told.rows.append(row)
+        page.say(row_line(row))
+    page.progress("start-up")
+    told.start_up = start_up()
+    starts = ", ".join(f"{took_s:.2f}" for took_s in told.start_up.first_pattern_s)
+    page.say(f"\nStart to the record of the first pattern: {starts} s; {told.start_up.resident_mb:.0f} MB by then.")
+    told.verdicts += verdicts({row.name: row for row in told.rows}, told.start_up)
+    page.section("Targets", "Measured in this run.", head(("target", "measured", "held", "limited by")))
+    for verdict in told.verdicts:
+        page.say(verdict_line(verdict))
+    if soak_minutes is not None:
+        told.soak = soak(soak_minutes, page.progress)
+        page.say(f"\n## Soak\n\n{soak_text(told.soak)}")
+
+
+def row_line(row: SystemRow) -> str:
+    """A run as a row of the table."""
+    losses = ("-",) * 4
+    if row.losses is not None:
+        losses = tuple(
+            str(count) for count in (row.losses.late, row.losses.dropped, row.losses.overruns, row.losses.torn)
+        )
+    return line(
+        (
+            row.name,
+            str(row.scans),
+            f"{row.cpu_percent:.2f}",
+            " + ".join(f"{share:.2f}" for share in row.thread_percent),
+            f"{row.resident_mb:.0f}",
+            *_times(row.run_time),
+            *_times(row.latency),
+            *losses,
+            str(row.preempted),
+            f"{row.others_percent:.0f}",
+            f"{row.stolen_percent:.1f}",
+        )
+    )
+
+
+def verdict_line(verdict: Verdict) -> str:
+    """A target as a row of the table."""
+    return line((verdict.target, verdict.measured, "yes" if verdict.held else "no", verdict.limited_by))
+
+
+def soak_text(found: Soak) -> str:
+    """What a soak showed, in a few sentences."""
+    first, last = found.windows[0], found.windows[-1]
+    return (
+        f"{found.minutes:.1f} minutes, rest and a moving contact in turns of 2.5 s: memory {first.resident_mb:.1f} to "
+        f"{last.resident_mb:.1f} MB, {found.memory_mb_per_minute:+.3f} MB a minute (+- {found.memory_half:.3f}, 95 %); "
+        f"lower quartile of the latency, last third to first: {found.latency_ratio:.3f}; threads {first.threads} to "
+        f"{last.threads}, descriptors {first.descriptors} to {last.descriptors}, {last.overruns} overrun."
+    )
+
+
+def _times(times: Times | None) -> tuple[str, ...]:
+    if times is None:
+        return ("-",) * 4
+    return tuple(f"{value:.0f}" for value in (times.p50_us, times.p99_us, times.p999_us, times.max_us))

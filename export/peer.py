@@ -1,0 +1,76 @@
+"""A network of the registry with random weights as an ONNX file, to hold run times against.
+
+python -m export.peer mtsr4 --out seed-mtsr4.onnx
+edge-sr bench --against seed-mtsr4.onnx
+
+It has no contract, so no runtime takes it for a model, and says in its metadata that nobody trained it. Of a trained
+checkpoint `export.to_onnx` makes a model that `edge-sr bench --against` takes as well.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from edge.bench.subjects import WEIGHTS_KEY
+from export.errors import ExportError
+from export.graph import to_model
+from export.rounding import folded
+from firmware_bridge.geometry import USPA44
+from train.networks.cost import macs, parameters_count
+from train.networks.registry import NETWORKS, build
+
+SCALE: Final = 10
+
+
+def export_peer(name: str, path: Path, seed: int = 0, scale: int = SCALE) -> str:
+    """Write a network that nobody trained, and say in a line what it is.
+
+    Args:
+        name: one of train.networks.registry.NETWORKS.
+        path: where it goes.
+        seed: of its weights.
+        scale: pattern pixels per taxel pitch.
+
+    Raises:
+        ValueError: no network of that name, or the scale is out of range.
+        ExportError: torch gives no graph.
+        OSError: the file cannot be written.
+    """
+    torch.manual_seed(seed)
+    net = folded(build(name, scale).eval())
+    new = not path.exists()
+    path.touch()  # one that cannot be written is told before the work, not after it
+    try:
+        model = to_model(net, USPA44)
+    except ExportError:
+        if new:
+            path.unlink()
+        raise
+    model.metadata_props.add(key=WEIGHTS_KEY, value=f"random, of {name}, seed {seed}")
+    content = model.SerializeToString(deterministic=True)
+    path.write_bytes(content)
+    work = f"{parameters_count(net) / 1e6:.2f} M weights, {macs(net) / 1e6:.1f} MMAC"
+    return f"{path}: {name} x{scale}, {work}, {len(content) / 1e6:.2f} MB, weights random, seed {seed}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m export.peer", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("network", choices=NETWORKS, metavar="NETWORK", help=f"one of {', '.join(NETWORKS)}")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .onnx file to write")
+    parser.add_argument("--seed", type=int, default=0, help="of the weights (default: 0)")
+    parser.add_argument("--scale", type=int, default=SCALE, help=f"pixels per taxel pitch (default: {SCALE})")
+    options = parser.parse_args(arguments)
+    try:
+        sys.stdout.write(export_peer(options.network, options.out, options.seed, options.scale) + "\n")
+    except (ExportError, ValueError) as error:
+        sys.exit(f"peer: {error}")
+    except OSError as error:
+        sys.exit(f"peer: {error.filename}: {error.strerror}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""The whole program for a minute, or EDGE_SOAK_MINUTES; `make test` runs it beside the other tests.
+
+So nothing is asserted that these can do to it: no time, and of latency only that its quiet quarter has not grown beyond
+what they may take.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from edge_samples import ROOT
+
+from edge.bench.soak import Window, judged
+
+MINUTES = float(os.environ.get("EDGE_SOAK_MINUTES", "1"))
+
+STILL = [Window(5.0 * (n + 1), 78.0 + 0.1 * (n % 2), 1000.0 + 100 * (n % 3), 3, 9, 0) for n in range(12)]
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(60 * MINUTES + 240)
+def test_memory_stays_flat_and_latency_does_not_drift():
+    command = [sys.executable, "-m", "edge.bench.soak", str(MINUTES)]
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["minutes"] >= 0.95 * MINUTES
+    windows = found["windows"]
+    assert found["memory_mb_per_minute"] - found["memory_half"] < 0.2, found
+    assert max(window["resident_mb"] for window in windows) < 100
+    assert found["latency_ratio"] < 5, found
+    assert {(window["threads"], window["descriptors"]) for window in windows} == {
+        (windows[0]["threads"], windows[0]["descriptors"])
+    }
+    assert windows[-1]["overruns"] == 0
+
+
+def test_what_does_not_change_is_flat():
+    found = judged(STILL)
+    assert found.minutes == 1.0
+    assert abs(found.memory_mb_per_minute) < found.memory_half < 0.2
+    assert found.latency_ratio == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_leak_and_a_drift_are_seen_by_what_they_are():
+    leaking = judged([replace(window, resident_mb=78.0 + 0.04 * n) for n, window in enumerate(STILL)])
+    assert leaking.memory_mb_per_minute == pytest.approx(12 * 0.04)
+    assert leaking.memory_half == pytest.approx(0.0, abs=1e-6)
+    drifting = judged([replace(window, quiet_us=1000.0 * 1.1**n) for n, window in enumerate(STILL)])
+    assert drifting.latency_ratio == pytest.approx(1.1**8)
