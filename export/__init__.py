@@ -1,1 +1,3 @@
 """Checkpoints to single-file ONNX models with a contract: the only place that knows torch and ONNX."""
+
+import edge  # noqa: F401  before onnxruntime, whose telemetry it switches off

@@ -1,4 +1,4 @@
-"""Networks to ONNX graphs: fixed shapes, one file, nothing of the machine they were made on."""
+"""Networks to ONNX graphs: fixed shapes but for the batch, one file, nothing of the machine they were made on."""
 
 import logging
 import warnings
@@ -14,19 +14,27 @@ from firmware_bridge.geometry import SensorGeometry
 from train.networks.blocks import PatternNet
 
 OPSET: Final = 18
+_TRACED: Final = 2
+"""Windows that a graph of any batch is traced with: of one, the tracer would take the one for granted."""
 
 
-def to_model(net: PatternNet, geometry: SensorGeometry, batch: int = 1) -> onnx.ModelProto:
-    """The network as an ONNX graph of a fixed batch, checked, without a contract yet.
+def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) -> onnx.ModelProto:
+    """The network as an ONNX graph, checked, without a contract yet.
 
     The exporter folds batch normalisation into the convolutions before it.
+
+    Args:
+        net: in evaluation mode.
+        geometry: of the sensor.
+        batch: windows in one run, or ANY_BATCH; onnxruntime is no slower for not knowing it.
 
     Raises:
         ExportError: the batch is not positive, or torch gives no graph.
     """
-    if batch < 1:
+    if not isinstance(batch, str) and batch < 1:
         raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
-    example = torch.zeros(batch, 3 * net.taps, geometry.rows, geometry.cols)
+    traced = _TRACED if isinstance(batch, str) else batch
+    example = torch.zeros(traced, 3 * net.taps, geometry.rows, geometry.cols)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not there
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch's own, about torch's own
@@ -37,6 +45,7 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int = 1) -> onnx.
             opset_version=OPSET,
             input_names=[INPUT_NAME],
             output_names=[OUTPUT_NAME, DEVIATION_NAME][: len(outputs(net, example))],
+            dynamic_shapes=({0: torch.export.Dim(batch)},) if isinstance(batch, str) else None,
             verbose=False,
         )
     if program is None:

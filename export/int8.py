@@ -75,7 +75,7 @@ def quantised(model: onnx.ModelProto, windows: NDArray[np.float32], *, every: bo
     Raises:
         ExportError: nothing in the graph may be done in integers.
     """
-    nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value
+    nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
     if not nodes:
         raise ExportError("no convolution of the graph may be done in integers: export it without --int8")
     with tempfile.TemporaryDirectory() as drafts, _quiet():

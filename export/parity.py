@@ -73,7 +73,8 @@ class GraphRun:
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
-        self._batch = self._session.get_inputs()[0].shape[0]
+        batch = self._session.get_inputs()[0].shape[0]
+        self._batch = batch if isinstance(batch, int) else 1
         self.outputs: list[str] = [output.name for output in self._session.get_outputs()]
 
     def __call__(self, windows: NDArray[np.float32]) -> list[NDArray[np.float32]]:

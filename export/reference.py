@@ -14,15 +14,13 @@ import onnx
 import torch
 from onnx import numpy_helper
 
+from edge.bundle import INT8_SUFFIX
 from edge.contract import Contract
 from export.errors import ExportError
 from train.networks.blocks import PatternNet
 from train.networks.registry import build
 
 ORIGIN_KEY: Final = "tactile.origin"
-
-
-INT8_SUFFIX: Final = "-int8"
 
 
 def contract_in(model: onnx.ModelProto) -> Contract:
@@ -42,7 +40,7 @@ def in_float(path: Path) -> Path:
 def origin(report: Mapping[str, Any]) -> dict[str, str]:
     """Metadata that tell which network a graph is, of what a checkpoint's report says.
 
-    What was trained on for integers is still of the network that it was trained on from.
+    Training for integers makes other weights, and so another network.
     """
     told = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
     return {ORIGIN_KEY: json.dumps(told, sort_keys=True)}

@@ -21,7 +21,7 @@ import torch
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR
+from edge.bundle import BUNDLE_DIR, INT8_SUFFIX
 from edge.contract import Contract
 from edge.errors import EdgeError, ModelError
 from edge.frozen import FrozenSet, load_frozen_set
@@ -30,7 +30,7 @@ from export.errors import ExportError, ParityError
 from export.graph import outputs
 from export.parity import LEVELS, TOLERANCE, Difference, GraphRun, differences, extreme_windows, read_windows
 from export.recordings import recorded_windows
-from export.reference import INT8_SUFFIX, contract_in, in_float, network_of, origin_of
+from export.reference import contract_in, in_float, network_of, origin_of
 from export.to_onnx import MOST_LOSS_DB
 from train.errors import TrainError
 from train.networks.blocks import PatternNet
@@ -40,8 +40,10 @@ _TORCH_BATCH: Final = 128
 INT8_READ: Final = 0.25
 """Largest relative difference of integers from their network on readings, in any pixel; measured: .10 on the test set,
 .17 on recordings."""
-INT8_EXTREME: Final = 0.5
-"""On windows beyond any touch: against nonsense, not an accuracy."""
+INT8_EXTREME: Final = 0.75
+"""On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
+FLOAT_EXTREME: Final = 2e-5
+"""Of float32 on the same windows; measured: 1.04e-5 at the full range, negative, not optimised."""
 READINGS: Final = ("test set", "recordings")
 
 
@@ -132,7 +134,7 @@ def _judge(
     if truth is not None:
         change_db = float((psnr_db(given[0], truth, full_scale) - psnr_db(expected[0], truth, full_scale)).mean())
     broken, largest = "", max(found, key=lambda difference: difference.relative)
-    bound = TOLERANCE
+    bound = TOLERANCE if windows in READINGS else FLOAT_EXTREME
     if contract.arithmetic == "int8":
         bound = INT8_READ if windows in READINGS else INT8_EXTREME
     if not largest.relative <= bound:

@@ -8,7 +8,7 @@ import torch
 from onnx import numpy_helper
 from test_dataset import make_sequences
 
-from edge.contract import CONTRACT_VERSION, Contract
+from edge.contract import ANY_BATCH, CONTRACT_VERSION, Contract
 from edge.errors import ModelError
 from edge.frozen import FrozenSet
 from edge.judge import judge, judge_model, mean_error
@@ -157,16 +157,26 @@ def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp
     assert not list(tmp_path.iterdir())
 
 
-def test_a_batch_is_one_run_of_many_windows(folder, frozen, tmp_path):
-    export(folder / "sure.pt", tmp_path, frozen, batch=3)
+@pytest.mark.parametrize("batch", [3, ANY_BATCH])
+def test_a_batch_is_one_run_of_many_windows(folder, frozen, tmp_path, batch):
+    export(folder / "sure.pt", tmp_path, frozen, batch=batch)
     model = onnx.load(tmp_path / "sure.onnx")
     contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
-    assert contract.batch == 3 and contract.window_shape == (3, 6, 4, 4)
+    assert contract.batch == batch and contract.window_shape == (batch, 6, 4, 4)
     windows = read_windows(frozen, contract)[:7]
     single = GraphRun(onnx.load(folder / "sure.onnx"))
     for together, alone in zip(GraphRun(model)(windows), single(windows), strict=True):
         np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-7)
-    with pytest.raises(ModelError, match=r"'batch' is 3, .* export it without --batch"):
+
+
+def test_the_runtime_takes_any_batch_and_refuses_another_than_one(folder, frozen, tmp_path):
+    export(folder / "sure.pt", tmp_path, frozen, batch=ANY_BATCH)
+    session, contract = ModelSession(tmp_path / "sure.onnx"), ModelSession(folder / "sure.onnx").contract
+    windows = [contract.scale_window(window) for window in frozen.windows(2)[:3]]
+    together = session.run_together(windows).copy()
+    np.testing.assert_allclose(together, [session.run(window).copy() for window in windows], rtol=1e-5, atol=1e-7)
+    export(folder / "sure.pt", tmp_path, frozen, batch=3)
+    with pytest.raises(ModelError, match=r"'batch' is 3, .* export it with --batch any"):
         ModelSession(tmp_path / "sure.onnx")
     with pytest.raises(ExportError, match="a batch of 0 asked for"):
         export(folder / "sure.pt", tmp_path, frozen, batch=0)
@@ -233,11 +243,16 @@ def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, m
         SystemExit, match=r"^export: integers cost too much in one-int8\.onnx .*: use the float32 model"
     ):
         main(command)
-    line = capsys.readouterr().out
+    *before, line = capsys.readouterr().out.splitlines()
     assert line.startswith("one-int8.onnx") and "fine-tuned 2 steps" in line
     contract = ModelSession(tmp_path / "one-int8.onnx").contract
     assert contract.arithmetic == "int8"
     assert (contract.training_sha256 == "ab" * 32) == ("not taken" in line)
+    # What was trained on comes in float32, too: integers alone could not be compared with what they are of.
+    assert [text.partition(":")[0] for text in before] == ([] if "not taken" in line else ["one.onnx"])
+    for _ in before:
+        in_float = ModelSession(tmp_path / "one.onnx").contract
+        assert (in_float.arithmetic, in_float.training_sha256) == ("float32", contract.training_sha256)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,8 @@ def save(model, path):
 
 
 def test_every_network_is_bundled_in_both_arithmetics():
-    assert IN_FLOAT and [f"{name}-int8" for name in IN_FLOAT] == IN_INTEGERS
+    in_float = {name for name in MODELS if not name.endswith("-int8")}
+    assert in_float and set(MODELS) == in_float | {f"{name}-int8" for name in in_float}
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -64,7 +65,7 @@ def test_every_bundled_model_keeps_every_bound_at_every_level(name):
 @pytest.mark.parametrize("name", IN_INTEGERS)
 def test_integers_cost_a_tenth_of_a_decibel_at_most(name):
     lost_db = [-row.psnr_change_db for row in rows(name) if row.psnr_change_db is not None]
-    assert len(lost_db) == len(LEVELS) and 0 < max(lost_db) <= 0.1
+    assert len(lost_db) == len(LEVELS) and min(lost_db) > -0.1 and max(lost_db) <= 0.1
     session, in_float = (ModelSession(find_model(each)) for each in (name, name.removesuffix("-int8")))
     taps = str(session.contract.taps)
     said_db = in_float.contract.test_error[taps]["psnr_db"] - session.contract.test_error[taps]["psnr_db"]
@@ -76,7 +77,7 @@ def test_integers_cost_a_tenth_of_a_decibel_at_most(name):
 def test_most_convolutions_run_in_integers(name):
     model, _ = graph_of(name)
     integer, every = convolutions(model)
-    assert integer >= 14 and every == 23
+    assert 2 * integer > every >= 19
     assert convolutions(graph_of(name.removesuffix("-int8"))[0])[0] == 0
     assert {output.type.tensor_type.elem_type for output in model.graph.output} == {onnx.TensorProto.FLOAT}
 

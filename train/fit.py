@@ -5,7 +5,8 @@
     python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start seed-stsr --steps 5000
 
 A base network of seven taps is trained from nothing; each bundled one starts as that network, with its own number of
-taps, and is trained on. Older taps drop out at random in training, so a network is right with fewer taps than it takes.
+taps, and is trained on. The small one is trained from nothing. Older taps drop out at random in training, so a network
+is right with fewer taps than it takes.
 A run that was cut short goes on where it was. `tensorboard --logdir checkpoints/logs` shows how it goes.
 """
 
@@ -36,6 +37,7 @@ BUNDLED: Final = tuple(
     )
     for name, taps, steps in (("mtsr4", 4, 2000), ("mtsr2", 2, 1000), ("stsr", 1, 1000))
 )
+SMALL: Final = Training("stsr-small", "small-stsr", Recipe(steps=16_000, bf16=True))
 
 
 def given_taps(taps: int) -> tuple[float, ...]:
@@ -49,7 +51,7 @@ def given_taps(taps: int) -> tuple[float, ...]:
 def fit_bundled(data: Sequences, folder: Path, shorten: int = 1) -> None:
     """Train the base, then the bundled networks from it; `shorten` divides their steps, for tests."""
     validation = freeze(held_out("validation", taps=data.taps), Nuisances(), SEED)
-    for training in (BASE, *BUNDLED):
+    for training in (BASE, *BUNDLED, SMALL):
         _say(_line(fit_network(_shortened(training, shorten), data, validation, folder)))
 
 
@@ -112,7 +114,7 @@ def _training(options: argparse.Namespace) -> Training:
 
 def _name(network: str) -> str:
     """Not that of a bundled one, which a network of the paper must not overwrite."""
-    return network if network.startswith("compact-") else f"seed-{network}"
+    return network if network.startswith(("compact-", "small-")) else f"seed-{network}"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bundle import DEFAULT_MODEL, find_model
+from edge.bundle import DEFAULT_MODEL, TAXELS, find_model
+from edge.estimate import load_estimator
 from edge.result import Result
 from edge.runtime import Runtime
 from edge.session import ModelSession
@@ -98,7 +99,8 @@ def _play(readings: Iterable[NDArray[np.int32]], infer: bool = True, clip: bool 
         infer: make patterns.
         clip: beyond the end of its range a chip stays there; else its 16 bits wrap round.
     """
-    runtime = Runtime(ModelSession(find_model(DEFAULT_MODEL)), source="replay")
+    estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
+    runtime = Runtime(ModelSession(find_model(DEFAULT_MODEL)), source="replay", estimator=estimator)
     series = ScanSeries("4", USPA44)
     period_ns = int(_NS / RATE_HZ)
     for number, counts in enumerate(readings):

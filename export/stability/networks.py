@@ -23,7 +23,7 @@ FLOAT: Final = 1e-5
 INT8: Final = {"zeros": 1e-3, "denormals": 1e-3, "a count in one taxel": 1e-3, "one hot taxel": 0.1}
 """The same for integers; presses with some of the taps by INT8_PRESS, what is beyond any touch by INT8_BEYOND."""
 INT8_PRESS: Final = 0.05
-INT8_BEYOND: Final = 0.5
+INT8_BEYOND: Final = 0.75
 """Ranges were taken of touches that happen: a bound against nonsense, not an accuracy."""
 
 

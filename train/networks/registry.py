@@ -11,11 +11,15 @@ from train.networks.srgan import TactileSRGAN
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 
+_SMALL: Final = {"channels": 32, "blocks": 4}
+"""A compact network of a quarter of the work, for a budget that the other does not fit."""
+
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
     "srgan": (TactileSRGAN, {}),
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
     **{f"compact-{name}": (CompactNet, {"taps": taps}) for name, taps in _TAPS.items()},
+    **{f"small-{name}": (CompactNet, {"taps": taps} | _SMALL) for name, taps in _TAPS.items()},
 }
 """Name to class and what the name says."""
 

@@ -1,0 +1,91 @@
+"""A model written: judged on the frozen test set, told what its deviations say, and said in a line."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from edge.contract import ANY_BATCH, Contract
+from edge.frozen import FrozenSet
+from edge.judge import judge_model, mean_error
+from edge.session import ModelSession
+from export.reference import origin
+from train.confidence import confidence_sets, fit_confidence
+from train.dataset import Sequences
+
+
+@dataclass(frozen=True, slots=True)
+class Writer:
+    """What all models of a checkpoint are written with.
+
+    Errors are those of a batch of one, in the runtime's own session; a model of another scale than the frozen set's is
+    not judged.
+
+    Attributes:
+        folder: where they go.
+        frozen: the test set.
+        validation: flat sequences on which is found what deviations tell; without, the contract's confidence stays
+            empty.
+        report: of the checkpoint.
+    """
+
+    folder: Path
+    frozen: FrozenSet
+    validation: Sequences | None
+    report: Mapping[str, Any]
+
+    def error(self, single: onnx.ModelProto, contract: Contract) -> dict[str, float]:
+        """Mean errors of a graph of a batch of one, all taps given; empty where it is not judged."""
+        if contract.scale != self.frozen.scale:
+            return {}
+        return mean_error(judge_model(self._session("judged", single, replace(contract, batch=1)), self.frozen))
+
+    def write(
+        self, name: str, model: onnx.ModelProto, single: onnx.ModelProto, contract: Contract, facts: Sequence[str]
+    ) -> str:
+        """Write NAME.onnx; returns the line that says what it is.
+
+        Args:
+            name: of the model.
+            model: its graph.
+            single: the same of a batch of one.
+            contract: its error and confidence not yet known; they are filled in.
+            facts: further ones to say.
+        """
+        # What is judged is what is written, wherever the runtime can run it.
+        session = self._session(name, model if contract.batch == ANY_BATCH else single, contract)
+        said = [f"x{contract.scale}"]
+        if contract.scale == self.frozen.scale:
+            for given in range(1, contract.taps + 1):
+                contract.test_error[str(given)] = mean_error(judge_model(session, self.frozen, given))
+            error = contract.test_error[str(contract.taps)]
+            said.append(f"{error['psnr_db']:.2f} dB, SSIM {error['ssim']:.3f}")
+            if "coverage_90" in error:
+                said.append(f"interval covers {error['coverage_90']:.1%}")
+        else:
+            said.append(f"not judged, the test set is of x{self.frozen.scale}")
+        if self.validation is not None and session.deviation is not None:
+            contract.confidence.update(fit_confidence(session, confidence_sets(self.validation, contract.scale)))
+        content = self._bytes(model, contract)
+        Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # as the runtime will
+        (self.folder / f"{name}.onnx").write_bytes(content)
+        return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*said, *facts])}"
+
+    def _session(self, name: str, single: onnx.ModelProto, contract: Contract) -> ModelSession:
+        with tempfile.TemporaryDirectory() as drafts:
+            draft = Path(drafts) / f"{name}.onnx"
+            batch = contract.batch if contract.batch == ANY_BATCH else 1
+            draft.write_bytes(self._bytes(single, replace(contract, batch=batch)))
+            return ModelSession(draft)
+
+    def _bytes(self, model: onnx.ModelProto, contract: Contract) -> bytes:
+        """The file's content, the same for the same model and contract."""
+        del model.metadata_props[:]
+        for key, value in (
+            contract.to_metadata() | origin({**self.report, "training_sha256": contract.training_sha256})
+        ).items():
+            model.metadata_props.add(key=key, value=value)
+        return model.SerializeToString(deterministic=True)

@@ -1,0 +1,108 @@
+"""What a pattern's doubt says of its error, and the table that says it."""
+
+import numpy as np
+import pytest
+from edge_samples import make_contract
+
+from edge.bundle import BUNDLE_DIR, bundled_models
+from edge.confidence import Expected, doubt, expect, is_confidence
+from edge.frozen import load_frozen_set
+from edge.session import ModelSession
+from train.confidence import BINS, doubts_and_errors, fit_confidence
+
+TABLE = {
+    "1": {"doubt": [0.1, 0.3], "error": [0.2, 0.4], "gain": [0.0, 0.1]},
+    "2": {"doubt": [0.1, 0.3], "error": [0.1, 0.3], "gain": []},
+}
+
+
+def maps(about, size=0.5):
+    """A pattern of that RMS, and its deviation."""
+    pattern = np.full((40, 40), size, dtype=np.float32)
+    return pattern, about * pattern
+
+
+@pytest.mark.parametrize(
+    ("about", "share", "gain"), [(0.05, 0.2, 0.0), (0.1, 0.2, 0.0), (0.2, 0.3, 0.05), (0.3, 0.4, 0.1), (0.6, 0.8, 0.1)]
+)
+def test_between_doubts_it_is_interpolated_and_beyond_them_the_error_grows(about, share, gain):
+    expected = expect(TABLE, 1, *maps(about))
+    assert expected.rmse == pytest.approx(0.5 * share, rel=1e-4) and expected.gain == pytest.approx(gain, abs=1e-6)
+
+
+def test_what_is_not_known_is_not_told():
+    assert expect(TABLE, 3, *maps(0.2)) is None and expect({}, 1, *maps(0.2)) is None
+    last = expect(TABLE, 2, *maps(0.2))
+    assert last.gain is None and last.another_tap is None
+    assert Expected(0.1, 0.02).another_tap is True and Expected(0.1, 0.019).another_tap is False
+
+
+def test_of_a_pattern_of_nothing_nothing_is_known():
+    nothing = np.zeros((40, 40), dtype=np.float32)
+    assert doubt(nothing, nothing + 1) == (np.inf, 0.0)
+    assert expect(TABLE, 1, nothing, nothing + 1) is None
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        {"1": None},
+        {"5": TABLE["1"]},
+        {"one": TABLE["1"]},
+        {"1": {**TABLE["1"], "doubt": [0.3, 0.1]}},
+        {"1": {**TABLE["1"], "doubt": [0.0, 0.1]}},
+        {"1": {**TABLE["1"], "doubt": []}},
+        {"1": {**TABLE["1"], "error": [0.1]}},
+        {"1": {**TABLE["1"], "gain": [0.1]}},
+        {"1": {**TABLE["1"], "gain": [0.1, True]}},
+        {"1": {"doubt": [0.1], "error": [0.1]}},
+    ],
+)
+def test_other_values_are_no_table(value):
+    assert is_confidence(TABLE, 2) and is_confidence({}, 4)
+    assert not is_confidence(value, 4)
+
+
+class Oracle:
+    """Gives a truth that is off by a share that its deviation tells, less with each tap."""
+
+    name, contract = "oracle", make_contract(taps=2, interval_factor=1.6, counts_per_unit=(1.0, 1.0, 1.0))
+
+    def __init__(self, frozen):
+        self.deviation = np.zeros((40, 40), dtype=np.float32)
+        self._truth = {frozen.newest[index].tobytes(): truth for index, truth in enumerate(frozen.patterns())}
+        self._rng = np.random.default_rng(1)
+        self._shares = dict.fromkeys(self._truth, 0.0)
+        for key in self._shares:
+            self._shares[key] = self._rng.uniform(0.05, 0.5)
+
+    def run(self, window):
+        key = window[0].astype(np.int16).tobytes()
+        share = self._shares[key]
+        pattern = self._truth[key] * (1 + share * (1 - share * bool(window[1].any())))
+        self.deviation = np.full_like(pattern, share * np.sqrt(np.mean(pattern**2)))
+        return pattern
+
+
+def test_the_table_finds_error_and_gain_by_doubt():
+    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    table = fit_confidence(Oracle(frozen), [frozen])
+    assert set(table) == {"1", "2"} and len(table["1"]["doubt"]) == BINS and table["2"]["gain"] == []
+    assert is_confidence(table, 2)
+    for about, error, gain in zip(*table["1"].values(), strict=True):
+        assert error == pytest.approx(about / (1 + about), rel=0.02)
+        assert gain == pytest.approx(about, rel=0.05)
+
+
+@pytest.mark.parametrize("path", bundled_models(), ids=lambda path: path.stem)
+def test_of_the_frozen_test_set_the_expected_error_is_near_the_true_one(path):
+    """The table was found at another position; the bound is what a bundled network may be off by."""
+    session, frozen = ModelSession(path), load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    about, error, size = doubts_and_errors(session, 1, frozen)
+    told = session.contract.confidence["1"]
+    expected = np.interp(about, told["doubt"], told["error"]) * size
+    assert expected.mean() == pytest.approx(error.mean(), rel=0.1)
+    assert np.corrcoef(expected, error)[0, 1] > 0.8
+    for part in np.array_split(np.argsort(expected), 4):
+        assert expected[part].mean() == pytest.approx(error[part].mean(), rel=0.25)

@@ -1,0 +1,81 @@
+"""What a network's deviations tell of its error, found on taps that it was not trained on: see edge.confidence."""
+
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.confidence import doubt
+from edge.frozen import FrozenSet
+from edge.runtime import Model
+from train.dataset import Sequences
+from train.freeze import SEED, freeze
+from train.nuisances import Nuisances
+
+BINS: Final = 10
+_SET_FORCES_N: Final = (5.0, 2.0, 1.0)
+"""Of the taps: as on the frozen test set, and lighter ones, which say less."""
+
+
+def confidence_sets(validation: Sequences, scale: int) -> list[FrozenSet]:
+    """The sets that confidence is found on, at a network's scale, of flat sequences that it was not trained on."""
+    return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in _SET_FORCES_N]
+
+
+def fit_confidence(model: Model, sets: Iterable[FrozenSet]) -> dict[str, dict[str, list[float]]]:
+    """The table of edge.confidence for a model with deviations.
+
+    Frames are sorted by their doubt into bins of equally many; a bin's gain is that of its frames together.
+
+    Raises:
+        ValueError: the model gives no deviation.
+    """
+    taps = model.contract.taps
+    parts = [[doubts_and_errors(model, given, frozen) for given in range(1, taps + 1)] for frozen in sets]
+    found = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
+    rows = {str(given): _row(found[given - 1 : given + 1]) for given in range(1, taps + 1)}
+    return {given: row for given, row in rows.items() if row["doubt"]}  # none where no pattern is more than zero
+
+
+def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np.float64]:
+    """Doubt, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
+
+    Raises:
+        ValueError: the model gives no deviation.
+    """
+    rows, contract = [], model.contract
+    for window, truth in zip(frozen.windows(contract.taps, given), frozen.patterns(), strict=True):
+        pattern, deviation = model.run(contract.scale_window(window)), model.deviation
+        if deviation is None:
+            raise ValueError(f"model '{model.name}' gives no deviation: there is nothing to be told of its errors")
+        about, size = doubt(pattern, deviation)
+        rows.append((about, float(np.sqrt(np.mean((pattern - truth) ** 2))), size))
+    return np.array(rows).T
+
+
+def _rising(bins: list[NDArray[np.intp]], about: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+    """Bins of which each lies above the one before, as far as four digits tell; others are joined."""
+    joined: list[NDArray[np.intp]] = []
+    for part in bins:
+        if joined and float(f"{about[part].mean():.4g}") <= float(f"{about[joined[-1]].mean():.4g}"):
+            joined[-1] = np.concatenate([joined[-1], part])
+        else:
+            joined.append(part)
+    return joined
+
+
+def _row(found: list[NDArray[np.float64]]) -> dict[str, list[float]]:
+    about, error, size = found[0]
+    seen = size > 0  # a pattern of nothing has no doubt of its own size
+    about, share = about[seen], error[seen] / size[seen]
+    bins = _rising([part for part in np.array_split(np.argsort(about), BINS) if part.size], about)
+    row = {
+        "doubt": [float(about[part].mean()) for part in bins],
+        "error": [float(share[part].mean()) for part in bins],
+        "gain": [],
+    }
+    if len(found) == 2:
+        later = found[1][1][seen] / size[seen]
+        row["gain"] = [float(1 - later[part].sum() / share[part].sum()) for part in bins]
+    return {name: [float(f"{value:.4g}") for value in values] for name, values in row.items()}
