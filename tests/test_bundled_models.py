@@ -13,7 +13,7 @@ from edge.judge import by_surface, judge, judge_model, mean_error
 from edge.session import ModelSession
 from firmware_bridge.geometry import USPA44
 
-IN_FLOAT = ("stsr", "mtsr2", "mtsr4")
+IN_FLOAT = ("stsr", "stsr-small", "mtsr2", "mtsr4")
 NAMES = (*IN_FLOAT, *(f"{name}-int8" for name in IN_FLOAT))
 
 
@@ -85,7 +85,7 @@ def test_wrong_earlier_taps_cost_more_than_right_ones_give():
     for earlier, least_cost_db in ((np.roll(frozen().earlier, 28, axis=0), 3), (ends, 0.2)):
         wrong = judge_model(session, replace(frozen(), earlier=earlier))
         assert wrong["psnr_db"].mean() < psnr_db("stsr", 1) - least_cost_db
-    assert DEFAULT_MODEL == "stsr"
+    assert DEFAULT_MODEL == "stsr-int8"
 
 
 @pytest.mark.parametrize("name", NAMES)
