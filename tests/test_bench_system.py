@@ -1,0 +1,127 @@
+"""The bench of the whole program: what it measures, what it makes of it, and where it shows it."""
+
+import json
+import time
+from dataclasses import replace
+
+import pytest
+from edge_samples import FakeModel, make_contract
+
+from edge.bench import scene, system, system_section
+from edge.bench.program import Line, Play, edge_sr, plain_loop
+from edge.bench.soak import Soak, Window
+from edge.bench.system import Losses, StartUp, SystemRow, latencies_ns
+from edge.bench.timing import summary
+from edge.bench.verdicts import verdicts
+from edge.bundle import BUNDLE_DIR
+from edge.cli import main
+from edge.frozen import load_frozen_set
+
+QUICK = summary([800_000] * 1000)
+ROW = SystemRow(system.IDLE, 1000, 1.0, (0.6, 0.4), 70.0, None, None, None, 3, 20.0, 0.5)
+ROWS = {
+    row.name: row
+    for row in (
+        ROW,
+        replace(ROW, name=system.PLAIN, cpu_percent=2.0),
+        replace(ROW, name=system.TWO, cpu_percent=7.0),
+        replace(ROW, name=system.TWO_RECORDED, run_time=QUICK, latency=QUICK, losses=Losses(0, 0, 0, 0)),
+        replace(ROW, name=system.MOVING, run_time=QUICK, latency=QUICK, losses=Losses(0, 0, 0, 0)),
+        replace(ROW, name=system.FAST, latency=QUICK, losses=Losses(0, 0, 0, 0)),
+    )
+}
+STARTED = StartUp((0.9, 0.3, 0.4), 75.0)
+SLOW = summary([5_000_000] * 1000)
+
+
+def test_a_run_is_measured_from_the_last_byte_of_each_scan(tmp_path):
+    with edge_sr(tmp_path, Play(sensors=2, pressed=500, moving=True), "--every-scan") as program:
+        assert 0 < program.first_pattern_s() < 60
+        program.lines(60.0, most=100)
+        usage, lines = system._Usage(program), program.lines(0.5)
+        used = usage.since()
+    row = system._recorded("two", lines, used, program.stamps_ns())
+    assert row.scans == len(lines) > 10
+    assert {line.record["sensor"] for line in lines} == {"4", "6"}
+    assert row.run_time is not None and row.latency is not None
+    told_us = [line.record["latency_us"] for line in lines if line.record["latency_us"] is not None]
+    assert row.latency.max_us >= max(told_us), "the way to the read and that of the record are in it"
+    assert row.cpu_percent == pytest.approx(sum(row.thread_percent), abs=0.1) and row.cpu_percent > 0
+    assert row.resident_mb > 20
+
+
+def test_the_plain_loop_reads(tmp_path):
+    with plain_loop(tmp_path, Play(rate_hz=1000.0)) as program:
+        time.sleep(0.3)
+        usage = system._Usage(program)
+        time.sleep(0.2)
+        assert usage.since().cpu_percent > 0.1
+
+
+def test_latency_is_taken_scan_by_scan_and_sensor_by_sensor():
+    lines = [Line(time_ns, {"sensor": name, "scan": scan}) for time_ns, name, scan in ((50, "4", 1), (70, "6", 0))]
+    assert latencies_ns(lines, {"4": [10, 20], "6": [65]}) == [30, 5]
+
+
+def test_who_lost_scans_has_no_latency():
+    counters = dict.fromkeys(("late", "dropped", "overruns", "torn_wire", "missing_taxels", "duplicates"), 0)
+    lines = [
+        Line(9, {"sensor": "4", "scan": 0, "run_time_us": 5.0, "counters": counters | {"overruns": n}}) for n in (0, 1)
+    ]
+    used = system._Used(1.0, (1.0,), 70.0, 0, 0.0, 0.0)
+    row = system._recorded("x", lines, used, {"4": [1]})
+    assert row.latency is None and row.losses == Losses(0, 0, 1, 0)
+    assert system._recorded("x", lines[:1], used, {"4": [1]}).latency == summary([8])
+
+
+def test_every_target_is_judged_and_a_missed_one_says_why():
+    assert [(verdict.held, verdict.limited_by) for verdict in verdicts(ROWS, STARTED)] == [(True, "")] * 8
+    worse = {
+        name: replace(
+            row,
+            cpu_percent=9.0,
+            resident_mb=101.0,
+            run_time=row.run_time and SLOW,
+            latency=row.latency and SLOW,
+            losses=row.losses and Losses(1, 2, 0, 0),
+        )
+        for name, row in ROWS.items()
+    }
+    missed = list(verdicts(worse, StartUp((0.8, 0.9, 0.1), 75.0)))
+    assert len(missed) == 8 and not any(verdict.held for verdict in missed)
+    assert missed[0].limited_by == "the plain loop alone takes 9.0 %; ours, by threads: 0.6 + 0.4 %"
+    assert missed[3].limited_by == "inference alone takes 50.0 % at 100 Hz"
+    assert list(verdicts({}, None)) == []
+
+
+def test_the_page_the_json_and_the_table_tell_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(system_section, "rows", lambda scans, tell: iter(ROWS.values()))
+    monkeypatch.setattr(system_section, "start_up", lambda: STARTED)
+    soaked = Soak(1.0, 0.01, 0.02, 1.1, (Window(5.0, 70.0, 900.0, 2, 9, 0),))
+    monkeypatch.setattr(system_section, "soak", lambda minutes, tell: soaked if minutes == 0.5 else None)
+    assert main(["bench", "--system", "--soak", "0.5", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert out.count("| yes |") == 8 and "+0.010 MB a minute" in out and "0.90, 0.30, 0.40 s" in out
+    told = json.loads((tmp_path / "bench.json").read_text())
+    assert [row["name"] for row in told["system"]["rows"]] == list(ROWS)
+    assert told["system"]["soak"]["latency_ratio"] == 1.1 and len(told["system"]["verdicts"]) == 8
+    table = (tmp_path / "bench.csv").read_text().splitlines()
+    assert len(table) == 1 + len(ROWS) and "latency_p999_us" in table[0]
+    assert main(["bench", "--soak", "1"]) == 2
+    assert "--soak is a part of --system: add it" in capsys.readouterr().err
+
+
+def test_each_thing_left_out_spares_inferences(monkeypatch):
+    monkeypatch.setattr(scene, "_EVERY", 40)
+    monkeypatch.setattr(scene, "HELD_SCANS", 12)
+    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    model = FakeModel(make_contract(taps=2, counts_per_unit=(500.0, 500.0, 1000.0)))
+    rows = list(scene.savings(model, frozen))
+    assert [row.left_out.removeprefix("+ ") for row in rows][1:3] == [
+        "where nothing touches",
+        "where nothing has changed",
+    ]
+    nothing, touching, changed, _ = (row.inferred for row in rows)
+    assert nothing == rows[0].scans > touching > changed > 0
+    assert rows[0].psnr_db == rows[1].psnr_db
+    assert rows[0].taps_used > 1

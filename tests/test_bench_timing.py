@@ -1,0 +1,158 @@
+"""Run times on a clock of its own, their ratios, and the front."""
+
+import numpy as np
+import pytest
+
+from edge.bench.against import alternated
+from edge.bench.front import front
+from edge.bench.intervals import Ratio, ratio_of
+from edge.bench.timing import BLOCKS, back_to_back, paced, summary
+
+
+class Clock:
+    """Goes on when someone sleeps or works."""
+
+    def __init__(self):
+        self.now_ns = 1_000_000
+
+    def __call__(self):
+        return self.now_ns
+
+    def sleep(self, time_s):
+        self.now_ns += round(time_s * 1e9)
+
+    def work(self, *took_ms):
+        """A run that takes these times in turn, then the last one always; keeps the numbers that it is given."""
+        numbers = []
+
+        def run(number):
+            numbers.append(number)
+            self.now_ns += round(1e6 * took_ms[min(len(numbers), len(took_ms)) - 1])
+
+        return run, numbers
+
+
+def pace(clock, run, ticks, rate_hz=100.0):
+    return paced(run, rate_hz, ticks, clock, clock.sleep, cpu_clock=lambda: clock.now_ns // 4)
+
+
+def test_a_quick_run_is_done_at_every_tick_and_misses_none():
+    clock = Clock()
+    run, numbers = clock.work(2)
+    found = pace(clock, run, 20)
+    assert numbers == list(range(1, 21))
+    assert (found.missed, found.ticks, found.times.runs) == (0, 20, 20)
+    assert (found.times.p50_us, found.times.max_us) == (2000, 2000)
+    assert found.cpu_percent == pytest.approx(25)
+
+
+def test_ticks_that_pass_during_a_long_run_are_missed_too():
+    clock = Clock()
+    run, numbers = clock.work(2, 35, 2)  # due at 20 ms, done at 55: ticks 2, 3, 4 have passed, 5 is begun late
+    found = pace(clock, run, 10)
+    assert numbers == [1, 2, 5, 6, 7, 8, 9, 10]
+    assert found.missed == 3
+
+
+def test_a_run_longer_than_a_period_misses_every_tick():
+    clock = Clock()
+    run, numbers = clock.work(60)
+    found = pace(clock, run, 30)
+    assert found.missed == 30
+    assert len(numbers) == found.times.runs == 5
+
+
+def test_a_run_that_is_not_done_when_the_next_is_due_is_missed():
+    clock = Clock()
+    run, numbers = clock.work(2, 12, 2)
+    assert pace(clock, run, 10).missed == 1
+    assert numbers == list(range(1, 11))
+
+
+def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
+    clock = Clock()
+    run, numbers = clock.work(1)
+    asked = []
+
+    def stalls():
+        asked.append(clock.now_ns)
+        clock.now_ns += 1_000_000_000 * (len(asked) == 3)  # before the first tick is waited for
+        return clock.now_ns
+
+    found = paced(run, 100.0, 10, stalls, clock.sleep, cpu_clock=lambda: 0)
+    assert (found.times.runs, numbers) == (1, [10])
+    assert found.missed == 10
+
+
+def test_percentiles_and_block_medians():
+    took_ns = np.arange(1, 3001) * 1000
+    times = summary(took_ns)
+    assert times.p50_us == 1500.5
+    assert (times.p99_us, times.p999_us) == pytest.approx((2970.01, 2997.001))
+    assert (times.max_us, times.runs) == (3000, 3000)
+    assert times.block_p50_us == tuple(50.5 + 100 * block for block in range(BLOCKS))
+    assert len(summary(took_ns[:7]).block_p50_us) == 7
+
+
+@pytest.mark.parametrize(
+    ("took_ms", "most", "runs"), [(1, 3000, 2000), (0.1, 3000, 3000), (200, 3000, 90), (200, 10, 10)]
+)
+def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
+    clock = Clock()
+    run, _ = clock.work(took_ms)
+    found = back_to_back(run, most, clock)
+    assert found.runs == runs
+    assert found.p50_us == took_ms * 1000
+
+
+def test_two_are_timed_in_turn_and_the_first_run_of_a_block_is_not_counted():
+    clock = Clock()
+    order = []
+
+    def work(name, *took_ms):
+        def run(number):
+            order.append(name)
+            clock.now_ns += round(1e6 * took_ms[number % len(took_ms)])
+
+        return run
+
+    one_us, other_us = alternated(work("one", 9, 7, 8), work("other", 90, 30, 40), 4, clock)
+    assert (one_us, other_us) == ([7500] * 4, [35_000] * 4)
+    blocks = [name for i, name in enumerate(order) if i == 0 or order[i - 1] != name]
+    assert blocks == ["one", "other", "one", "other", "one", "other"]  # after the estimate: who begins changes
+
+
+def test_pairs_are_drawn_together_so_that_what_meets_both_cancels():
+    rng = np.random.default_rng(3)
+    weather = rng.uniform(1, 3, 30)
+    paired = ratio_of(2 * weather, weather, paired=True)
+    assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2))
+    loose = ratio_of(2 * weather, weather, paired=False)
+    assert loose.low < 1.9 < 2.1 < loose.high
+
+
+def test_an_interval_holds_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(4)
+    held = 0
+    for _ in range(60):
+        found = ratio_of(rng.normal(12, 1, 30), rng.normal(10, 1, 30), paired=False)
+        held += found.low <= 1.2 <= found.high
+    assert 50 <= held < 60
+
+
+def test_blocks_that_cannot_be_compared_are_refused():
+    with pytest.raises(ValueError, match="3 blocks over 2"):
+        ratio_of([1, 2, 3], [1, 2], paired=True)
+    with pytest.raises(ValueError, match="0 blocks over 2"):
+        ratio_of([], [1, 2], paired=False)
+
+
+def test_a_ratio_is_shown_with_three_digits_and_says_whether_it_differs():
+    assert str(Ratio(1178.2, 1140.1, 1209.9)) == "1180 (1140..1210)"
+    assert Ratio(1.2, 1.1, 1.3).differs
+    assert not Ratio(1.2, 0.9, 1.3).differs
+
+
+def test_the_front_is_who_is_not_beaten():
+    points = [(9.0, 100.0), (5.0, 60.0), (2.0, 700.0), (2.0, 800.0), (1.9, 900.0), (5.0, 60.0)]
+    assert front(points) == [False, True, True, False, True, True]
