@@ -15,14 +15,10 @@ class Deadline:
 
     The period is the running median of the intervals between scans, which neither jitter nor a gap moves, unless a
     rate is given.
-
-    Attributes:
-        missed: patterns that came later than one period after their scan.
     """
 
     def __init__(self, rate_hz: float | None = None) -> None:
         """Start without a scan; `rate_hz` is the sensor's rate if it is known, in [Hz]."""
-        self.missed = 0
         self._known_period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._intervals: deque[int] = deque()
         self._sorted: list[int] = []
@@ -55,6 +51,4 @@ class Deadline:
             done_ns: when the pattern was ready, on the same clock.
         """
         period_ns = self.period_ns
-        late = period_ns is not None and done_ns - scan_time_ns > period_ns
-        self.missed += late
-        return late
+        return period_ns is not None and done_ns - scan_time_ns > period_ns

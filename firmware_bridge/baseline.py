@@ -270,7 +270,10 @@ def _refuse_motion(counts: NDArray[np.int32]) -> None:
 
 def _refuse_load(baseline: Baseline, reference: Baseline) -> None:
     z = len(AXES) - 1
-    load = deformation(np.rint(baseline.counts).astype(np.int32) % COUNTS_ON_CIRCLE, reference)
+    # A taxel that either knows no rest of says nothing of a load.
+    known = np.where(np.isnan(baseline.counts), 0, baseline.counts)
+    load = deformation(np.rint(known).astype(np.int32) % COUNTS_ON_CIRCLE, reference)
+    load[np.isnan(baseline.counts) | np.isnan(reference.counts)] = 0
     row, col = _worst(load[z])
     if load[z, row, col] > LOAD_LIMIT_COUNTS:
         what = f"is {load[z, row, col]:.0f} counts above the baseline {reference.id}"

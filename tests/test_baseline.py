@@ -1,4 +1,5 @@
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -363,3 +364,17 @@ def test_a_taxel_that_comes_and_goes_does_not_put_zeroing_off_for_ever():
             break
     assert baseline is not None and number < 110
     assert np.isnan(baseline.counts[:, 0, 0]).all() and np.isfinite(baseline.counts[:, 1:, :]).all()
+
+
+@pytest.mark.parametrize("pressed", [False, True])
+def test_a_load_is_refused_also_where_a_taxel_has_no_rest(pressed):
+    reference = Baseline.of("4", REST.astype(np.float32), 0.0, 100, "file")
+    silent = np.zeros((4, 4), dtype=bool)
+    silent[0, 0] = True
+    estimator = BaselineEstimator(reference=reference)
+    counts = still(100)
+    counts[:, :, 0, 0] = ABSENT
+    counts[:, 2, 1, 1] += 1000 * pressed
+    with pytest.raises(BaselineRefusedError, match="above the baseline") if pressed else nullcontext():
+        found = [estimator.push(scan, silent) for scan in scans_of(counts)]
+        assert found[-1] is not None and np.isnan(found[-1].counts[:, 0, 0]).all()

@@ -39,8 +39,8 @@ def test_a_given_rate_is_the_period_from_the_start():
 
 def test_a_pattern_is_late_after_one_period_and_not_before():
     deadline = followed([10] * 9)
-    assert not deadline.check(90 * MS, 100 * MS) and deadline.missed == 0
-    assert deadline.check(90 * MS, 100 * MS + 1) and deadline.missed == 1
+    assert not deadline.check(90 * MS, 100 * MS)
+    assert deadline.check(90 * MS, 100 * MS + 1)
     assert not Deadline().check(0, 10**12)
 
 

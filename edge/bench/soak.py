@@ -5,7 +5,9 @@
 writes what it found as JSON.
 """
 
+import argparse
 import json
+import math
 import sys
 import tempfile
 import time
@@ -16,6 +18,7 @@ from typing import Final
 
 import numpy as np
 
+from edge.bench.errors import BenchError
 from edge.bench.program import Play, Program, edge_sr
 
 WARM_UP_S: Final = 6.0
@@ -109,5 +112,20 @@ def _slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, floa
     return slope, float(1.96 * np.sqrt(rest @ rest / (len(times) - 2) / (centred @ centred)))
 
 
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; 0 when done, 1 on a clear error."""
+    parser = argparse.ArgumentParser(prog="python -m edge.bench.soak", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("minutes", type=float, metavar="MINUTES", help="how long; a quarter of one at least")
+    minutes: float = parser.parse_args(arguments).minutes
+    if not 0 < minutes < math.inf:
+        parser.error(f"MINUTES is {minutes:g}, expected a positive number")
+    try:
+        sys.stdout.write(json.dumps(asdict(soak(minutes))))
+    except BenchError as error:
+        sys.stderr.write(f"soak: {error}\n")
+        return 1
+    return 0
+
+
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(asdict(soak(float(sys.argv[1])))))
+    sys.exit(main())

@@ -8,7 +8,6 @@ compared with that of all.
 Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no scan of theirs goes into a report.
 """
 
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
 from firmware_bridge.scan import ABSENT, ScanSeries
-from train.experiments.hidden_taxel import recorded_sets, recording_paths
+from train.experiments.hidden_taxel import recorded_sets, recording_paths, recordings_folder
 from train.experiments.report import Report, Row, with_interval
 from train.experiments.workbench import Workbench, thinned
 from train.freeze import SEED
@@ -95,7 +94,7 @@ def run(bench: Workbench, folder: Path) -> Path:
             for fault in ("stuck at rest", "stuck at random") if dead else ():
                 rows.append(_row(model, frozen, play(model, frozen, None, dead, fault), dead, fault, "unfound"))
     report.table(rows, "Errors by number of dead taxels.")
-    recordings = _recordings()
+    recordings = recordings_folder()
     if recording_paths(recordings):
         caption = "Real grips: how far a pattern is from that of all taxels, when some are hidden."
         report.table(_real_rows(recordings, estimator, bench.quick), caption, "real")
@@ -193,10 +192,6 @@ def _row(model: ModelSession, frozen: FrozenSet, told: Told, dead: int, fault: s
         "found after scans": max(told.delays_scans, default=None),
         "run time us p50": round(float(np.median(told.run_time_us)), 0),
     }
-
-
-def _recordings() -> Path:
-    return Path(os.environ.get("TACTILE_RECORDINGS", Path(__file__).parents[2] / "../shared/recordings/imanlab"))
 
 
 def _real_rows(folder: Path, estimator: TaxelEstimator, quick: bool) -> list[Row]:

@@ -1,5 +1,6 @@
 """One taxel of a scan hidden, and told from the others: scans, real and simulated, and methods that tell."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,6 +57,12 @@ class ScanSet:
 def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:
     """Readings of z, (n, taxels), of scans (n, 3, rows, cols)."""
     return counts[:, _Z].reshape(-1, _TAXELS)
+
+
+def recordings_folder() -> Path:
+    """Where TACTILE_RECORDINGS says, else beside the repository."""
+    beside = Path(__file__).parents[2] / "../shared/recordings/imanlab"
+    return Path(os.environ.get("TACTILE_RECORDINGS", beside))
 
 
 def recording_paths(folder: Path) -> list[Path]:

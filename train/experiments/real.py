@@ -10,7 +10,6 @@ Recordings are read where TACTILE_RECORDINGS says, else beside the repository; n
 Source: Wu and Liu 2024, Eq. 7-8 (degradation).
 """
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -33,6 +32,7 @@ from train.experiments.hidden_taxel import (
     hidden_taxels,
     recorded_sets,
     recording_paths,
+    recordings_folder,
     simulated_sets,
     z_of,
 )
@@ -97,8 +97,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 def _recorded(quick: bool) -> list[ScanSet]:
     """Real scans; a quick run may find none."""
-    beside = Path(__file__).parents[2] / "../shared/recordings/imanlab"
-    folder = Path(os.environ.get("TACTILE_RECORDINGS", beside))
+    folder = recordings_folder()
     if quick and not recording_paths(folder):
         return []
     return recorded_sets(folder)
