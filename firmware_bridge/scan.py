@@ -12,6 +12,29 @@ ABSENT: Final = -1
 """Stands where a taxel gave no reading in this scan; raw counts are unsigned, so no reading is -1."""
 
 
+LONGEST_SENSOR_NAME: Final = 64
+
+
+def is_sensor_name(name: str) -> bool:
+    """Whether a sensor may be called so: what a file says is shown, logged and written into others."""
+    return name.isprintable() and 0 < len(name) <= LONGEST_SENSOR_NAME
+
+
+@dataclass(frozen=True, slots=True)
+class VendorReading:
+    """What the vendor's own software says beside the counts; None where it does not.
+
+    Attributes:
+        newtons: (3, rows, cols) float32, axes x, y, z, in [N].
+        temperature_k: (rows, cols) float32, in [K]; NaN where a taxel has no thermometer.
+        ups_hz: (rows, cols) float32, how often a second each taxel is renewed.
+    """
+
+    newtons: NDArray[np.float32] | None = None
+    temperature_k: NDArray[np.float32] | None = None
+    ups_hz: NDArray[np.float32] | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
     """One reading of all taxels of one sensor.
@@ -25,6 +48,9 @@ class Scan:
         renewed: (rows, cols) bool, fresh and different from that taxel's reading before. Noise
             renews a live taxel almost surely, so a fresh taxel that is not renewed is most
             likely an old reading sent again.
+        device_ns: when its newest reading was on the bus or in the sensor's own hands, by the device's time stamps
+            mapped to monotonic time, in [ns]; None where it gives none. What `time_ns` is later is delay.
+        vendor: what the vendor's software says of the same moment; None of a link that reads the sensor itself.
     """
 
     sensor: str
@@ -33,6 +59,8 @@ class Scan:
     counts: NDArray[np.int32]
     fresh: NDArray[np.bool_]
     renewed: NDArray[np.bool_]
+    device_ns: int | None = None
+    vendor: VendorReading | None = None
 
     # On sixteen taxels numpy's all() costs ten times what looking for a byte does, and these are asked of every scan.
 
@@ -57,6 +85,14 @@ class Scan:
         """Every taxel arrived and none is new."""
         return self.complete and True not in self.renewed.tobytes()
 
+    @property
+    def vendor_force_n(self) -> tuple[float, float, float] | None:
+        """Force x, y, z on the pad in [N], by the vendor; None where it is not told, or holds for old readings."""
+        if self.vendor is None or self.vendor.newtons is None or not self.complete:
+            return None
+        x, y, z = self.vendor.newtons.reshape(3, -1).sum(axis=1).tolist()
+        return x, y, z
+
 
 class ScanSeries:
     """The scans of one sensor in their order: numbers them and tells new readings from old ones."""
@@ -67,29 +103,43 @@ class ScanSeries:
         self._last = np.full(geometry.scan_shape, ABSENT, dtype=np.int32)
         self._all_fresh = np.ones((geometry.rows, geometry.cols), dtype=bool)
 
-    def close(self, counts: NDArray[np.int32], time_ns: int) -> Scan:
+    def close(
+        self,
+        counts: NDArray[np.int32],
+        time_ns: int,
+        device_ns: int | None = None,
+        vendor: VendorReading | None = None,
+    ) -> Scan:
         """The next scan.
 
         Args:
             counts: (3, rows, cols), ABSENT where no reading came; kept and made read-only.
             time_ns: arrival of its newest reading, in [ns].
+            device_ns: of its newest reading, as in Scan.
+            vendor: what the vendor's software says of it.
         """
         fresh = counts[0] != ABSENT
         renewed = fresh & (counts != self._last).any(axis=0)
         self._last = np.where(fresh, counts, self._last)
-        return self._number_on(counts, fresh, renewed, time_ns)
+        return self._number_on(counts, fresh, renewed, time_ns, device_ns, vendor)
 
-    def close_whole(self, counts: NDArray[np.int32], time_ns: int) -> Scan:
+    def close_whole(self, counts: NDArray[np.int32], time_ns: int, device_ns: int | None = None) -> Scan:
         """The same for a scan that holds every taxel, at half the cost."""
         renewed = np.logical_or.reduce(counts != self._last)
         self._last = counts
-        return self._number_on(counts, self._all_fresh, renewed, time_ns)
+        return self._number_on(counts, self._all_fresh, renewed, time_ns, device_ns)
 
     def _number_on(
-        self, counts: NDArray[np.int32], fresh: NDArray[np.bool_], renewed: NDArray[np.bool_], time_ns: int
+        self,
+        counts: NDArray[np.int32],
+        fresh: NDArray[np.bool_],
+        renewed: NDArray[np.bool_],
+        time_ns: int,
+        device_ns: int | None,
+        vendor: VendorReading | None = None,
     ) -> Scan:
         for array in (counts, fresh, renewed):
             array.setflags(write=False)
-        scan = Scan(self._sensor, self._number, time_ns, counts, fresh, renewed)
+        scan = Scan(self._sensor, self._number, time_ns, counts, fresh, renewed, device_ns, vendor)
         self._number += 1
         return scan

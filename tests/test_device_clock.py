@@ -1,0 +1,100 @@
+"""Stamps of a device on the host's clock."""
+
+import random
+from dataclasses import replace
+
+import pytest
+from edge_samples import make_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.silence import Silence
+from firmware_bridge.device_clock import BACK_NS, WINDOW_NS, DeviceClock
+
+US, MS, S = 1_000, 1_000_000, 1_000_000_000
+WRAP_US = 1 << 32  # 71.6 minutes
+HOST_NS = 5_000 * S
+
+
+def test_the_delay_of_a_frame_is_what_it_took_beyond_the_shortest() -> None:
+    clock = DeviceClock(US, WRAP_US)
+    mapped = [clock.host_ns(i * 10_000, HOST_NS + i * 10 * MS + delay) for i, delay in enumerate([0, 3 * MS, 16 * MS])]
+    assert mapped == [HOST_NS + i * 10 * MS for i in range(3)]
+
+
+@given(st.integers(0, WRAP_US - 1), st.integers(0, 10**9))
+def test_nothing_is_mapped_later_than_it_arrived(first: int, seed: int) -> None:
+    noise = random.Random(seed)
+    clock, stamp_us, arrival_ns = DeviceClock(US, WRAP_US), first, HOST_NS
+    for _ in range(50):
+        gap_us = noise.choice([130, 10_000, 10**7])
+        stamp_us = (stamp_us + gap_us) % WRAP_US
+        arrival_ns = max(arrival_ns, arrival_ns + gap_us * US + noise.randint(-MS, 16 * MS))
+        assert clock.host_ns(stamp_us, arrival_ns) <= arrival_ns
+
+
+def test_the_wrap_of_32_bits_of_microseconds_is_no_step() -> None:
+    clock = DeviceClock(US, WRAP_US)
+    mapped = [clock.host_ns((WRAP_US - 15_000 + i * 10_000) % WRAP_US, HOST_NS + i * 10 * MS) for i in range(4)]
+    assert mapped == [HOST_NS + i * 10 * MS for i in range(4)]
+    assert clock.restarts == 0
+
+
+def test_hours_of_silence_are_hours_and_not_what_is_left_of_a_turn() -> None:
+    clock = DeviceClock(US, WRAP_US)
+    clock.host_ns(1_000, HOST_NS)
+    silent_us = 3 * 3600 * 10**6
+    arrival_ns = HOST_NS + silent_us * US + 4 * MS
+    # After so long nobody knows how far the clocks have parted: the offset is found anew, the turns are counted.
+    assert clock.host_ns((1_000 + silent_us) % WRAP_US, arrival_ns) == arrival_ns
+    assert clock.host_ns((1_000 + silent_us + 10_000) % WRAP_US, arrival_ns + 26 * MS) == arrival_ns + 10 * MS
+    assert clock.restarts == 0
+
+
+def test_milliseconds_that_wrap_each_minute() -> None:
+    clock = DeviceClock(MS, 60_000)
+    mapped = [clock.host_ns(i * 10 % 60_000, HOST_NS + i * 10 * MS) for i in range(0, 20_000, 7)]
+    assert mapped == [HOST_NS + i * 10 * MS for i in range(0, 20_000, 7)]
+
+
+def test_a_device_that_is_slower_than_the_host_is_followed() -> None:
+    clock = DeviceClock(US, WRAP_US)
+    slower = 0.9999
+    delays_ns = []
+    for i in range(60_000):
+        arrival_ns = HOST_NS + i * 10 * MS
+        delays_ns.append(arrival_ns - clock.host_ns(round(i * 10_000 * slower), arrival_ns))
+    assert max(delays_ns) <= 2.1 * WINDOW_NS * (1 - slower)
+
+
+def test_a_device_that_began_anew_is_counted_and_mapped_anew() -> None:
+    clock = DeviceClock(US, None)
+    clock.host_ns(50_000_000, HOST_NS)
+    assert clock.host_ns(1_000, HOST_NS + 10 * MS) == HOST_NS + 10 * MS
+    assert clock.restarts == 1
+
+
+def test_frames_that_changed_places_are_no_new_beginning() -> None:
+    clock = DeviceClock(US, WRAP_US)
+    clock.host_ns(1_000_000, HOST_NS)
+    back_us = BACK_NS // US // 2
+    assert clock.host_ns(1_000_000 - back_us, HOST_NS + MS) == HOST_NS - back_us * US
+    assert clock.restarts == 0
+
+
+@pytest.mark.parametrize("back_ms", [-50, 0, 3, 12, 15, 20, 50, 80, 99, 3000])
+def test_a_wall_clock_that_is_set_back_costs_no_scan(back_ms: int) -> None:
+    """Stamps of socketcan and of a server are of one. No scan is lost, so none may be told to be missing.
+
+    A step that stamps do not show, being less than what they go on by meanwhile, may make one.
+    """
+    clock, silence, noise = DeviceClock(US, None), Silence(), random.Random(back_ms)
+    for number in range(5_000):
+        bus_us = 10_000 * number
+        arrival_ns = HOST_NS + bus_us * US + noise.randint(0, 2 * MS)
+        stamp_us = 1_800_000_000_000_000 + bus_us - 1_000 * back_ms * (number >= 1_000)
+        device_ns = clock.host_ns(stamp_us, arrival_ns)
+        silence.follow(replace(make_scan(number), time_ns=arrival_ns, device_ns=device_ns), 10 * MS)
+    seen = back_ms * MS > BACK_NS + 10 * MS
+    assert clock.restarts == seen
+    assert silence.missed == (0 if seen or back_ms < 5 else 1)
