@@ -16,8 +16,11 @@ import numpy as np
 import onnxruntime
 
 from edge.calibration import ROUND_TICKS, ROUNDS, RunTime
+from firmware_bridge.bounded import read_bounded
 
 FILE_NAME: Final = "calibration.json"
+MOST_FILE_BYTES: Final = 1 << 20
+"""A model takes 200."""
 MOST: Final = 1e12
 """In [us] or [s]: no figure here can be more."""
 CPU_KEYS: Final = ("model name", "CPU implementer", "CPU part")
@@ -90,7 +93,7 @@ class CalibrationCache:
 
     def _read(self) -> dict[str, Any]:
         try:
-            entries = {} if self._path is None else json.loads(self._path.read_bytes())
+            entries = {} if self._path is None else json.loads(read_bounded(self._path, MOST_FILE_BYTES))
         except FileNotFoundError:
             return {}
         except OSError as error:
@@ -107,7 +110,7 @@ class CalibrationCache:
 
 def _positive(entry: object, key: str) -> float | None:
     value = entry.get(key) if isinstance(entry, dict) else None
-    return value if isinstance(value, (int, float)) and 0 < value < MOST else None
+    return value if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < MOST else None
 
 
 def cache_path(environment: Mapping[str, str] = os.environ) -> Path | None:

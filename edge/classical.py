@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
+from firmware_bridge.npz import read_npz
 
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's maximum from which these methods call a pixel touched: the edge of a blurred step."""
 
 _CUBIC_A: Final = -0.5
+
+MOST_BYTES: Final = 1 << 28
 
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
@@ -30,10 +33,10 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
         EdgeError: the file cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            gain, matrix = float(arrays["bilinear_gain"]), arrays["linear_map"]
-            cubic_gain = float(arrays["bicubic_gain"]) if "bicubic_gain" in arrays else None
-    except (OSError, ValueError, KeyError) as error:
+        arrays = read_npz(path, ("bilinear_gain", "linear_map", "bicubic_gain"), MOST_BYTES)
+        gain, matrix = float(arrays["bilinear_gain"]), arrays["linear_map"]
+        cubic_gain = float(arrays["bicubic_gain"]) if "bicubic_gain" in arrays else None
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
 
     def by_gain(newest: NDArray[np.floating]) -> NDArray[np.floating]:

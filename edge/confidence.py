@@ -8,11 +8,13 @@ and the share of it that one more tap took away.
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
+LARGEST: Final = float(np.finfo(np.float32).max)
+"""Of the numbers in a contract: patterns are float32. A whole number can have more digits than any float."""
 WORTH_A_TAP: Final = 0.02
 """Share of the error that another tap must be expected to take away to be worth it: .2 dB."""
 
@@ -78,12 +80,13 @@ def is_confidence(value: Any, taps: int) -> bool:
 def _is_row(row: Any) -> bool:
     if not isinstance(row, dict) or set(row) != {"doubt", "error", "gain"}:
         return False
-    if not all(isinstance(values, list) and all(_is_number(v) for v in values) for values in row.values()):
+    if not all(isinstance(values, list) and all(is_number(v) for v in values) for values in row.values()):
         return False
     known, count = row["doubt"], len(row["doubt"])
     rising = count > 0 and known[0] > 0 and all(a < b for a, b in pairwise(known))
     return rising and len(row["error"]) == count and len(row["gain"]) in (0, count)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether a value read from a file is a finite number."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST

@@ -1,15 +1,15 @@
 """The one agreement between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.confidence import is_confidence
+from edge.confidence import is_confidence, is_number
 from edge.errors import ModelError
 from firmware_bridge.geometry import SensorGeometry
 
@@ -22,6 +22,14 @@ ANY_BATCH: Final = "any"
 """Of a graph that takes as many windows in one run as it is given; its first dimension bears this name."""
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
+MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
+MOST_PIXELS: Final = 1 << 20
+"""Of a pattern: what is allocated for a run is this times a few."""
+LONGEST_VALUE: Final = 1 << 16
+"""Characters of a key's JSON; the longest of a bundled model has a thousand."""
+LONGEST_SHOWN: Final = 100
+LEAST_UNIT: Final = 1e-6
+"""Of counts, newtons or millimetres that something is divided by, so that float32 holds what comes out."""
 STAND_IN_KEYS: Final = (
     *("scale", "angle_step_deg", "output_unit", "output_full_scale", "sensor", "rows", "cols", "pitch_mm"),
 )
@@ -108,7 +116,7 @@ class Contract:
         version = _value(metadata, "version")
         if version != CONTRACT_VERSION:  # before the other keys, which another version may not have
             expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
-            raise ModelError(f"contract key 'version' is {version!r}, {expected}")
+            raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
         values = {field.name: _value(metadata, field.name) for field in fields(cls)}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
@@ -152,46 +160,53 @@ def _value(metadata: Mapping[str, str], key: str) -> Any:
     text = metadata.get(KEY_PREFIX + key)
     if text is None:
         raise ModelError(f"contract key '{key}' is missing: not a model made by export, or an old one")
+    if len(text) > LONGEST_VALUE:
+        raise ModelError(f"contract key '{key}' has {len(text)} characters, expected at most {LONGEST_VALUE}")
     try:
         return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ModelError(f"contract key '{key}' is {text!r}, expected JSON") from error
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"contract key '{key}' is {_shown(text)}, expected JSON") from error
+
+
+def _shown(value: object) -> str:
+    """Short enough for a line."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
 def _check(values: Mapping[str, Any]) -> None:
     def refuse(key: str, expected: str) -> None:
-        raise ModelError(f"contract key '{key}' is {values[key]!r}, expected {expected}")
+        raise ModelError(f"contract key '{key}' is {_shown(values[key])}, expected {expected}")
 
-    for key in ("batch", "taps", "scale", "rows", "cols"):
+    for key, most in MOST.items():
         any_batch = key == "batch" and values[key] == ANY_BATCH
-        if not any_batch and (type(values[key]) is not int or values[key] < 1):
-            refuse(key, "a whole number from 1")
+        if not any_batch and (type(values[key]) is not int or not 1 <= values[key] <= most):
+            refuse(key, f"a whole number from 1 to {most}")
+    if values["rows"] * values["cols"] * values["scale"] ** 2 > MOST_PIXELS:
+        refuse("scale", f"patterns of at most {MOST_PIXELS} pixels")
     if values["tap_order"] != TAP_ORDER:
         refuse("tap_order", repr(TAP_ORDER))
     if values["arithmetic"] not in ARITHMETICS:
         refuse("arithmetic", " or ".join(map(repr, ARITHMETICS)))
     for key in ("output_full_scale", "pitch_mm", "contact_level"):
-        if not _is_number(values[key]) or values[key] <= 0:
-            refuse(key, "a positive number")
+        if not is_number(values[key]) or values[key] < LEAST_UNIT:
+            refuse(key, f"a positive number from {LEAST_UNIT:g}")
     if values["contact_level"] >= 1:
         refuse("contact_level", "a number below 1")
-    if not _is_number(values["angle_step_deg"]):
+    if not is_number(values["angle_step_deg"]):
         refuse("angle_step_deg", "a number")
     factor = values["interval_factor"]
-    if factor is not None and not (_is_number(factor) and factor > 0):
+    if factor is not None and not (is_number(factor) and factor > 0):
         refuse("interval_factor", "a positive number, or null for a model without deviations")
     if not is_confidence(values["confidence"], values["taps"]):
         refuse("confidence", "for each number of taps doubt, error and gain, lists of equal length, doubt rising")
     scaling = values["counts_per_unit"]
-    if not isinstance(scaling, list) or len(scaling) != 3 or not all(_is_number(v) and v > 0 for v in scaling):
-        refuse("counts_per_unit", "three positive numbers, for x, y, z")
+    if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
+        refuse("counts_per_unit", f"three positive numbers from {LEAST_UNIT:g}, for x, y, z")
     for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
-        if not isinstance(values[key], str) or not values[key]:
-            refuse(key, "a text")
+        text = values[key]
+        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= LONGEST_SHOWN:
+            refuse(key, f"a printable text of 1 to {LONGEST_SHOWN} characters")
     error = values["test_error"]
     if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
         refuse("test_error", "a map from taps to metrics")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -6,7 +6,6 @@ taxels tell, whatever their scale. Networks were trained with dead taxels at res
 they make up for them better than any linear estimate; on anything else they do not (reports/dead.md).
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from edge.errors import EdgeError
 from edge.result import Filled
+from firmware_bridge.npz import read_npz
 
 RIDGE: Final = 1e-3
 """Of the mean variance, added to every channel: gains and noise of a sensor of its own."""
@@ -32,6 +32,7 @@ WIDENING: Final = (1.0, 1.05, 1.16, 1.28, 1.43, 1.71, 1.95, 2.44, 3.8)
 """Of deviations with so many taxels dead, that 90 % intervals hold 90 % of pixels: at the validation position, the
 larger of STSR's and MTSR-4's. On readings unlike those of training nobody knows the truth; there it may be too little.
 """
+MOST_BYTES: Final = 1 << 24
 _AXES: Final = 3
 _Z: Final = 2
 
@@ -127,9 +128,8 @@ def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
         EdgeError: the file cannot be read, or is of another grid.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            covariance = arrays["covariance"]
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        covariance = read_npz(path, ["covariance"], MOST_BYTES)["covariance"]
+    except (OSError, ValueError, KeyError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
     return TaxelEstimator(covariance, grid_shape)
 

@@ -1,14 +1,31 @@
 """The frozen test set: what every model and every classical method is judged on, here and in training."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
+from firmware_bridge.npz import read_npz
+
+MOST_BYTES: Final = 1 << 31
+_AXES: Final[Mapping[str, tuple[str, str]]] = {
+    "newest": ("int16", "n3rc"),
+    "earlier": ("int16", "tk3rc"),
+    "tap": ("i", "n"),
+    "indentation_mm": ("f", "n"),
+    "force_n": ("f", "n"),
+    "unit_patterns": ("float16", "thw"),
+    "touched": ("bool", "thw"),
+    "surface": ("U", "t"),
+    "angle_deg": ("f", "t"),
+    "full_scale_mm": ("f", ""),
+}
+"""Type and axes of each array; a letter is the same length everywhere."""
 
 
 class FrozenSetError(EdgeError, ValueError):
@@ -94,14 +111,31 @@ def load_frozen_set(path: Path) -> FrozenSet:
     """Read a frozen set.
 
     Raises:
-        FrozenSetError: no such file, or an array is missing; it is named.
+        FrozenSetError: no such file, or an array is missing or of another type or shape; it is named.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(FrozenSet)}
-            values["full_scale_mm"] = float(values["full_scale_mm"])
-            return FrozenSet(**values)
-    except (OSError, ValueError, KeyError) as error:
+        arrays = read_npz(path, (field.name for field in fields(FrozenSet)), MOST_BYTES)
+        _check_axes(arrays)
+    except (OSError, ValueError) as error:
         raise FrozenSetError(
             f"{path} is no frozen test set ({error}): make it with 'python -m train.freeze'"
         ) from error
+    values: dict[str, Any] = arrays | {"full_scale_mm": float(arrays["full_scale_mm"])}
+    return FrozenSet(**values)
+
+
+def _check_axes(arrays: Mapping[str, NDArray[Any]]) -> None:
+    lengths = {"3": 3}
+    for name, (kind, axes) in _AXES.items():
+        if name not in arrays:
+            raise ValueError(f"array '{name}' is missing")
+        array = arrays[name]
+        fits = array.ndim == len(axes) and (array.dtype.kind == kind if len(kind) == 1 else array.dtype == kind)
+        if not fits or any(
+            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
+        ):
+            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
+            raise ValueError(f"array '{name}' is {array.dtype} {array.shape}, expected {kind} ({expected})")
+    taps = arrays["tap"]
+    if not taps.size or taps.min() < 0 or taps.max() >= lengths["t"] or not 0 < arrays["full_scale_mm"] < np.inf:
+        raise ValueError("array 'tap' names taps that are not there, or 'full_scale_mm' is no length")

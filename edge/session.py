@@ -12,10 +12,13 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 
 from edge.contract import ANY_BATCH, DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
 from edge.errors import ModelError, WindowError
+from edge.onnx_file import read_model
 
 WARM_UP_RUNS: Final = 10
 """The first takes 3 to 10 times as long as the tenth, after which run times stay."""
 LOG_FATAL_ONLY: Final = 4
+LONGEST_REASON: Final = 300
+"""Of onnxruntime, which may quote a whole graph."""
 LOAD_ERRORS: Final = (
     ort_errors.Fail,
     ort_errors.InvalidArgument,
@@ -24,6 +27,7 @@ LOAD_ERRORS: Final = (
     ort_errors.NoModel,
     ort_errors.NotImplemented,
     ort_errors.RuntimeException,
+    UnicodeDecodeError,  # names in its messages are the file's
 )
 
 onnxruntime.disable_telemetry_events()  # where it was imported before `edge`, which is too late for all of it
@@ -60,10 +64,15 @@ class ModelSession:
             _check_tensors("output", self._session.get_outputs(), self.contract.output_shapes)
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
+        except UnicodeDecodeError as error:
+            raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
         self._runs: dict[int, _Run] = {}
         self._deviation: NDArray[np.float32] | None = None
-        for _ in range(WARM_UP_RUNS):
-            self.run(np.zeros(self._shape, dtype=np.float32))
+        try:
+            for _ in range(WARM_UP_RUNS):
+                self.run(np.zeros(self._shape, dtype=np.float32))
+        except LOAD_ERRORS as error:
+            raise ModelError(f"{path}: cannot be run: {_reason(error)}") from error
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
@@ -162,7 +171,7 @@ def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     """Any ONNX file in the runtime's own settings, its contract not asked for.
 
     Raises:
-        ModelError: no such file, not a model, or weights in a side file.
+        ModelError: no such file, not a model, or not one plain graph with its weights.
     """
     options = onnxruntime.SessionOptions()
     options.log_severity_level = LOG_FATAL_ONLY
@@ -172,19 +181,18 @@ def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
-    # A model is one file. Nothing can lie below the null device, so weights kept in a side file
-    # are refused even where that file happens to be in reach.
+    # A second lock behind `read_model`: nothing can lie below the null device.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+    content = read_model(path)
+    # Its fallback tries the same again, and prints on stdout, where records go.
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
-    try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
     except LOAD_ERRORS as error:
-        if "xternal" in str(error):
-            raise ModelError(f"{path}: keeps its weights in a side file, expected one file: export it again") from error
-        raise ModelError(f"{path}: not a model that onnxruntime can load: {error}") from error
+        raise ModelError(f"{path}: not a model that onnxruntime can load: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:LONGEST_REASON]
 
 
 def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int | str, ...]]) -> None:

@@ -6,6 +6,8 @@ BridgeError
 |   +-- LinkLostError          the link was there and is gone
 +-- BaselineRefusedError (ValueError)  the pad moved or was loaded while zeroing
 +-- RecordingError (ValueError)        a recording or baseline file that cannot be used
++-- NpzError (ValueError)              an npz file that is not plain arrays
++-- SensorFileError (ValueError)       a sensor file that cannot be used
 +-- SourceError (ValueError)           a text that names no source
 
 Bad frames, skipped bytes and torn scans are counted, never raised.
@@ -34,6 +36,14 @@ class BaselineRefusedError(BridgeError, ValueError):
 
 class RecordingError(BridgeError, ValueError):
     """A recording or baseline file that cannot be used."""
+
+
+class NpzError(BridgeError, ValueError):
+    """An npz file that is damaged, larger than expected, or not plain arrays."""
+
+
+class SensorFileError(BridgeError, ValueError):
+    """A sensor file that cannot be used."""
 
 
 class SourceError(BridgeError, ValueError):

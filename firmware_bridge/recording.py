@@ -1,10 +1,10 @@
 """Recordings of scans, read from disk: CSV rows, or what the npz sink wrote."""
 
 import csv
-import io
+import itertools
 import re
-import zipfile
-import zlib
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -12,9 +12,10 @@ from typing import Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import RecordingError
+from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.scan import ABSENT
+from firmware_bridge.npz import read_npz
+from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import NS_PER_S
 
 NPZ_FORMAT: Final = "tactile-recording"
@@ -22,9 +23,23 @@ NPZ_VERSION: Final = 1
 _NPZ_REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
 HIGHEST_COUNT: Final = 0xFFFF
 
+MOST_CSV_BYTES: Final = 1 << 30
+"""Some eight hours of one sensor at 100 Hz."""
+LONGEST_CSV_LINE_BYTES: Final = 1 << 14
+"""Fifty times a row of counts."""
+MOST_NPZ_BYTES: Final = 1 << 31
+"""Of the arrays that are read: a day of one sensor at 100 Hz."""
+MOST_SENSORS: Final = 64
+"""On one wire there can be sixteen."""
+RATES_HZ: Final = (1e-3, 1e5)
+"""Beyond them periods in ns overflow, or are none."""
+LAST_TIME_NS: Final = 1 << 60
+"""36 years: sums of two times stay below 2^63."""
+
 CSV_HEADER: Final = tuple(f"txl{taxel}_{axis}" for taxel in range(1, USPA44.taxel_count + 1) for axis in AXES)
 _META_NAME: Final = "meta_data.csv"
 _META_RATE: Final = "frequency_hz"
+_A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 _WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
 
 
@@ -84,30 +99,48 @@ def load_recording(path: str | Path) -> Recording:
 
 def _load_csv(path: Path) -> Recording:
     rows = _csv_rows(path)
-    if not rows:
+    header = next(rows, None)
+    if header is None:
         _refuse(path, 1, "an empty file", "a header and rows of counts")
-    _check_header(path, rows[0])
-    if len(rows) == 1:
+    _check_header(path, header)
+    values = array("i")  # a list of rows would take ten times the file
+    for line, row in enumerate(rows, 2):
+        values.extend(_count_row(path, line, row))
+    if not values:
         _refuse(path, 2, "the end of the file", "a row of counts")
-    values = [_count_row(path, line, row) for line, row in enumerate(rows[1:], 2)]
-    taxels = np.array(values, dtype=np.int32).reshape(-1, USPA44.rows, USPA44.cols, len(AXES))
+    taxels = np.frombuffer(values, dtype=np.int32).reshape(-1, USPA44.rows, USPA44.cols, len(AXES))
     counts = np.ascontiguousarray(taxels.transpose(0, 3, 1, 2))
     return Recording(path, (Track(path.stem, counts, time_ns=None),), _meta_rate_hz(path.with_name(_META_NAME)))
 
 
-def _csv_rows(path: Path) -> list[list[str]]:
-    data = path.read_bytes()
+def _csv_rows(path: Path) -> Iterator[list[str]]:
+    """Row by row, each of one line."""
+    read_bytes = 0
+    with path.open("rb") as file:
+        for number in itertools.count(1):
+            line = file.readline(LONGEST_CSV_LINE_BYTES + 1)
+            read_bytes += len(line)
+            if not line:
+                return
+            if len(line) > LONGEST_CSV_LINE_BYTES:
+                _refuse(path, number, f"a line longer than {LONGEST_CSV_LINE_BYTES} bytes", "a row of counts")
+            if read_bytes > MOST_CSV_BYTES:
+                _refuse(path, number, f"a file larger than {MOST_CSV_BYTES:,} bytes", "a smaller one: cut it in parts")
+            yield _csv_row(path, number, line)
+
+
+def _csv_row(path: Path, number: int, line: bytes) -> list[str]:
     try:
-        text = data.decode("utf-8-sig")
+        text = line.decode("utf-8-sig" if number == 1 else "utf-8")
     except UnicodeDecodeError as error:
-        _refuse(path, data[: error.start].count(b"\n") + 1, f"byte {data[error.start]:#04x}", "UTF-8 text")
+        _refuse(path, number, f"byte {line[error.start]:#04x}", "UTF-8 text")
     # A number cut short is still a number: only the line end shows that the last row is whole.
-    if text and not text.endswith("\n"):
-        _refuse(path, text.count("\n") + 1, "a last line without its end", "a whole file: copy it again")
+    if not text.endswith("\n"):
+        _refuse(path, number, "a last line without its end", "a whole file: copy it again")
     try:
-        return list(csv.reader(io.StringIO(text, newline=""), strict=True))
+        return next(csv.reader([text], strict=True))
     except csv.Error as error:
-        raise RecordingError(f"{path}: not CSV: {error}") from error
+        raise RecordingError(f"{path}, line {number}: not CSV: {error}") from error
 
 
 def _check_header(path: Path, header: list[str]) -> None:
@@ -118,7 +151,7 @@ def _check_header(path: Path, header: list[str]) -> None:
         _refuse(
             path, 1, f"columns {', '.join(names[:4])}, ...", f"x, y, z of each taxel side by side: {_header_text()}"
         )
-    _refuse(path, 1, f"{len(names)} columns: {', '.join(names[:4])}, ...", f"{len(CSV_HEADER)}: {_header_text()}")
+    _refuse(path, 1, f"{len(names)} columns: {', '.join(names[:4])[:60]}, ...", f"{len(CSV_HEADER)}: {_header_text()}")
 
 
 def _header_text() -> str:
@@ -142,7 +175,7 @@ def _count(path: Path, line: int, cell: str) -> int:
 def _meta_rate_hz(path: Path) -> float | None:
     if not path.is_file():
         return None
-    rows = _csv_rows(path)
+    rows = list(itertools.islice(_csv_rows(path), 2))
     if not rows or _META_RATE not in rows[0]:
         return None
     column = rows[0].index(_META_RATE)
@@ -151,9 +184,13 @@ def _meta_rate_hz(path: Path) -> float | None:
         rate_hz = float(cell)
     except ValueError:
         rate_hz = 0.0
-    if not 0 < rate_hz < float("inf"):
-        _refuse(path, 2, f"{_META_RATE} '{cell}'", "a positive number")
+    if not _is_rate(rate_hz):
+        _refuse(path, 2, f"{_META_RATE} '{cell[:20]}'", _A_RATE)
     return rate_hz
+
+
+def _is_rate(rate_hz: float) -> bool:
+    return RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
 
 
 def _refuse(path: Path, line: int, got: str, expected: str) -> NoReturn:
@@ -173,34 +210,46 @@ def _load_npz(path: Path) -> Recording:
         if array.dtype.kind not in kinds or array.shape != counts.shape[:1]:
             kind = "text" if kinds == "U" else "whole numbers"
             _refuse_array(path, name, f"{array.dtype} of shape {array.shape}", f"{kind} of shape {counts.shape[:1]}")
-    tracks = []
-    for sensor in dict.fromkeys(arrays["sensor"].tolist()):
-        mine = arrays["sensor"] == sensor
-        time_ns = arrays["time_ns"][mine].astype(np.int64)
-        if (np.diff(time_ns) < 0).any():
-            _refuse_array(path, "time_ns", f"times of sensor {sensor!r} that go back", "times that never fall")
-        tracks.append(Track(str(sensor), counts[mine], time_ns))
+    tracks = [
+        Track(sensor, counts[mine], _npz_times(path, sensor, arrays["time_ns"][mine]))
+        for sensor in _npz_sensors(path, arrays["sensor"])
+        for mine in [arrays["sensor"] == sensor]
+    ]
     return Recording(path, tuple(tracks), _npz_rate_hz(path, arrays.get("rate_hz")))
 
 
 def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {}
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.lib.npyio.NpzFile):
-            with loaded:
-                arrays = {name: loaded[name] for name in (*_NPZ_REQUIRED, "rate_hz") if name in loaded}
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:
-        raise RecordingError(f"{path}: not a whole .npz archive of plain arrays: {error}") from error
+        arrays = read_npz(path, (*_NPZ_REQUIRED, "rate_hz"), MOST_NPZ_BYTES)
+    except NpzError as error:
+        raise RecordingError(f"{path}: {error}") from error
     for name in _NPZ_REQUIRED:
         if name not in arrays:
             raise RecordingError(f"{path}, array '{name}': missing, expected what the npz sink writes")
     return arrays
 
 
+def _npz_sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:
+    names = list(dict.fromkeys(sensors.tolist()))
+    if len(names) > MOST_SENSORS:
+        _refuse_array(path, "sensor", f"{len(names)} sensors", f"at most {MOST_SENSORS}")
+    for name in names:
+        if not is_sensor_name(name):
+            _refuse_array(path, "sensor", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    return names
+
+
+def _npz_times(path: Path, sensor: str, times: NDArray[np.integer]) -> NDArray[np.int64]:
+    if times.min() < 0 or times.max() > LAST_TIME_NS:
+        _refuse_array(path, "time_ns", f"times {times.min()}..{times.max()}", f"0..{LAST_TIME_NS}")
+    if (times[1:] < times[:-1]).any():  # not a difference, which wraps around
+        _refuse_array(path, "time_ns", f"times of sensor {sensor!r} that go back", "times that never fall")
+    return times.astype(np.int64)
+
+
 def _check_npz_counts(path: Path, counts: NDArray[Any]) -> NDArray[np.int32]:
-    if counts.dtype.kind not in "iu" or counts.ndim != 4 or counts.shape[1] != len(AXES) or counts.size == 0:
-        expected = "whole numbers of shape (scans, 3, rows, cols), at least one scan"
+    if counts.dtype.kind not in "iu" or counts.shape[1:] != USPA44.scan_shape or counts.size == 0:
+        expected = f"whole numbers of shape (scans, {str(USPA44.scan_shape)[1:]}, at least one scan"
         _refuse_array(path, "counts", f"{counts.dtype} of shape {counts.shape}", expected)
     if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
         got = f"counts {counts.min()}..{counts.max()}"
@@ -214,8 +263,8 @@ def _check_npz_counts(path: Path, counts: NDArray[Any]) -> NDArray[np.int32]:
 def _npz_rate_hz(path: Path, rate: NDArray[Any] | None) -> float | None:
     if rate is None:
         return None
-    if rate.shape or rate.dtype.kind not in "iuf" or not 0 < float(rate) < float("inf"):
-        _refuse_array(path, "rate_hz", str(rate)[:40], "a positive number")
+    if rate.shape or rate.dtype.kind not in "iuf" or not _is_rate(float(rate)):
+        _refuse_array(path, "rate_hz", str(rate)[:40], _A_RATE)
     return float(rate)
 
 

@@ -3,6 +3,7 @@
 Source: Wu and Liu 2024, Sec. IV-A, and the layout of the files that their code reads.
 """
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -54,12 +55,14 @@ def load_authors_taps(path: Path) -> AuthorsTaps:
         DatasetError: absent, not of that kind, cut short, or a pickle that names what no array needs.
     """
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that look like Python 2's, and of escapes in strings
             records = _records(file)
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
     except (*BROKEN, *_BROKEN_HEADER) as error:
-        raise DatasetError(f"{path} is none of the authors' files: {error or type(error).__name__}") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DatasetError(f"{path} is none of the authors' files: {reason}") from error
     if not records:
         raise DatasetError(f"{path} holds no records, expected up to 81")
     taps = [_tap(record, f"{path}, record {number}") for number, record in enumerate(records)]

@@ -7,8 +7,6 @@ of the press, nothing is felt at 0, and between frames all goes along straight l
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from firmware_bridge.npz import read_npz
 from train.errors import DatasetError
 from train.nuisances import Nuisances, Seed, read_windows
 from train.resample import resample, resample_touching
@@ -25,6 +24,8 @@ from train.simulation import FINE_SCALE, FRAMES
 SCHEMA: Final = "tactile-edge-sr sequences"
 VERSION: Final = 1
 
+_MOST_FACTS_BYTES: Final = 1 << 22
+"""A configuration takes some kB."""
 _RESAMPLED_AT_ONCE: Final = 256
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "surfaces": ("U", "n"),
@@ -183,24 +184,28 @@ def load_sequences(path: Path) -> Sequences:
         DatasetError: absent, not ours, of a newer schema, incomplete, or damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile) or "schema" not in file or str(file["schema"]) != SCHEMA:
-                raise DatasetError(f"{path} is no file of sequences: make one with 'python -m train.generate'")
-            if (version := int(file["version"])) > VERSION:
-                raise DatasetError(f"{path} has schema version {version}, newer than {VERSION}: update this program")
-            facts = json.loads(str(file["facts"]))
-            arrays = {name: file[name] for name in _AXES}
-            arrays["touching"] = _unpacked(arrays["touching"], arrays["unit_patterns"])
+        about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
+        if str(about.get("schema")) != SCHEMA:
+            raise DatasetError(f"{path} is no file of sequences: make one with 'python -m train.generate'")
+        if (version := int(about["version"])) > VERSION:
+            raise DatasetError(f"{path} has schema version {version}, newer than {VERSION}: update this program")
+        facts: Any = json.loads(str(about["facts"]))
+        found = read_npz(path, _AXES, path.stat().st_size)  # nothing in it is compressed
+        arrays = {name: found[name] for name in _AXES}
+        arrays["touching"] = _unpacked(arrays["touching"], arrays["unit_patterns"])
+        told: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
+        hashed = str(facts.get("sha256"))[:64]
     except DatasetError:
         raise
     except FileNotFoundError:
         raise DatasetError(f"{path}: no such file; make one with 'python -m train.generate {path}'") from None
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DatasetError(f"{path} is no file of sequences, or a damaged one ({error}): make it again") from error
     _check_axes(path, arrays)
-    loaded = Sequences(**arrays, **{name: facts.get(name) for name in ("scale", "seed", "config")})
-    if (found := loaded.sha256()) != facts.get("sha256"):
-        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it says {facts.get('sha256')}: make it again")
+    loaded = Sequences(**arrays, **told)
+    if (found := loaded.sha256()) != hashed:
+        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it says {hashed}: make it again")
+    _check_facts(path, told)
     return loaded
 
 
@@ -276,7 +281,15 @@ def _unpacked(touching: NDArray[np.uint8], patterns: NDArray[np.float16]) -> NDA
     """Masks that a file keeps as bits, along the last axis."""
     if not patterns.ndim:
         raise ValueError("unit_patterns has no axes")
+    if touching.ndim != patterns.ndim or touching.shape[-1] != -(-patterns.shape[-1] // 8):
+        raise ValueError(f"touching is {touching.shape}, which is no mask of {patterns.shape}")
     return np.unpackbits(touching, axis=-1, count=patterns.shape[-1]).astype(bool)
+
+
+def _check_facts(path: Path, facts: Mapping[str, Any]) -> None:
+    kinds = {"scale": int, "seed": int, "config": dict}
+    if not all(type(facts.get(name)) is kind for name, kind in kinds.items()) or facts["scale"] < 1:
+        raise DatasetError(f"{path}: scale, seed or config is missing or of another type: make it again")
 
 
 def _check_axes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

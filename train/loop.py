@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, Final, Protocol
 
 import torch
@@ -292,8 +293,12 @@ class _Keeper:
         """Steps and seconds that lie behind, both 0 for a new run."""
         if not self._path.exists():
             return 0, 0.0
-        state = torch.load(self._path, map_location=device, weights_only=True)
-        if state["recipe"] != self._hash:
+        try:
+            state = torch.load(self._path, map_location=device, weights_only=True)
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise NotResumableError(f"{self._path} is no state of a run ({reason}): delete it to start anew") from error
+        if not isinstance(state, dict) or state.get("recipe") != self._hash:
             raise NotResumableError(
                 f"{self._path} is of a run with another recipe or on other data: delete it to start anew"
             )

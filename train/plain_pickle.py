@@ -6,7 +6,9 @@ types. numpy's own ones are not used, as they trust their input. Any other name 
 was called with it.
 """
 
+import io
 import pickle
+import pickletools
 import re
 from collections.abc import Callable, Mapping
 from math import prod
@@ -14,6 +16,8 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from firmware_bridge.bounded import read_up_to
 
 BROKEN: Final = (
     pickle.UnpicklingError,
@@ -29,6 +33,15 @@ BROKEN: Final = (
 )
 """What a broken pickle makes the unpickler raise."""
 
+MOST_BYTES: Final = 1 << 30
+_KEEPING: Final = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
+_NEEDED: Final = (
+    "PROTO FRAME STOP MARK POP POP_MARK MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD NONE NEWTRUE "
+    "NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING UNICODE "
+    "BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_TUPLE TUPLE TUPLE1 "
+    "TUPLE2 TUPLE3 EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS"
+)
+_OPERATIONS: Final = _KEEPING | frozenset(_NEEDED.split())
 _PLAIN_CODE: Final = re.compile(r"[biuf][0-9]{1,2}|U[1-9][0-9]{0,5}|O8?")
 
 
@@ -37,8 +50,20 @@ def load_plain(file: BinaryIO) -> Any:
 
     Raises:
         pickle.UnpicklingError: a name that no array needs, or an array that is none; broken ones raise any of BROKEN.
+        OSError: it cannot be read, or is larger than MOST_BYTES.
     """
-    return plain_value(_PlainUnpickler(file).load())
+    content = read_up_to(file, MOST_BYTES)
+    _check_operations(content)
+    return plain_value(_PlainUnpickler(io.BytesIO(content)).load())
+
+
+def _check_operations(content: bytes) -> None:
+    """Refuse what the unpickler allocates for on a word alone: lengths beyond the end, places far off in its memo."""
+    for count, (operation, argument, _) in enumerate(pickletools.genops(content), 1):
+        if operation.name not in _OPERATIONS:
+            raise pickle.UnpicklingError(f"the operation {operation.name}, which no array needs")
+        if operation.name in _KEEPING and int(argument or 0) > count:
+            raise pickle.UnpicklingError(f"a value kept in place {argument} before {count} operations")
 
 
 def plain_value(value: Any) -> Any:

@@ -64,8 +64,8 @@ def compared(new: Record, old: dict[str, Any], path: Path) -> Comparison:
             differences=tuple(_differences(new, old)),
             peak={threads: peak / peaks[threads] for threads, peak in new.peak_gmac_s.items() if threads in peaks},
         )
-    except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise BenchError(f"{path} is damaged ({error!r}): run that bench again") from error
+    except (AttributeError, LookupError, TypeError, ArithmeticError, ValueError) as error:
+        raise BenchError(f"{path} is damaged ({repr(error)[:200]}): run that bench again") from error
 
 
 def told(name: str, threads: int, load: bool) -> str:

@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 SEED: Final = 0
+MOST_BLOCKS: Final = 10_000
+"""As many as resampling can hold: each is drawn a thousand times."""
+LONGEST_US: Final = 1e12
 _RESAMPLES: Final = 2000
 _QUANTILES: Final = (0.025, 0.975)
 
@@ -39,11 +42,14 @@ def ratio_of(over: Sequence[float], under: Sequence[float], *, paired: bool) -> 
         paired: whether the blocks of one place were measured together, and are drawn together.
 
     Raises:
-        ValueError: a measurement without blocks, or pairs that do not match.
+        ValueError: a measurement without blocks, with one that is no run time, or pairs that do not match.
     """
     above, below = np.asarray(over, dtype=np.float64), np.asarray(under, dtype=np.float64)
     if not len(above) or not len(below) or (paired and len(above) != len(below)):
         raise ValueError(f"{len(above)} blocks over {len(below)}, expected some, and as many where they are paired")
+    for blocks in (above, below):
+        if blocks.ndim != 1 or len(blocks) > MOST_BLOCKS or not ((blocks > 0) & (blocks < LONGEST_US)).all():
+            raise ValueError(f"blocks {str(blocks[:4])[:60]}, expected at most {MOST_BLOCKS} run times in us")
     rng = np.random.default_rng(SEED)
     drawn_above = rng.integers(len(above), size=(_RESAMPLES, len(above)))
     drawn_below = drawn_above if paired else rng.integers(len(below), size=(_RESAMPLES, len(below)))

@@ -16,6 +16,7 @@ import onnxruntime
 
 from edge.bench.subjects import random_feeds
 from edge.errors import ModelError
+from edge.onnx_file import read_model
 from edge.session import LOAD_ERRORS, LOG_FATAL_ONLY
 
 Shape = Sequence[int]
@@ -83,7 +84,9 @@ def macs_of(path: Path) -> Macs:
     with tempfile.TemporaryDirectory() as folder:
         options.profile_file_prefix = str(Path(folder) / "macs")
         try:
-            session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            session = onnxruntime.InferenceSession(
+                read_model(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
             session.run(None, random_feeds(session, path))
         except LOAD_ERRORS as error:
             raise ModelError(f"{path}: cannot be run to count its multiply-accumulates: {error}") from error

@@ -18,9 +18,12 @@ from edge.bench.soak import Soak
 from edge.bench.system import StartUp, SystemRow
 from edge.bench.timing import Pace, Times
 from edge.bench.verdicts import Verdict
+from firmware_bridge.bounded import read_bounded
 
 FORMAT: Final = "tactile bench"
 VERSION: Final = 1
+MOST_FILE_BYTES: Final = 1 << 26
+"""A hundred times a bench of all models."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +221,8 @@ def read_record(path: Path) -> dict[str, Any]:
         BenchError: no such file, no bench, or one of another version.
     """
     try:
-        told = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        told = json.loads(read_bounded(path, MOST_FILE_BYTES))
+    except (OSError, ValueError, RecursionError) as error:
         raise BenchError(
             f"{path} cannot be read ({error}): expected the bench.json of 'edge-sr bench --out'"
         ) from error
@@ -228,6 +231,6 @@ def read_record(path: Path) -> dict[str, Any]:
         raise BenchError(f"{path} is no bench: expected the bench.json of 'edge-sr bench --out'")
     if kind[1] != VERSION:
         raise BenchError(
-            f"{path} is of version {kind[1]!r}, expected {VERSION}: run that bench again with this release"
+            f"{path} is of version {repr(kind[1])[:40]}, expected {VERSION}: run that bench again with this release"
         )
     return told

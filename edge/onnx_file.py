@@ -1,0 +1,145 @@
+"""What a file must be before onnxruntime sees it: one plain graph that holds its own weights, of bounded size.
+
+onnxruntime follows a tensor into a side file below the model's folder, and a graph into graphs within it, which may
+run for ever. No model of ours has either. The walk below knows the fields that lead to them, passes over all else,
+weights among it, and refuses what it does not understand: what it let pass unread, onnxruntime might read.
+
+Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
+"""
+
+from collections.abc import Iterator, Mapping
+from math import prod
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from edge.errors import ModelError
+from firmware_bridge.bounded import read_bounded
+
+MOST_BYTES: Final = 1 << 28
+"""A hundred times the largest bundled model, ten times the paper's network."""
+MOST_FIELDS: Final = 1 << 20
+"""Some seconds of walking; the bundled models have a thousand and a half."""
+MOST_DIMS: Final = 64
+"""Of weights: the product of a million dimensions takes hours."""
+_HIGHEST_TAG: Final = (1 << 32) - 1
+_TAG_BYTES: Final = 5
+_VARINT_BYTES: Final = 10
+_VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
+_FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
+
+_SIDE_FILE: Final = "keeps its weights in a side file, expected one file"
+_NESTED: Final = "has graphs within its graph, expected one plain graph"
+_BROKEN: Final = "not a model that onnxruntime can load: damaged, or no ONNX file"
+_SPARSE: Final = "has sparse weights, expected plain ones"
+
+_Message = Mapping[int, "_Message | str"]
+"""Number of a field -> what message it holds, or why it is refused."""
+_DIMS: Final = 1
+_LOCATION: Final = 14
+_TENSOR: Final[_Message] = {13: _SIDE_FILE}
+_ATTRIBUTE: Final[_Message] = {5: _TENSOR, 6: _NESTED, 10: _TENSOR, 11: _NESTED, 22: _SPARSE, 23: _SPARSE}
+_NODE: Final[_Message] = {5: _ATTRIBUTE}
+_GRAPH: Final[_Message] = {1: _NODE, 5: _TENSOR, 15: _SPARSE}
+_MODEL: Final[_Message] = {7: _GRAPH, 20: _NESTED, 25: _NESTED}
+
+
+class _Field(NamedTuple):
+    """A field's number and kind, its number if it is one, and where its content lies."""
+
+    number: int
+    wire: int
+    value: int
+    start: int
+    end: int
+
+
+def read_model(path: Path) -> bytes:
+    """An ONNX file's content, for onnxruntime to load from memory.
+
+    Raises:
+        ModelError: no such file, too large, or not one plain graph with its weights.
+    """
+    try:
+        content = read_bounded(path, MOST_BYTES)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        check_plain(content)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}: export it again") from error
+    return content
+
+
+def check_plain(content: bytes) -> None:
+    """Refuse all but one plain graph with its weights.
+
+    Raises:
+        ModelError: weights in another file, sparse or of more elements than the file can hold; graphs within the
+            graph; or not the encoding that ONNX has.
+    """
+    waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
+    fields = 0
+    while waiting:
+        message, start, end = waiting.pop()
+        dims: list[int] = []
+        for field in _fields(content, start, end):
+            fields += 1
+            if fields > MOST_FIELDS:
+                raise ModelError(f"has more than {MOST_FIELDS} fields, expected a smaller graph")
+            kind = message.get(field.number)
+            if isinstance(kind, str):
+                raise ModelError(kind)
+            if kind is not None and field.wire == _LENGTH:
+                waiting.append((kind, field.start, field.end))
+            if message is _TENSOR:
+                if field.number == _LOCATION and (field.wire != _VARINT or field.value):
+                    raise ModelError(_SIDE_FILE)
+                if field.number == _DIMS:
+                    dims += _dims(content, field)
+        # Four bits are the least that an element takes.
+        if dims and (len(dims) > MOST_DIMS or prod(dims) > 2 * len(content)):
+            raise ModelError(f"has weights of shape {dims[:8]}, more than its {len(content)} bytes can hold")
+
+
+def _dims(content: bytes, field: _Field) -> Iterator[int]:
+    if field.wire == _VARINT:
+        yield field.value
+    position = field.start
+    while field.wire == _LENGTH and position < field.end:  # packed
+        value, position = _varint(content, position, field.end, _VARINT_BYTES)
+        yield value
+
+
+def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
+    while position < end:
+        tag, position = _varint(content, position, end, _TAG_BYTES)
+        number, wire = tag >> 3, tag & 7
+        value = 0
+        if wire == _VARINT:
+            start = position
+            value, position = _varint(content, position, end, _VARINT_BYTES)
+        elif wire == _LENGTH:
+            length, start = _varint(content, position, end, _VARINT_BYTES)
+            position = start + length
+        elif wire in _FIXED_BYTES:
+            start = position
+            position += _FIXED_BYTES[wire]
+        else:
+            raise ModelError(_BROKEN)
+        if number == 0 or tag > _HIGHEST_TAG or position > end:
+            raise ModelError(_BROKEN)
+        yield _Field(number, wire, value, start, position)
+
+
+def _varint(content: bytes, position: int, end: int, most_bytes: int) -> tuple[int, int]:
+    """A number and the place behind it; bits beyond 64 are refused by the limits on what it stands for."""
+    value = 0
+    for shift in range(0, 7 * most_bytes, 7):
+        if position >= end:
+            break
+        byte = content[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position
+    raise ModelError(_BROKEN)
