@@ -1,7 +1,7 @@
 """Taxel readings to scans. No I/O, no clock.
 
 The wire has no end-of-scan marker. A scan closes when every taxel has come, or when a taxel comes
-again (then the scan is torn), or when it has stood open too long for its readings to belong together.
+again (then the scan is torn), or when too much time has passed for its readings to belong together.
 
 What this cannot see: where a cycle of the controller begins. Who joins in mid-cycle, or loses the
 first frame of one, gets complete scans that each hold taxels of two neighbouring cycles, until the
@@ -14,15 +14,16 @@ from typing import Final
 
 import numpy as np
 
+from firmware_bridge.device_clock import DeviceTime
 from firmware_bridge.geometry import SensorGeometry
 from firmware_bridge.scan import ABSENT, Scan, ScanSeries
-from firmware_bridge.slcan import PACKED_BYTES, USUAL_LINE_BYTES, CanFrame, SlcanDecoder
-from firmware_bridge.xela import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
+from firmware_bridge.xela import Cycle, Reading
 
 LONGEST_SCAN_NS: Final = 1_000_000_000
 """The slowest sensor on record renews a taxel four times a second; older readings are another scan's."""
-
-_MOST_ORDERS: Final = 1024
+LONGEST_PAUSE_NS: Final = 60_000_000
+"""Between two readings of one scan: that sensor's come 17 ms apart, and an FTDI chip keeps them for 16. After a longer
+one, as where the bus was off for a moment, what comes is of another press."""
 
 _COUNTED: Final[tuple[str, ...]] = (
     "scans",
@@ -32,6 +33,7 @@ _COUNTED: Final[tuple[str, ...]] = (
     "missing_taxels",
     "duplicates",
     "unconfirmed",
+    "abandoned",
 )
 
 
@@ -50,34 +52,43 @@ class ScanAssembler:
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
 
-    def feed(self, reading: Reading, time_ns: int) -> list[Scan]:
+    def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
         """Scans that this reading closes.
 
         Args:
             reading: of one taxel.
             time_ns: monotonic time of its arrival, in [ns].
+            device: when it was on the bus, by the device's time stamps.
         """
         self._readings += 1
         self._newest_ns = time_ns
         sensor = self._sensors.get(reading.sensor)
         if sensor is None:
             sensor = self._sensors[reading.sensor] = _Sensor(reading.sensor, self._geometry)
-        return sensor.feed(reading, time_ns)
+        return sensor.feed(reading, time_ns, device)
 
-    def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int) -> Scan | None:
-        """The scan of a cycle that came as one; None if it must be fed reading by reading, and nothing was done.
+    def takes(self, cycle: Cycle) -> bool:
+        """Whether a cycle may be fed as one; otherwise it must be, reading by reading."""
+        sensor = self._sensors.get(cycle.sensor)
+        return sensor is not None and sensor.between_cycles(cycle.taxels[0])
+
+    def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None = None) -> Scan:
+        """The scan of a cycle that came as one, which `takes` has said may be.
 
         Args:
             cycle: its sensor, and the order of its taxels.
             packed: its frames, as `SlcanDecoder.cut` packs them.
             time_ns: monotonic time of its arrival, in [ns].
+            device: when its last frame was on the bus, by the device's time stamps.
         """
-        sensor = self._sensors.get(cycle.sensor)
-        if sensor is None or not sensor.between_cycles(cycle.taxels[0]):
-            return None
         self._readings += len(cycle.taxels)
         self._newest_ns = time_ns
-        return sensor.feed_cycle(cycle, packed, time_ns)
+        return self._sensors[cycle.sensor].feed_cycle(cycle, packed, time_ns, device)
+
+    def begin_anew(self) -> None:
+        """Give up open scans: the link broke, and what comes next does not belong to them."""
+        for sensor in self._sensors.values():
+            sensor.begin_anew()
 
     def fewest_missing(self) -> int:
         """Readings that must come at least before a scan can close whole.
@@ -91,18 +102,18 @@ class ScanAssembler:
         """Sums over all sensors.
 
         readings; duplicates: the same frame twice in a row; unconfirmed: readings of sensors that
-        do not exist (yet); scans; torn_wire: taxels missing; torn_source: complete, but only partly
-        renewed; repeated: nothing renewed; missing_taxels.
+        do not exist (yet); abandoned: readings of scans that a broken link left open; scans; torn_wire:
+        taxels missing; torn_source: complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
         """
         totals = dict.fromkeys(_COUNTED, 0)
-        for sensor in self._sensors.values():
+        for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and find a sensor
             for name, count in sensor.counters().items():
                 totals[name] += count
         return {"readings": self._readings} | totals
 
     def sensor_counters(self) -> dict[str, dict[str, int]]:
         """The same counters apart for each sensor that exists."""
-        return {name: sensor.counters() for name, sensor in self._sensors.items() if sensor.confirmed}
+        return {name: sensor.counters() for name, sensor in list(self._sensors.items()) if sensor.confirmed}
 
 
 class _Sensor:
@@ -116,10 +127,16 @@ class _Sensor:
         self._taxels: dict[int, Reading] = {}
         self._opened_ns = 0
         self._newest_ns = 0
+        self._device: DeviceTime | None = None
         self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
     def counters(self) -> dict[str, int]:
         return dict(self._counts)
+
+    def begin_anew(self) -> None:
+        self._counts["abandoned"] += len(self._taxels)
+        self._taxels = {}
+        self._last = None
 
     def closes_before_long(self, now_ns: int) -> bool:
         """It exists, and the scan that may be open is not one that it left unfinished."""
@@ -134,14 +151,17 @@ class _Sensor:
         """No scan is open, and this taxel was not the last one, so that it cannot be a duplicate."""
         return not self._taxels and (self._last is None or self._last.taxel != next_taxel)
 
-    def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int) -> Scan:
+    def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None) -> Scan:
         counts = cycle.counts(packed)
         last = cycle.taxels[-1]
         self._last = Reading(cycle.sensor, last, *counts[:, last].tolist())
         self.confirmed = True
-        return self._count(self._series.close_whole(counts.reshape(self._geometry.scan_shape), time_ns), missing=0)
+        counts = counts.reshape(self._geometry.scan_shape)
+        return self._count(
+            self._series.close_whole(counts, time_ns, None if device is None else device.host_ns), missing=0
+        )
 
-    def feed(self, reading: Reading, time_ns: int) -> list[Scan]:
+    def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
         # Twice the same frame in a row is the link's doing. Closing on it would move the cut
         # between scans for ever, and skipping it loses nothing.
         if reading == self._last:
@@ -149,15 +169,21 @@ class _Sensor:
             return []
         self._last = reading
         closed: list[Scan] = []
-        if self._taxels and (reading.taxel in self._taxels or time_ns - self._opened_ns > LONGEST_SCAN_NS):
+        if self._taxels and (reading.taxel in self._taxels or self._is_over(time_ns, device)):
             closed += self._close()
         if not self._taxels:
             self._opened_ns = time_ns
         self._taxels[reading.taxel] = reading
-        self._newest_ns = time_ns
+        self._newest_ns, self._device = time_ns, device
         if len(self._taxels) == self._geometry.taxel_count:
             closed += self._close()
         return closed
+
+    def _is_over(self, time_ns: int, device: DeviceTime | None) -> bool:
+        """What comes now cannot be of the open scan. Where the device tells times, our own being late splits none."""
+        if device is not None and self._device is not None:
+            return device.own_ns - self._device.own_ns > LONGEST_PAUSE_NS
+        return time_ns - self._newest_ns > LONGEST_PAUSE_NS
 
     def _close(self) -> list[Scan]:
         taxels, self._taxels = self._taxels, {}
@@ -169,7 +195,8 @@ class _Sensor:
         axes_last = np.full((self._geometry.taxel_count, 3), ABSENT, dtype=np.int32)
         axes_last[list(taxels)] = np.array([(reading.x, reading.y, reading.z) for reading in taxels.values()])
         counts = np.ascontiguousarray(axes_last.T).reshape(self._geometry.scan_shape)
-        return [self._count(self._series.close(counts, self._newest_ns), missing)]
+        device_ns = None if self._device is None else self._device.host_ns
+        return [self._count(self._series.close(counts, self._newest_ns, device_ns), missing)]
 
     def _count(self, scan: Scan, missing: int) -> Scan:
         self._counts["scans"] += 1
@@ -179,60 +206,3 @@ class _Sensor:
             self._counts["repeated"] += scan.repeated
             self._counts["torn_source"] += missing == 0 and scan.torn
         return scan
-
-
-class SlcanScans:
-    """slcan text to scans: the three pure stages in a row."""
-
-    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self._model = model
-        self._cycle_bytes = model.geometry.taxel_count * PACKED_BYTES
-        self._cycles: dict[bytes, Cycle | None] = {}
-        self._decoder = SlcanDecoder()
-        self._assembler = ScanAssembler(model.geometry)
-        self._foreign = 0
-
-    def feed(self, data: bytes, time_ns: int) -> list[Scan]:
-        """Scans that close within `data`, which arrived at `time_ns` [ns]."""
-        scans: list[Scan] = []
-        for piece in self._decoder.cut(data):
-            if isinstance(piece, CanFrame):
-                self._feed_reading(decode(piece, self._model), time_ns, scans)
-                continue
-            start = 0
-            while start < len(piece):
-                scan = self._feed_cycle(piece[start : start + self._cycle_bytes], time_ns)
-                if scan is not None:
-                    scans.append(scan)
-                    start += self._cycle_bytes
-                else:
-                    self._feed_reading(decode_packed(piece, start, self._model), time_ns, scans)
-                    start += PACKED_BYTES
-        return scans
-
-    def bytes_until_scan(self) -> int:
-        """How many bytes must come at least before a scan can close whole; from 1."""
-        return max(1, self._assembler.fewest_missing() * USUAL_LINE_BYTES - self._decoder.pending_bytes)
-
-    def counters(self) -> dict[str, int]:
-        """Counters of all stages; foreign: frames that are none of this model's taxels."""
-        return self._decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
-
-    def _feed_reading(self, reading: Reading | None, time_ns: int, scans: list[Scan]) -> None:
-        if reading is None:
-            self._foreign += 1
-        else:
-            scans += self._assembler.feed(reading, time_ns)
-
-    def _feed_cycle(self, packed: bytes, time_ns: int) -> Scan | None:
-        """The scan of a sensor's whole cycle; None where this is none, or one of readings before is still open."""
-        if len(packed) < self._cycle_bytes:
-            return None
-        can_ids = packed[::PACKED_BYTES] + packed[1::PACKED_BYTES]
-        if can_ids not in self._cycles:
-            if len(self._cycles) >= _MOST_ORDERS:  # frames of two sensors mix in many orders
-                self._cycles.clear()
-            high, low = can_ids[: len(can_ids) // 2], can_ids[len(can_ids) // 2 :]
-            self._cycles[can_ids] = self._model.cycle([h << 4 | b >> 4 for h, b in zip(high, low, strict=True)])
-        cycle = self._cycles[can_ids]
-        return None if cycle is None else self._assembler.feed_cycle(cycle, packed, time_ns)

@@ -5,14 +5,18 @@ LAST frame letter (t T r R) to the CR: hex digits hold no such letter, so a lett
 the start of a whole frame behind the wreck of another, or of noise. That text must fit its own
 length digit exactly, or nothing is given.
 
+An adapter stamps every line with a time, or none. Which, is learnt from LINES_TO_LEARN frames in a row
+of one form; from then on a frame of the other form is a bad line, until as many of those come in a row.
+So four data digits lost from a stamped line make no false frame without a stamp. Before anything is
+learnt, both are taken.
+
 What a prefix can do: nothing to the frame behind it, which is checked as if it stood alone. A data
 digit corrupted INTO a letter starts a false frame, but too few characters follow it for eight data
-bytes; only the length digit of a line with a time stamp (which we never ask for) leaves enough.
+bytes; only the length digit of a stamped line leaves enough, and what follows that has no stamp.
 
-The limit: slcan has no checksum on the serial leg. A flipped hex digit, a loss of exactly one
-line's length across two lines (the head of one frame with the tail of the next), and in a line with
-a time stamp the loss of four data digits, all give a well-formed frame that was never sent. Nobody
-can tell from the text. Such a value lives for one scan.
+The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one
+line's length across two lines (the head of one frame with the tail of the next), give a well-formed
+frame that was never sent. Nobody can tell from the text. Such a value lives for one scan.
 """
 
 import re
@@ -20,25 +24,46 @@ import struct
 from binascii import hexlify, unhexlify
 from typing import Final, NamedTuple
 
+from firmware_bridge.slcan_status import AdapterStatus
+
 CLOSE: Final = b"C\r"
 BITRATE_1M: Final = b"S8\r"
 OPEN: Final = b"O\r"
+STAMPS_ON: Final = b"Z1\r"
+STAMPS_OFF: Final = b"Z0\r"
 
 LONGEST_LINE: Final = 30
 """Characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp."""
 LAST_TIMESTAMP_MS: Final = 59_999
 
-USUAL_LINE_BYTES: Final = 22
-"""A standard frame of eight bytes without a time stamp, with its CR: what a sensor sends."""
-PACKED_BYTES: Final = 10
-"""Such a frame packed: twelve bits of id, four of length (8), eight bytes of data."""
+LINES_TO_LEARN: Final = 4
+"""Frames in a row of the form that is not the learnt one: no damage to a line makes so many of them."""
 
-_USUAL_LINES = re.compile(rb"(?:t[0-7][0-9A-Fa-f]{2}8[0-9A-Fa-f]{16}\r)+")
+PACKED_BYTES: Final = 10
+"""A usual frame packed: twelve bits of id, four of length (8), eight bytes of data."""
+STAMPED_BYTES: Final = 12
+"""The same and two bytes of time stamp, in [ms]."""
+
+_STAMP = rb"(?:[0-9A-Da-d][0-9A-Fa-f]{3}|[Ee](?:[0-9][0-9A-Fa-f]{2}|[Aa][0-5][0-9A-Fa-f]))"
+_USUAL = rb"(?:t[0-7][0-9A-Fa-f]{2}8[0-9A-Fa-f]{16}%s\r)+"
 _FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7}))([0-8])([0-9A-Fa-f]*)")
 _LINE_END = re.compile(rb"[\r\a]")
-_REPLY = re.compile(rb"[zZ]?|[VN][0-9A-Za-z]{4}|F[0-9A-Fa-f]{2}")
-_unpack_frames = struct.Struct(">H8s").iter_unpack
-_STATUS = re.compile(rb"s[awpb][0-9]{6}|e[1-9][abBcfoOs]{1,9}")
+_REPLY = re.compile(rb"[zZ]?|[VN][0-9A-Za-z]{4}")
+
+
+class _Form(NamedTuple):
+    """Lines of frames of eight bytes with a standard id, which is what a sensor sends."""
+
+    lines: re.Pattern[bytes]
+    line_bytes: int
+    frame_bytes: int
+    unpack: struct.Struct
+
+
+_FORMS: Final = {
+    False: _Form(re.compile(_USUAL % b""), 22, PACKED_BYTES, struct.Struct(">H8s")),
+    True: _Form(re.compile(_USUAL % _STAMP), 26, STAMPED_BYTES, struct.Struct(">H8sH")),
+}
 
 
 class CanFrame(NamedTuple):
@@ -51,23 +76,64 @@ class CanFrame(NamedTuple):
     timestamp_ms: int | None = None
 
 
+class PackedFrames(NamedTuple):
+    """A run of usual frames, PACKED_BYTES or STAMPED_BYTES each."""
+
+    data: bytes
+    frame_bytes: int
+
+
 class SlcanDecoder:
-    """Cuts a byte stream into frames. Any chunking gives the same frames and the same counters."""
+    """Cuts a byte stream into frames. Any chunking gives the same frames and the same counters.
+
+    Attributes:
+        status: what the adapter told of itself.
+    """
 
     def __init__(self) -> None:
+        self.status = AdapterStatus()
+        self._form: _Form | None = None
+        self._newest_stamped = False
+        self._same_in_a_row = 0
         self._pending = b""
         self._frames = 0
         self._bad_lines = 0
         self._non_ascii_lines = 0
         self._skipped_bytes = 0
+        self._late_stamps = 0
         self._replies = 0
         self._refusals = 0
-        self._status_lines = 0
 
     @property
     def pending_bytes(self) -> int:
         """Bytes of an unfinished line."""
         return len(self._pending)
+
+    @property
+    def usual_line_bytes(self) -> int:
+        """A usual frame's line as the adapter sends it, with its CR; the shorter one before that is learnt."""
+        return (self._form or _FORMS[False]).line_bytes
+
+    @property
+    def frames(self) -> int:
+        """Frames so far, of any sort."""
+        return self._frames
+
+    @property
+    def refusals(self) -> int:
+        """BELs so far."""
+        return self._refusals
+
+    @property
+    def late_stamps(self) -> int:
+        """Lines lost because their time stamp was beyond LAST_TIMESTAMP_MS."""
+        return self._late_stamps
+
+    def begin_anew(self) -> None:
+        """Give up an unfinished line: the link broke, and what comes next does not belong to it, nor has its form."""
+        self._skipped_bytes += len(self._pending)
+        self._pending = b""
+        self._form, self._same_in_a_row = None, 0
 
     def feed(self, data: bytes) -> list[CanFrame]:
         """Frames whose last byte lies in `data`; what comes after it waits for the next call."""
@@ -76,22 +142,26 @@ class SlcanDecoder:
             if isinstance(piece, CanFrame):
                 frames.append(piece)
             else:
-                frames += [CanFrame(id_and_length >> 4, payload) for id_and_length, payload in _unpack_frames(piece)]
+                unpack = _FORMS[piece.frame_bytes == STAMPED_BYTES].unpack.iter_unpack
+                for id_and_length, payload, *stamp in unpack(piece.data):
+                    frames.append(CanFrame(id_and_length >> 4, payload, timestamp_ms=stamp[0] if stamp else None))
         return frames
 
-    def cut(self, data: bytes) -> list[bytes | CanFrame]:
-        """The same frames in their order, those of the usual form packed, PACKED_BYTES each, run by run.
+    def cut(self, data: bytes) -> list[PackedFrames | CanFrame]:
+        """The same frames in their order, those of the usual form packed, run by run, once that form is learnt.
 
         A sensor sends no other form, and a run of sixteen costs about what one frame by itself does.
         """
         buffer = self._pending + data
-        pieces: list[bytes | CanFrame] = []
+        pieces: list[PackedFrames | CanFrame] = []
         position = 0
         while True:
-            if usual := _USUAL_LINES.match(buffer, position):
+            form = self._form
+            if form and (usual := form.lines.match(buffer, position)):
                 packed = unhexlify(usual[0].translate(None, b"t\r"))
-                self._frames += len(packed) // PACKED_BYTES
-                pieces.append(packed)
+                self._frames += len(packed) // form.frame_bytes
+                self._same_in_a_row = 0
+                pieces.append(PackedFrames(packed, form.frame_bytes))
                 position = usual.end()
                 if position == len(buffer):
                     break
@@ -117,10 +187,10 @@ class SlcanDecoder:
             "bad_lines": self._bad_lines,
             "non_ascii_lines": self._non_ascii_lines,
             "skipped_bytes": self._skipped_bytes,
+            "late_stamps": self._late_stamps,
             "replies": self._replies,
             "refusals": self._refusals,
-            "status_lines": self._status_lines,
-        }
+        } | self.status.counters()
 
     def _read_line(self, line: bytes, *, refused: bool) -> CanFrame | None:
         self._refusals += refused
@@ -128,20 +198,28 @@ class SlcanDecoder:
         # A frame ends at CR alone: a BEL says that what stands before it went wrong.
         if start >= 0 and not refused:
             frame = _parse_frame(line[start:])
-            if frame is not None:
+            if frame is not None and (frame.timestamp_ms or 0) > LAST_TIMESTAMP_MS:
+                self._late_stamps += 1
+            elif frame is not None and self._takes(frame.timestamp_ms is not None):
                 self._skipped_bytes += start
                 return frame
         if _REPLY.fullmatch(line):
             self._replies += not refused
-        elif _STATUS.fullmatch(line):
-            self._status_lines += 1
-        else:
+        elif not self.status.hear(line, self._frames):
             self._skipped_bytes += len(line)
             if line[-LONGEST_LINE:].isascii():
                 self._bad_lines += 1
             else:
                 self._non_ascii_lines += 1
         return None
+
+    def _takes(self, stamped: bool) -> bool:
+        """Whether a frame of this form is what the adapter sends; learns."""
+        self._same_in_a_row = self._same_in_a_row + 1 if stamped == self._newest_stamped else 1
+        self._newest_stamped = stamped
+        if self._same_in_a_row >= LINES_TO_LEARN:
+            self._form = _FORMS[stamped]
+        return self._form is None or self._form is _FORMS[stamped]
 
 
 def encode_frame(frame: CanFrame) -> bytes:
@@ -165,6 +243,7 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 
 def _parse_frame(text: bytes) -> CanFrame | None:
+    """The frame that this is to the letter; its time stamp may be any."""
     match = _FRAME.fullmatch(text)
     if match is None:
         return None
@@ -173,7 +252,7 @@ def _parse_frame(text: bytes) -> CanFrame | None:
     data_length = 0 if remote else 2 * int(match[5])
     stamp = digits[data_length:]
     timestamp_ms = int(stamp, 16) if len(stamp) == 4 else None
-    if len(digits) < data_length or len(stamp) not in (0, 4) or (timestamp_ms or 0) > LAST_TIMESTAMP_MS:
+    if len(digits) < data_length or len(stamp) not in (0, 4):
         return None
     extended = match[3] is not None
     return CanFrame(int(match[4] or match[2], 16), unhexlify(digits[:data_length]), extended, remote, timestamp_ms)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from firmware_bridge.slcan import CanFrame
+from firmware_bridge.slcan import PACKED_BYTES, CanFrame
 
 PAYLOAD_BYTES: Final = 8
 BOARDS: Final = range(1, 8)
@@ -45,14 +45,16 @@ class Cycle(NamedTuple):
     sensor: str
     taxels: tuple[int, ...]
     unpack: Callable[[bytes], tuple[int, ...]]
+    unpack_stamped: Callable[[bytes], tuple[int, ...]]
     in_place: Callable[[Sequence[int]], tuple[int, ...]]
     pack: Callable[..., bytes]
 
     def counts(self, packed: bytes) -> NDArray[np.int32]:
-        """Of frames that `SlcanDecoder.cut` packed: (3, taxels), axes x, y, z; read-only."""
+        """Of frames that `SlcanDecoder.cut` packed, stamped or not: (3, taxels), axes x, y, z; read-only."""
+        unpack = self.unpack if len(packed) == PACKED_BYTES * len(self.taxels) else self.unpack_stamped
         # Integers one by one, and no array of numpy's before the last: on so few it is a third of the time, and where
         # a processor slept since the scan before, what counts is how much code there is to fetch.
-        return np.frombuffer(self.pack(*self.in_place(self.unpack(packed))), dtype=np.int32).reshape(3, -1)
+        return np.frombuffer(self.pack(*self.in_place(unpack(packed))), dtype=np.int32).reshape(3, -1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,7 @@ class ModelMap:
             str(names.pop()),
             taxels,
             struct.Struct(">" + "3xHHHx" * len(taxels)).unpack,
+            struct.Struct(">" + "3xHHH3x" * len(taxels)).unpack,
             itemgetter(*places_of_values),
             struct.Struct(f"={3 * len(taxels)}i").pack,
         )

@@ -13,13 +13,13 @@ import pytest
 import serial
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
 
-from firmware_bridge.emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import bursts, slcan_serial
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording import Recording, Track
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.xela import LAYOUT_A_MAP, USPA44_MAP, trigger_frame
 
 
@@ -42,7 +42,7 @@ def test_every_scan_comes_once_and_in_order(acknowledges, latency_s):
         assert times == sorted(times)
     # The acknowledgement of the opening is seen; those before it are dropped with what is old.
     lines = 2 * 60 * 16
-    expected = {"received_bytes": lines * 22 + acknowledges, "frames": lines, "readings": lines, "scans": 120}
+    expected = {"received_bytes": lines * 26 + acknowledges, "frames": lines, "readings": lines, "scans": 120}
     assert counters == expected | ({"replies": 1} if acknowledges else {})
 
 
@@ -241,6 +241,18 @@ def test_opening_again_after_closing():
                 read_scans(link, 2)
 
 
+def test_opening_again_joins_nothing_to_what_came_before():
+    with SilentDevice() as device:
+        link = SlcanSerialLink(device.port)
+        lines = b"".join(encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4"))
+        for piece in (lines[:100], lines[100:]):
+            with link:
+                os.write(device.device_fd, piece)
+                assert link.read(0.1) == []
+        counters = link.counters()
+        assert counters["abandoned"] == 4 and counters["skipped_bytes"] > 0
+
+
 class SilentDevice:
     """The far end of a pseudo-terminal that takes nothing: a dead adapter, its cable in."""
 
@@ -267,13 +279,20 @@ def test_commands_on_opening_and_closing():
         with SlcanSerialLink(device.port) as link:
             assert link.read(0.0) == []
         # Nothing before, nothing between and nothing after: an empty command is refused by some adapters.
+        assert device.received(15) == b"C\rS8\rZ1\rO\rC\rZ0\r"
+
+
+def test_no_time_stamps_where_the_line_carries_none():
+    with SilentDevice() as device:
+        with SlcanSerialLink(device.port, 921_600) as link:
+            assert link.read(0.0) == []
         assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
 def test_triggers_wake_older_controllers():
     triggers = [trigger_frame(1), trigger_frame(2)]
     with SilentDevice() as device, SlcanSerialLink(device.port, model=LAYOUT_A_MAP, triggers=triggers) as link:
-        assert device.received(27) == b"C\rS8\rO\rt20120700\rt20220700\r"
+        assert device.received(30) == b"C\rS8\rZ1\rO\rt20120700\rt20220700\r"
         lines = b"".join(b"t%03X8000001000200%02X00\r" % (0x710 + taxel, 3) for taxel in range(16))
         os.write(device.device_fd, lines)
         (scan,) = read_scans(link, 1)

@@ -5,10 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.assembler import LONGEST_SCAN_NS, ScanAssembler, SlcanScans
+from firmware_bridge.assembler import LONGEST_PAUSE_NS, LONGEST_SCAN_NS, ScanAssembler, _Sensor
+from firmware_bridge.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ABSENT, Scan
 from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.xela import USPA44_MAP, XR1944_MAP, Reading
 
 ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
@@ -171,14 +173,19 @@ def test_half_of_the_taxels_make_a_sensor():
     assert counters(fewer) == {"readings": 15, "unconfirmed": 14}
 
 
-def test_a_scan_that_stood_open_too_long_takes_no_more():
+@pytest.mark.parametrize("known", [False, True])
+def test_what_comes_after_a_pause_is_of_another_scan(known):
+    """As where the bus was off for a moment: half of one press and half of another are no reading of the pad."""
     assembler = ScanAssembler(USPA44)
-    feed(assembler, cycle(0) + cycle(1)[:10])
-    assert feed(assembler, cycle(1)[10:11], LONGEST_SCAN_NS + 16) == []
-    (scan,) = feed(assembler, cycle(1)[11:12], LONGEST_SCAN_NS + 17)
+    times_ns = [n * LONGEST_PAUSE_NS for n in range(11)] + [10 * LONGEST_PAUSE_NS + LONGEST_PAUSE_NS + 1]
+    scans = []
+    for reading, time_ns in zip(cycle(0)[:12], times_ns, strict=True):
+        # The device's own times count where there are any: being late here says nothing of the bus.
+        scans += assembler.feed(reading, 10 * time_ns if known else time_ns, DeviceTime(0, time_ns) if known else None)
+    (scan,) = scans
     assert int(scan.fresh.sum()) == 11
-    (scan,) = feed(assembler, cycle(2), LONGEST_SCAN_NS + 18)
-    assert int(scan.fresh.sum()) == 12 and scan.fresh[divmod(cycle(1)[11].taxel, 4)]
+    (scan,) = feed(assembler, cycle(1), times_ns[-1] + 1)
+    assert int(scan.fresh.sum()) == 12 and scan.fresh[divmod(cycle(0)[11].taxel, 4)]
 
 
 def test_a_pause_between_scans_makes_no_empty_one():
@@ -294,3 +301,55 @@ def test_who_closes_no_scan_does_not_change_how_many_readings_are_waited_for():
     assert assembler.fewest_missing() == 7
     feed(assembler, cycle(2), 60 + 2 * LONGEST_SCAN_NS)
     assert assembler.fewest_missing() == 16
+
+
+def test_a_broken_link_leaves_no_half_scan_to_be_joined():
+    """Half of a cycle, the link away for less than a scan may stand open, and the other half of a later one."""
+    assembler = ScanAssembler(USPA44)
+    feed(assembler, [*cycle(0), *cycle(1)[:9]])
+    assembler.begin_anew()
+    scan = feed(assembler, [*cycle(7)[9:], *cycle(8)], 100)[0]
+    assert set((scan.counts[0].ravel() % 1000).tolist()) == {7, 8}
+    assert counters(assembler)["abandoned"] == 9
+
+
+def test_a_pause_is_measured_by_the_device_s_own_clock():
+    """Its times on our clock are a guess, and a better one may hide a pause: half a press would join another's half."""
+    assembler, clock = ScanAssembler(USPA44), DeviceClock(1_000_000, None)
+    ms = 1_000_000
+    feed(assembler, cycle(0))
+    for number, reading in enumerate(cycle(1)[:9]):
+        assembler.feed(reading, 400 * ms, clock.at(number, 400 * ms))
+    (torn,) = assembler.feed(cycle(2)[9], 450 * ms, clock.at(350, 450 * ms))
+    assert not torn.complete
+
+
+def test_counters_are_asked_for_while_another_thread_finds_a_sensor(monkeypatch):
+    """As it happens where a link has a thread of its own: the new sensor comes in the midst of the counting."""
+    assembler = ScanAssembler(USPA44)
+    feed(assembler, cycle(0))
+    new, count = iter("56"), _Sensor.counters
+
+    def counters_meanwhile(sensor):
+        assembler.feed(cycle(0, next(new))[0], 100)
+        return count(sensor)
+
+    monkeypatch.setattr(_Sensor, "counters", counters_meanwhile)
+    assert assembler.counters()["scans"] == 1
+    assert list(assembler.sensor_counters()) == ["4"]
+
+
+def test_a_cycle_that_was_read_in_one_piece_and_has_a_pause_in_it_is_two():
+    """As after the host stood still: the bus was off between half of one press and half of another."""
+    scans, places = SlcanScans(), USPA44_MAP.wire_order("4")
+
+    def lines(stamps_ms):
+        return b"".join(
+            encode_frame(CanFrame(can_id, bytes([stamp % 251] * 8), timestamp_ms=stamp))
+            for (can_id, _), stamp in zip(places, stamps_ms, strict=True)
+        )
+
+    whole = [*range(100, 116), *range(110, 126)]
+    assert [scan.complete for scan in scans.feed(lines(whole[:16]) + lines(whole[16:]), 0)] == [True, True]
+    broken = lines([*range(59_990, 59_999), *(n % 60_000 for n in range(60_340, 60_347))])
+    assert [int(scan.fresh.sum()) for scan in scans.feed(broken, 10**9)] == [9]

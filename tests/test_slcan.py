@@ -5,7 +5,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.slcan import BITRATE_1M, CLOSE, LONGEST_LINE, OPEN, CanFrame, SlcanDecoder, encode_frame
+from firmware_bridge.slcan import (
+    BITRATE_1M,
+    CLOSE,
+    LINES_TO_LEARN,
+    LONGEST_LINE,
+    OPEN,
+    STAMPED_BYTES,
+    STAMPS_OFF,
+    STAMPS_ON,
+    CanFrame,
+    SlcanDecoder,
+    encode_frame,
+)
 
 # Two frames as a sensor sent them.
 GOLDEN = b"t0048937E317E1593120F\r"
@@ -18,10 +30,13 @@ NONE_COUNTED = {
     "bad_lines": 0,
     "non_ascii_lines": 0,
     "skipped_bytes": 0,
+    "late_stamps": 0,
     "replies": 0,
     "refusals": 0,
     "status_lines": 0,
+    "status_answers": 0,
 }
+STAMPED = [GOLDEN[:-1] + b"%04X\r" % stamp_ms for stamp_ms in (0, 1, 0x1234, 59_999)]
 
 
 def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
@@ -31,20 +46,23 @@ def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
     return frames, {name: count for name, count in decoder.counters().items() if count}
 
 
-def frames_of(*, extended: bool, remote: bool) -> st.SearchStrategy[CanFrame]:
+def frames_of(*, extended: bool, remote: bool, stamped: bool) -> st.SearchStrategy[CanFrame]:
     return st.builds(
         CanFrame,
         st.integers(0, 0x1FFFFFFF if extended else 0x7FF),
         st.binary(max_size=0 if remote else 8),
         st.just(extended),
         st.just(remote),
-        st.none() | st.integers(0, 59_999),
+        st.integers(0, 59_999) if stamped else st.none(),
     )
 
 
-frames = st.one_of(
-    frames_of(extended=extended, remote=remote) for extended in (False, True) for remote in (False, True)
+kinds = [(extended, remote) for extended in (False, True) for remote in (False, True)]
+plain_frames, stamped_frames = (
+    st.one_of(frames_of(extended=extended, remote=remote, stamped=stamped) for extended, remote in kinds)
+    for stamped in (False, True)
 )
+frames = plain_frames | stamped_frames
 
 
 def test_golden_frames():
@@ -58,9 +76,10 @@ def test_nothing_is_counted_before_anything_comes():
 
 def test_commands_are_what_adapters_know():
     assert (CLOSE, BITRATE_1M, OPEN) == (b"C\r", b"S8\r", b"O\r")
+    assert (STAMPS_ON, STAMPS_OFF) == (b"Z1\r", b"Z0\r")
 
 
-@given(st.lists(frames, max_size=20))
+@given(st.lists(plain_frames, max_size=20) | st.lists(stamped_frames, max_size=20))
 @settings(deadline=None)
 def test_what_is_encoded_is_decoded(sent):
     assert decode(b"".join(map(encode_frame, sent))) == (sent, {"frames": len(sent)} if sent else {})
@@ -91,6 +110,7 @@ pieces = st.one_of(
     st.binary(max_size=40),
     st.text("tTrR0123456789abcdefABCDEFzZVNFse\r\a ", max_size=45).map(str.encode),
     st.sampled_from([b"\r", b"\a", b"z\r", b"Z\r", b"V1013\r", b"N12AB\r", b"F04\r", b"sa127095\r", b"e1a\r", b"\0"]),
+    st.sampled_from([GOLDEN * 5, b"".join(STAMPED), b"".join(STAMPED) * 2, GOLDEN[:-1] + b"EA60\r", STAMPED[0] * 3]),
 )
 
 
@@ -104,7 +124,9 @@ def test_any_chunking_gives_the_same(stream, data):
     assert decode(*(stream[i : i + 1] for i in range(len(stream)))) == whole
 
 
-@given(st.lists(st.tuples(st.text("0123456789ABCDEFabcdef \0zx", max_size=60).map(str.encode), frames), max_size=10))
+@given(
+    st.lists(st.tuples(st.text("0123456789ABCDEFabcdef \0zx", max_size=60).map(str.encode), plain_frames), max_size=10)
+)
 @settings(deadline=None)
 def test_noise_without_frame_letters_before_a_frame_costs_nothing(noisy):
     stream = b"".join(noise + encode_frame(frame) for noise, frame in noisy)
@@ -118,7 +140,7 @@ def test_every_byte_at_every_place_of_a_line():
     """What one corrupted byte can do: nothing, or lose the frame, or another digit in its place."""
     digits = b"0123456789ABCDEFabcdef"
     for place in range(len(GOLDEN)):
-        for byte in range(256):
+        for byte in range(256):  # of a stream that has taught no form yet
             line = bytearray(GOLDEN)
             line[place] = byte
             got, counters = decode(bytes(line) + OTHER)
@@ -162,7 +184,6 @@ def test_a_whole_frame_behind_a_wreck_is_kept():
         b"t\r",
         b"t0048937E317E1593120F0\r",  # one digit more
         b"t0048937E317E1593120F00\r",
-        b"t0048937E317E1593120FEA60\r",  # later than the last millisecond of a minute
         b"t0048937E317E1593120F00000\r",
         b"t0049937E317E1593120F00\r",  # nine bytes
         b"t8008937E317E1593120F\r",  # id of twelve bits
@@ -180,7 +201,11 @@ def test_a_whole_frame_behind_a_wreck_is_kept():
         b"sa12709\r",
         b"sx127095\r",
         b"e0a\r",
+        b"e2a\r",  # two errors, one letter
+        b"e1ab\r",
         b"F0G\r",
+        b"F004\r",
+        b"04\r",  # EasySYNC's flags mean something else
     ],
 )
 def test_bad_lines(line):
@@ -203,14 +228,80 @@ def test_frames_of_other_sorts():
     assert decode(b"R000001231\r")[0] == [CanFrame(0x123, b"", extended=True, remote=True)]
 
 
-@pytest.mark.parametrize("reply", [b"\r", b"z\r", b"Z\r", b"V1013\r", b"N12ab\r", b"F04\r", b"Vrt12\r"])
+def test_a_stamp_beyond_a_minute_is_none():
+    late = GOLDEN[:-1] + b"EA60\r"
+    expected = {"frames": 1, "bad_lines": 1, "skipped_bytes": 25, "late_stamps": 1}
+    assert decode(late + GOLDEN) == ([GOLDEN_FRAME], expected)
+    # And teaches nothing, nor is it taken where stamps are learnt.
+    got, counters = decode(b"".join(STAMPED) + late * LINES_TO_LEARN + STAMPED[1])
+    assert [frame.timestamp_ms for frame in got] == [0, 1, 0x1234, 59_999, 1]
+    assert counters["late_stamps"] == counters["bad_lines"] == LINES_TO_LEARN
+    for stamp in (b"EA5f", b"ea60", b"Eb00", b"F000", b"ffff", b"D999", b"E9ff"):
+        got, _ = decode(b"".join(STAMPED), GOLDEN[:-1] + stamp + b"\r")
+        assert len(got) == 4 + (int(stamp, 16) < 60_000), stamp
+
+
+@pytest.mark.parametrize(
+    ("usual", "other"), [([GOLDEN] * 4, STAMPED), (STAMPED, [GOLDEN] * 4)], ids=["plain", "stamped"]
+)
+def test_which_form_is_the_adapters_is_learnt_from_four_frames_in_a_row(usual, other):
+    few = LINES_TO_LEARN - 1
+    # Before that both are taken, in any order.
+    assert len(decode(b"".join((usual[:few] + other[:few]) * 3))[0]) == 6 * few
+    # Then those of the other form are bad lines: damage, such as four lost digits.
+    taught = b"".join(usual)
+    got, counters = decode(taught + b"".join(other[:few] + usual[:1] + other[:few]))
+    assert (len(got), counters["bad_lines"]) == (5, 2 * few)
+    assert counters["skipped_bytes"] == sum(map(len, other[:few])) * 2 - 2 * few
+    # Unless the adapter has changed its mind, and with it we ours.
+    got, counters = decode(taught + b"".join([*other, other[0], usual[0]]))
+    assert (len(got), counters["bad_lines"]) == (4 + 2, few + 1)
+
+
+def test_what_breaks_the_row_begins_it_anew():
+    decoder = SlcanDecoder()
+    decoder.feed(GOLDEN * 5)
+    for between in (GOLDEN, b"T1FFFFFFF2ABCD\r"):
+        assert decoder.feed(b"".join(STAMPED[:3])) == []
+        assert len(decoder.feed(between)) == 1
+    assert decoder.feed(b"".join(STAMPED[:3]) + b"z\rnoise\r") == []
+    assert len(decoder.feed(STAMPED[3])) == 1, "neither replies nor bad lines are frames of the other form"
+
+
+def test_stamped_lines_are_packed_too():
+    decoder = SlcanDecoder()
+    decoder.feed(b"".join(STAMPED))
+    (piece,) = decoder.cut(STAMPED[2] * 16)
+    assert not isinstance(piece, CanFrame)
+    assert piece == (bytes.fromhex("0048 937E317E1593120F 1234") * 16, STAMPED_BYTES)
+    assert decoder.usual_line_bytes == len(STAMPED[0])
+    assert decoder.feed(STAMPED[2] * 2) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)] * 2
+    assert SlcanDecoder().usual_line_bytes == len(GOLDEN)
+
+
+@pytest.mark.parametrize("reply", [b"\r", b"z\r", b"Z\r", b"V1013\r", b"N12ab\r", b"Vrt12\r"])
 def test_replies(reply):
     assert decode(GOLDEN + reply + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], {"frames": 2, "replies": 1})
 
 
-@pytest.mark.parametrize("line", [b"sa127095\r", b"sb000000\r", b"e1a\r", b"e3boO\r"])
-def test_status_lines(line):
-    assert decode(GOLDEN + line + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], {"frames": 2, "status_lines": 1})
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (b"sa127095\r", {"error_active": 1}),
+        (b"sb000000\r", {"bus_off": 1}),
+        (b"e1a\r", {"ack_error": 1}),
+        (b"e3boO\r", {"bit_error": 1, "overrun": 1, "tx_overrun": 1}),
+        (b"e4bBcc\r", {"bit_error": 2, "crc_error": 2}),
+    ],
+)
+def test_status_lines(line, told):
+    expected = {"frames": 2, "status_lines": 1} | {f"adapter_{name}": count for name, count in told.items()}
+    assert decode(GOLDEN + line + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], expected)
+
+
+def test_flags():
+    expected = {"frames": 2, "status_answers": 1, "adapter_error_warning": 1}
+    assert decode(GOLDEN + b"F04\r" + OTHER) == ([GOLDEN_FRAME, OTHER_FRAME], expected)
 
 
 def test_a_bel_is_a_refusal_and_ends_a_line():
@@ -277,17 +368,37 @@ def test_what_no_decoder_can_tell():
     """The limits that the module states: well-formed frames that nobody sent."""
     head_and_tail = GOLDEN[:9] + OTHER[9:]
     assert decode(head_and_tail)[0] == [CanFrame(0x004, GOLDEN_FRAME.data[:2] + OTHER_FRAME.data[2:])]
-    stamped = GOLDEN[:-1] + b"1234\r"
-    assert decode(stamped[:9] + stamped[13:])[0] == [CanFrame(0x004, bytes.fromhex("937E 1593 120F 1234"))]
+    stamped = STAMPED[2]
+    lost = stamped[:9] + stamped[13:]
+    assert decode(lost)[0] == [CanFrame(0x004, bytes.fromhex("937E 1593 120F 1234"))]
+    assert decode(stamped * 4, lost)[0] == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)] * 4
 
 
-@pytest.mark.parametrize(("stamp", "places"), [(b"", set()), (b"1234", {4})])
-def test_a_letter_in_mid_line_makes_eight_bytes_only_of_a_stamped_line(stamp, places):
+def test_no_loss_in_a_stamped_line_makes_a_frame_once_stamps_are_learnt():
+    line = STAMPED[2]
+    for start in range(len(line)):
+        for end in range(start + 1, len(line)):
+            decoder = SlcanDecoder()
+            decoder.feed(line * LINES_TO_LEARN)
+            assert decoder.feed(line[:start] + line[end:] + line) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)]
+
+
+@pytest.mark.parametrize(("stamp", "learnt", "places"), [(b"", 0, set()), (b"1234", 0, {4}), (b"1234", 4, set())])
+def test_a_letter_in_mid_line_makes_eight_bytes_only_of_a_stamped_line_before_stamps_are_learnt(stamp, learnt, places):
     noise = random.Random(5)
     made_up = set()
     for _ in range(300):
         line = encode_frame(CanFrame(0x004, noise.randbytes(8)))[:-1] + stamp + b"\r"
         for place in range(1, len(line) - 1):
-            got, _ = decode(line[:place] + b"t" + line[place + 1 :])
-            made_up |= {place for frame in got if len(frame.data) == 8}
+            got, _ = decode(STAMPED[2] * learnt + line[:place] + b"t" + line[place + 1 :])
+            made_up |= {place for frame in got[learnt:] if len(frame.data) == 8}
     assert made_up == places
+
+
+def test_what_a_broken_link_left_unfinished_is_skipped_and_counted():
+    decoder = SlcanDecoder()
+    line = encode_frame(CanFrame(0x004, bytes(8)))
+    decoder.feed(line[:9])
+    decoder.begin_anew()
+    assert decoder.feed(line[9:]) == [] and decoder.feed(line) == [CanFrame(0x004, bytes(8))]
+    assert decoder.counters()["skipped_bytes"] == len(line) - 1

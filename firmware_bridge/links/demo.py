@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scan import Scan
 
@@ -15,7 +15,7 @@ START_TIMEOUT_S: Final = 20.0
 END_TIMEOUT_S: Final = 5.0
 
 
-class DemoLink:
+class DemoLink(Link):
     """A recording played by the emulator, through the ordinary serial path.
 
     The emulator ends with this link, and with this process however it ends.
@@ -25,6 +25,7 @@ class DemoLink:
         self.name = "demo"
         self.kind: SourceKind = "emulated"
         self.ended = False
+        self.trouble: str | None = None
         self._recording = str(recording)
         self._rate_hz = rate_hz
         self._process: subprocess.Popen[str] | None = None
@@ -68,13 +69,15 @@ class DemoLink:
         if self.ended:
             return []
         try:
-            return self._link.read(timeout_s)
+            scans = self._link.read(timeout_s)
         except LinkLostError:
             # It hangs up when it has played everything, and only then ends well.
             if not _ends_well(self._process):
                 raise
             self.ended = True
             return []
+        self.trouble = self._link.trouble
+        return scans
 
     def counters(self) -> dict[str, int]:
         """Counters of the serial link."""

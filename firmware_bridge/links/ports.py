@@ -1,31 +1,64 @@
 """Which serial ports there are, and which of them is a sensor's adapter."""
 
+import re
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.errors import NoDeviceError
 
+FTDI_X: Final = (0x0403, 0x6015)
+"""Of FTDI's chip, and so of what XELA ships, and of grippers and cables as well."""
+
 KNOWN_ADAPTERS: Final = {
-    (0x0403, 0x6015): "VScom USB-CAN Plus",  # what XELA ships; other FTDI devices have this id as well
+    FTDI_X: "VScom USB-CAN Plus",
     (0xAD50, 0x60C4): "CANable, slcan firmware",  # the id of CANtact, from which it comes
     (0x16D0, 0x117E): "CANable 2, slcan firmware",
 }
 
+_CAN_ADAPTER = re.compile(r"\bCAN\b|CAN-?USB|USB-?CAN")
+
+NO_PERMISSION: Final = (
+    "no permission: add the user to the group that owns it (often: sudo usermod -aG dialout $USER), log in again"
+)
+MOST_LOOKS: Final = 3
+
 
 class Port(NamedTuple):
-    """One serial port. `usb_id` is vendor and product, or None for a port that is not on USB."""
+    """One serial port.
+
+    Attributes:
+        path: such as /dev/ttyUSB0.
+        usb_id: vendor and product; None for a port that is not on USB.
+        serial_number: of the USB device, which several ports may share.
+        description: for a reader.
+        product: what the device calls itself.
+        manufacturer: what it says it is made by.
+        interface: which port of a device with several, such as "1.0".
+    """
 
     path: str
     usb_id: tuple[int, int] | None
     serial_number: str | None
     description: str
+    product: str | None = None
+    manufacturer: str | None = None
+    interface: str | None = None
 
     @property
     def adapter(self) -> str | None:
-        """Name of the adapter, if it is one known to be used with these sensors."""
-        return KNOWN_ADAPTERS.get(self.usb_id) if self.usb_id else None
+        """Name of the adapter, if it looks like one known to be used with these sensors.
+
+        Of a chip that many devices have, the device's own words decide, where it has any.
+        """
+        words = " ".join(word for word in (self.product, self.manufacturer) if word)
+        if self.usb_id is None or (self.usb_id == FTDI_X and words and not _CAN_ADAPTER.search(words)):
+            return None
+        return KNOWN_ADAPTERS.get(self.usb_id)
 
     def __str__(self) -> str:
         usb = f" {self.usb_id[0]:04x}:{self.usb_id[1]:04x}" if self.usb_id else ""
@@ -41,25 +74,34 @@ def serial_ports() -> list[Port]:
             None if info.vid is None or info.pid is None else (info.vid, info.pid),
             info.serial_number or None,
             info.description,
+            info.product or None,
+            info.manufacturer or None,
+            (info.location or "").partition(":")[2] or None,
         )
-        for info in list_ports.comports()
+        for info in _comports()
     )
+
+
+def _comports() -> list[ListPortInfo]:
+    for _ in range(MOST_LOOKS):
+        # pyserial takes for a number what it could not read of a device that is just being pulled out.
+        with suppress(TypeError, ValueError, OSError):
+            return list(list_ports.comports())
+    return []
 
 
 def find_adapter(ports: Sequence[Port]) -> Port:
     """The one known adapter among `ports`.
 
-    Of several kinds the first in KNOWN_ADAPTERS wins; of several of one kind none does.
-
     Raises:
         NoDeviceError: there is none, or there are several.
     """
-    for name in KNOWN_ADAPTERS.values():
-        found = [port for port in ports if port.adapter == name]
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise NoDeviceError(f"{len(found)} adapters found: name one, {_example(found[0])}. {_seen(ports)}")
+    found = [port for port in ports if port.adapter is not None]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = ", ".join(f"{port.adapter} at {port.path}" for port in found)
+        raise NoDeviceError(f"{len(found)} adapters found, {names}: name one, {_example(found[0])}. {_seen(ports)}")
     raise NoDeviceError(
         f"no known adapter found: name a port, --source slcan:PORT, or try --source demo. {_seen(ports)}"
     )
@@ -74,8 +116,48 @@ def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
     found = [port for port in ports if port.serial_number == serial_number]
     if len(found) != 1:
         count = len(found) or "no"
-        raise NoDeviceError(f"{count} port with serial number {serial_number}, expected one. {_seen(ports)}")
+        raise NoDeviceError(
+            f"{count} port with serial number {serial_number}, expected one"
+            f"{': name one by its path' if found else ''}. {_seen(ports)}"
+        )
     return found[0]
+
+
+class PluggedAdapter:
+    """An adapter, wherever it is plugged in: known by the USB serial number that its port had first.
+
+    Of a device with several ports it is the same one of them.
+    """
+
+    def __init__(self, path: str) -> None:
+        """Know it by the path of its port, until `find` has seen more."""
+        self._path = path
+        self._port: Port | None = None
+
+    def find(self, ports: Sequence[Port]) -> str:
+        """Path of its port among those there are now; the path given where it has no serial number.
+
+        Raises:
+            NoDeviceError: it is not there, or another cannot be told from it.
+        """
+        if self._port is None:
+            real_path = Path(self._path).resolve()
+            self._port = next((port for port in ports if Path(port.path).resolve() == real_path), None)
+        known = self._port
+        if known is None or known.serial_number is None:
+            self._port = None
+            return self._path
+        same = [port for port in ports if port[1:3] == known[1:3] and port.interface == known.interface]
+        if known.path in (port.path for port in same):
+            return known.path
+        if len(same) != 1:
+            count = f"{len(same)} adapters" if same else "no adapter"
+            raise NoDeviceError(
+                f"{count} with serial number {known.serial_number}, which was at {known.path}, expected one: "
+                f"plug it in again, alone. {_seen(ports)}"
+            )
+        self._port = same[0]
+        return same[0].path
 
 
 def _example(port: Port) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.recording import Recording, Track, load_recording
 from firmware_bridge.scan import Scan, ScanSeries
 from firmware_bridge.schedule import NS_PER_S, Clock, Sleep, sleep_until
@@ -24,7 +24,7 @@ class _Due(NamedTuple):
     counts: NDArray[np.int32]
 
 
-class ReplayLink:
+class ReplayLink(Link):
     """Scans from recordings, all started together. It never leaves a scan out; late ones come at once."""
 
     def __init__(

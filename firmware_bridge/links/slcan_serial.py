@@ -15,13 +15,14 @@ try:
 except ImportError:
     termios = None
 
-from firmware_bridge.assembler import SlcanScans
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.bursts import BurstReader
-from firmware_bridge.links.ports import serial_ports
+from firmware_bridge.links.ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.scan import Scan
-from firmware_bridge.slcan import BITRATE_1M, CLOSE, OPEN, CanFrame, encode_frame
+from firmware_bridge.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
+from firmware_bridge.slcan_scans import SlcanScans
+from firmware_bridge.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.xela import USPA44_MAP, ModelMap
 
 DEFAULT_BAUD: Final = 3_000_000
@@ -29,23 +30,34 @@ WRITE_TIMEOUT_S: Final = 1.0
 QUIET_S: Final = 0.02
 """A little over the 16 ms for which an FTDI chip may hold bytes back."""
 LONGEST_SETTLE_S: Final = 0.3
+SLOWEST_STAMPED_BAUD: Final = 1_000_000
+"""Two sensors at 100 scans a second are 832 kbit/s of stamped lines, and 704 of plain ones."""
+MOST_SILENT_OPENINGS: Final = 10
+"""In a row after which stamps are asked for no more, until a scan has come: a link that lasts opens for days."""
+MOST_LATE_STAMPS: Final = 4
+"""Lines lost to stamps that are no milliseconds of a minute, before this adapter is told to leave them out."""
+LATE_STAMPS_FRAMES: Final = 1000
+"""So thick they must come: a digit that flips on the wire now and then says nothing of the adapter's clock."""
 
 # pyserial lets termios.error through, which is no OSError; Windows has no termios.
 _PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
-_PERMISSION = (
-    "no permission: add the user to the group that owns it (often: sudo usermod -aG dialout $USER), log in again"
-)
 _BUSY = "in use: end what holds it, such as slcand, xela_server or another edge-sr"
 
 
-class SlcanSerialLink:
+class SlcanSerialLink(Link):
     """Scans from a sensor behind an slcan adapter.
 
-    Opening sends close, bitrate and open, and waits for no acknowledgement, since some adapters
-    never send one. What arrives before the line falls silent is older than the opening and dropped.
+    Opening sends close, bitrate, time stamps on and open, and waits for no acknowledgement, since some
+    adapters never send one. What arrives before the line falls silent is older than the opening and dropped.
+    Closing sends close and time stamps off: some adapters keep that setting, and not every program expects stamps.
+    They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for stamps at every opening.
+
+    It may be opened any number of times. An adapter with a USB serial number is then found again under
+    whatever name its port has.
 
     Attributes:
         port: path of the serial port.
+        baudrate: of the serial line, in bit/s.
         low_latency: the platform took the request not to hold bytes back.
     """
 
@@ -71,17 +83,27 @@ class SlcanSerialLink:
         # No hardware sensor is a pseudo-terminal: who is behind one only pretends.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.ended = False
+        self.trouble: str | None = None
         self.port = port
         self.low_latency = False
-        self._baudrate = baudrate
+        self.baudrate = baudrate
         self._rtscts = rtscts
         self._triggers = tuple(triggers)
+        self._plugged = PluggedAdapter(port)
+        self._asks_stamps = baudrate >= SLOWEST_STAMPED_BAUD
         self._scans = SlcanScans(model)
+        self._questions = StatusQuestions(self._scans.status)
+        self._stamps_on = False
+        self._silent_openings = 0
+        self._frames_at_opening = 0
+        self._late_stamps_from = (0, 0)
         self._received_bytes = 0
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
 
     def __enter__(self) -> Self:
+        self._scans.begin_anew()
+        self.port = self._plugged.find(serial_ports())
         self._serial = self._open_port()
         try:
             self._start(self._serial)
@@ -89,6 +111,7 @@ class SlcanSerialLink:
         except _PORT_ERRORS as error:
             self._serial.close()
             raise DeviceError(f"{self.port}: does not take commands: {error}") from error
+        self._questions.reopened()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -96,8 +119,9 @@ class SlcanSerialLink:
         if port is None:
             return
         with suppress(*_PORT_ERRORS):  # gone already: nobody left to tell
-            port.write(CLOSE)
-            _wait_until_sent(port)
+            for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
+                port.write(command)
+                _wait_until_sent(port)
         with suppress(*_PORT_ERRORS):
             if port.out_waiting:  # what a dead device does not take would hold up the closing
                 port.reset_output_buffer()
@@ -109,14 +133,26 @@ class SlcanSerialLink:
         Raises:
             LinkLostError: the port is gone.
         """
-        if self._bursts is None:
+        if self._bursts is None or self._serial is None:
             raise ValueError("the link is not open: use it in a with statement")
         try:
             data = self._bursts.read(timeout_s, self._scans.bytes_until_scan())
         except OSError as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
         self._received_bytes += len(data)
-        return self._scans.feed(data, time.monotonic_ns())
+        now_ns = time.monotonic_ns()
+        scans = self._scans.feed(data, now_ns)
+        if self._questions.due(len(scans), self._scans.refusals, now_ns):
+            _say(self._serial, STATUS_FLAGS)
+        silence = self._questions.answered_in_silence
+        self.trouble = self._scans.status.trouble(self._scans.frames, flags_of_a_silence=silence)
+        if self._stamps_on and self._stamps_are_none():
+            self._asks_stamps = self._stamps_on = False
+            self._open_anew(self._serial, STAMPS_OFF)
+        elif scans and self._asks_stamps and not self._stamps_on:  # left out while nothing came
+            self._stamps_on = True
+            self._open_anew(self._serial, STAMPS_ON)
+        return scans
 
     def counters(self) -> dict[str, int]:
         """Received bytes and the counters of decoder and assembler."""
@@ -126,7 +162,7 @@ class SlcanSerialLink:
         try:
             port = serial.Serial(
                 self.port,
-                self._baudrate,
+                self.baudrate,
                 rtscts=self._rtscts,
                 exclusive=True,
                 timeout=0,
@@ -143,8 +179,13 @@ class SlcanSerialLink:
         return port
 
     def _start(self, port: serial.Serial) -> None:
+        frames = self._scans.frames
+        self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
+        self._frames_at_opening = frames
+        self._late_stamps_from = self._scans.late_stamps, frames
+        self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
         # One write each: some adapters obey only the first command in a USB packet.
-        for command in (CLOSE, BITRATE_1M):
+        for command in (CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M):
             port.write(command)
             _wait_until_sent(port)
         self._drop_old_bytes(port)
@@ -153,11 +194,34 @@ class SlcanSerialLink:
             _wait_until_sent(port)
             port.write(encode_frame(frame))
 
+    def _stamps_are_none(self) -> bool:
+        late_before, frames_before = self._late_stamps_from
+        if self._scans.late_stamps - late_before >= MOST_LATE_STAMPS:
+            return True
+        if self._scans.frames - frames_before >= LATE_STAMPS_FRAMES:
+            self._late_stamps_from = self._scans.late_stamps, self._scans.frames
+        return False
+
+    def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:
+        """With time stamps on or off, from a line that has fallen silent: of two forms at once most would be lost."""
+        for command in (CLOSE, stamps):
+            _say(port, command)
+        with suppress(*_PORT_ERRORS):  # gone, which reading tells
+            self._drop_old_bytes(port)
+        self._scans.begin_anew()
+        _say(port, OPEN)
+
     def _drop_old_bytes(self, port: serial.Serial) -> None:
         port.timeout = QUIET_S
         end_s = time.monotonic() + LONGEST_SETTLE_S
         while port.read(1) and time.monotonic() < end_s:
             port.reset_input_buffer()
+
+
+def _say(port: serial.Serial, command: bytes) -> None:
+    with suppress(*_PORT_ERRORS):  # gone, which reading tells, or full, and then nobody would answer
+        os.write(port.fileno(), command)
+        _wait_until_sent(port)
 
 
 def _wait_until_sent(port: serial.Serial) -> None:
@@ -170,7 +234,7 @@ def _wait_until_sent(port: serial.Serial) -> None:
 def _reason(error: Exception) -> str:
     code = getattr(error, "errno", None)
     if code in (errno.EACCES, errno.EPERM):
-        return _PERMISSION
+        return NO_PERMISSION
     if code in (errno.EBUSY, errno.EAGAIN):
         return _BUSY
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):

@@ -1,0 +1,32 @@
+"""CAN frames to scans, for links that hand out frames. No I/O, no clock."""
+
+from firmware_bridge.assembler import ScanAssembler
+from firmware_bridge.device_clock import DeviceTime
+from firmware_bridge.scan import Scan
+from firmware_bridge.slcan import CanFrame
+from firmware_bridge.xela import USPA44_MAP, ModelMap, decode
+
+
+class FrameScans:
+    """CAN frames to scans, for links that hand out frames."""
+
+    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
+        self._model = model
+        self._assembler = ScanAssembler(model.geometry)
+        self._foreign = 0
+
+    def feed(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
+        """Scans that a frame closes which arrived at `time_ns` [ns], and was on the bus at `device` if known."""
+        reading = decode(frame, self._model)
+        if reading is None:
+            self._foreign += 1
+            return []
+        return self._assembler.feed(reading, time_ns, device)
+
+    def begin_anew(self) -> None:
+        """Give up what is half read, since the link was broken."""
+        self._assembler.begin_anew()
+
+    def counters(self) -> dict[str, int]:
+        """Counters of the assembler; foreign: frames that are none of this model's taxels."""
+        return {"foreign": self._foreign} | self._assembler.counters()

@@ -1,0 +1,127 @@
+"""slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
+
+from typing import Final
+
+from firmware_bridge.assembler import LONGEST_PAUSE_NS, ScanAssembler
+from firmware_bridge.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scan import Scan
+from firmware_bridge.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, CanFrame, SlcanDecoder
+from firmware_bridge.slcan_status import AdapterStatus
+from firmware_bridge.xela import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
+
+_MOST_ORDERS: Final = 1024
+_LONGEST_PAUSE_MS: Final = LONGEST_PAUSE_NS // 1_000_000
+
+
+class SlcanScans:
+    """slcan text to scans: the three pure stages in a row."""
+
+    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
+        self._model = model
+        self._clock = _millisecond_clock()
+        self._stamped: tuple[int, int] | None = None
+        self._device = DeviceTime(0, 0)
+        self._cycles: dict[bytes, Cycle | None] = {}
+        self._decoder = SlcanDecoder()
+        self._assembler = ScanAssembler(model.geometry)
+        self._foreign = 0
+
+    @property
+    def status(self) -> AdapterStatus:
+        """What the adapter told of itself."""
+        return self._decoder.status
+
+    @property
+    def frames(self) -> int:
+        """CAN frames so far, of any sort."""
+        return self._decoder.frames
+
+    @property
+    def refusals(self) -> int:
+        """BELs so far."""
+        return self._decoder.refusals
+
+    @property
+    def late_stamps(self) -> int:
+        """Lines lost because of a time stamp that is none."""
+        return self._decoder.late_stamps
+
+    def feed(self, data: bytes, time_ns: int) -> list[Scan]:
+        """Scans that close within `data`, which arrived at `time_ns` [ns]."""
+        scans: list[Scan] = []
+        for piece in self._decoder.cut(data):
+            if isinstance(piece, CanFrame):
+                self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
+                continue
+            packed, frame_bytes = piece
+            cycle_bytes = self._model.geometry.taxel_count * frame_bytes
+            start = 0
+            while start < len(packed):
+                end = start + cycle_bytes
+                scan = self._feed_cycle(packed[start:end], frame_bytes, time_ns) if end <= len(packed) else None
+                if scan is not None:
+                    scans.append(scan)
+                else:
+                    end = start + frame_bytes
+                    stamp_ms = _stamp_ms(packed, end) if frame_bytes != PACKED_BYTES else None
+                    self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans)
+                start = end
+        return scans
+
+    def begin_anew(self) -> None:
+        """Give up what is half read, since the link was broken; the adapter's clock may have begun anew, too."""
+        self._decoder.begin_anew()
+        self._assembler.begin_anew()
+        self._clock, self._stamped = _millisecond_clock(), None
+
+    def bytes_until_scan(self) -> int:
+        """How many bytes must come at least before a scan can close whole; from 1."""
+        return max(1, self._assembler.fewest_missing() * self._decoder.usual_line_bytes - self._decoder.pending_bytes)
+
+    def counters(self) -> dict[str, int]:
+        """Counters of all stages; foreign: frames that are none of this model's taxels."""
+        return self._decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
+
+    def _feed_reading(self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan]) -> None:
+        if reading is None:
+            self._foreign += 1
+        else:
+            scans += self._assembler.feed(
+                reading, time_ns, None if stamp_ms is None else self._device_time(stamp_ms, time_ns)
+            )
+
+    def _feed_cycle(self, packed: bytes, frame_bytes: int, time_ns: int) -> Scan | None:
+        """The scan of a sensor's whole cycle; None where this is none, or one of readings before is still open."""
+        can_ids = packed[::frame_bytes] + packed[1::frame_bytes]
+        if can_ids not in self._cycles:
+            if len(self._cycles) >= _MOST_ORDERS:  # frames of two sensors mix in many orders
+                self._cycles.clear()
+            high, low = can_ids[: len(can_ids) // 2], can_ids[len(can_ids) // 2 :]
+            self._cycles[can_ids] = self._model.cycle([h << 4 | b >> 4 for h, b in zip(high, low, strict=True)])
+        cycle = self._cycles[can_ids]
+        # Before its last stamp is looked at: a clock that is told of the first ones after it seems to be set back.
+        if cycle is None or not self._assembler.takes(cycle):
+            return None
+        if frame_bytes == PACKED_BYTES:
+            return self._assembler.feed_cycle(cycle, packed, time_ns)
+        last_ms = _stamp_ms(packed, len(packed))
+        # Read late and in one piece, half a cycle from before a pause and half from behind look like a whole one.
+        if (last_ms - _stamp_ms(packed, frame_bytes)) % (LAST_TIMESTAMP_MS + 1) > _LONGEST_PAUSE_MS:
+            return None
+        return self._assembler.feed_cycle(cycle, packed, time_ns, self._device_time(last_ms, time_ns))
+
+    def _device_time(self, stamp_ms: int, time_ns: int) -> DeviceTime:
+        # Of sixteen frames that come together three have stamps of their own: a scan takes 2 ms on the bus.
+        if (stamp_ms, time_ns) != self._stamped:
+            self._stamped = stamp_ms, time_ns
+            self._device = self._clock.at(stamp_ms, time_ns)
+        return self._device
+
+
+def _stamp_ms(packed: bytes, end: int) -> int:
+    """The time stamp of the packed frame that ends there."""
+    return packed[end - 2] << 8 | packed[end - 1]
+
+
+def _millisecond_clock() -> DeviceClock:
+    return DeviceClock(tick_ns=1_000_000, wrap_ticks=LAST_TIMESTAMP_MS + 1)

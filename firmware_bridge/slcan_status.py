@@ -1,0 +1,178 @@
+"""What an slcan adapter tells of itself: status flags, changes of state, errors on the bus. No I/O, no clock.
+
+    Fxx         answer to `F`: eight flags (Lawicel CAN232 manual, version 3), which are cleared by the asking
+    saRRRTTT    the state, a active, w warning, p passive, b bus-off, and two error counts (Linux slcan-core.c)
+    eNxx...     N errors on the bus, a letter each (the same)
+
+EasySYNC adapters answer with other flags and no F before them: that is a bad line.
+"""
+
+import re
+from collections.abc import Iterable
+from typing import Final
+
+STATUS_FLAGS: Final = b"F\r"
+
+FLAGS: Final = {
+    0x01: "rx_full",
+    0x02: "tx_full",
+    0x04: "error_warning",
+    0x08: "overrun",
+    0x20: "error_passive",
+    0x40: "arbitration_lost",
+    0x80: "bus_error",
+}
+STATES: Final = {"a": "error_active", "w": "error_warning", "p": "error_passive", "b": "bus_off"}
+ERRORS: Final = {
+    "a": "ack_error",
+    "b": "bit_error",
+    "B": "bit_error",
+    "c": "crc_error",
+    "f": "form_error",
+    "o": "overrun",
+    "O": "tx_overrun",
+    "s": "stuff_error",
+}
+LOSSES: Final = frozenset({"rx_full", "overrun"})
+NOISE: Final = frozenset({"error_passive", "bus_error"})
+SILENCE_NS: Final = 500_000_000
+INTERVAL_NS: Final = 5_000_000_000
+MOST_UNANSWERED: Final = 3
+FRAMES_TO_FORGET: Final = 1600
+"""A loss that an error line told of is over when so many frames have come since: a second of one sensor."""
+
+BUS_OFF: Final = "the adapter reports bus-off: check bitrate, wiring and termination"
+BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame: check bitrate, wiring and termination"
+FRAMES_LOST: Final = "the adapter lost frames: they come faster than it hands them on"
+
+_STATUS = re.compile(rb"s[awpb][0-9]{6}|e[1-9][abBcfoOs]{1,9}")
+_FLAGS = re.compile(rb"F[0-9A-Fa-f]{2}")
+
+
+class AdapterStatus:
+    """Counts what the adapter reports, and knows what of it a user must know.
+
+    Attributes:
+        answers: how often `F` was answered.
+    """
+
+    def __init__(self) -> None:
+        self.answers = 0
+        self._status_lines = 0
+        self._counts: dict[str, int] = {}
+        self._flags: frozenset[str] = frozenset()
+        self._off_at_frame: int | None = None
+        self._lost_at_frame: int | None = None
+
+    def hear(self, line: bytes, frames: int) -> bool:
+        """Take a line without its end, after so many frames in all; False if it is none of these."""
+        if _FLAGS.fullmatch(line):
+            value = int(line[1:], 16)
+            self._flags = frozenset(name for bit, name in FLAGS.items() if value & bit)
+            self.answers += 1
+            self._count(self._flags)
+        elif _STATUS.fullmatch(line) and line[:1] == b"s":
+            state = STATES[chr(line[1])]
+            self._off_at_frame = frames if state == "bus_off" else None
+            self._status_lines += 1
+            self._count([state])
+        elif _STATUS.fullmatch(line) and int(line[1:2]) == len(line) - 2:
+            errors = [ERRORS[letter] for letter in line[2:].decode()]
+            if "overrun" in errors:
+                self._lost_at_frame = frames
+            self._status_lines += 1
+            self._count(errors)
+        else:
+            return False
+        return True
+
+    def trouble(self, frames: int, *, flags_of_a_silence: bool = False) -> str | None:
+        """What a user must know, in plain words; None while all is well.
+
+        Bus-off is over when a frame comes; a loss that flags told of, when they next say nothing of it.
+
+        Args:
+            frames: so many have come in all.
+            flags_of_a_silence: no frame comes, and the flags were asked for since the last one did: an error now
+                and then is in the flags of any bus, and no trouble while frames come.
+        """
+        if self._off_at_frame == frames:
+            return BUS_OFF
+        if flags_of_a_silence and self._flags & NOISE:
+            return BUS_ERRORS
+        recent = self._lost_at_frame is not None and frames - self._lost_at_frame < FRAMES_TO_FORGET
+        return FRAMES_LOST if recent or self._flags & LOSSES else None
+
+    def forget(self) -> None:
+        """It answers no more: the flags that it told last hold no longer."""
+        self._flags = frozenset()
+
+    def counters(self) -> dict[str, int]:
+        """status_lines: unasked; status_answers: to `F`; and of each sort that was ever reported, how often."""
+        return {"status_lines": self._status_lines, "status_answers": self.answers} | self._counts
+
+    def _count(self, names: Iterable[str]) -> None:
+        for name in names:
+            key = f"adapter_{name}"
+            self._counts[key] = self._counts.get(key, 0) + 1
+
+
+class StatusQuestions:
+    """When to ask for the flags.
+
+    After SILENCE_NS without a scan, since then there is something to learn, and else once in INTERVAL_NS at most:
+    adapters that obey one command a USB packet have something else to do, the answer stands in the midst of frames,
+    and asking clears the flags for whoever else might want them. One that refuses, or leaves MOST_UNANSWERED of them
+    unanswered, is asked no more.
+    """
+
+    def __init__(self, status: AdapterStatus) -> None:
+        """Ask the adapter that `status` hears of."""
+        self._status = status
+        self._refusals = 0
+        self._answers = 0
+        self._unanswered = 0
+        self._due_ns: int | None = None
+        self._asked = False
+        self._scan_ns: int | None = None
+        self._answers_before_silence: int | None = None
+
+    @property
+    def answered_in_silence(self) -> bool:
+        """No scan comes, and flags were asked for since the last one did, and came."""
+        before = self._answers_before_silence
+        return before is not None and self._status.answers > before
+
+    def reopened(self) -> None:
+        """The channel was opened anew: who has ever answered is given another chance."""
+        if self._status.answers:
+            self._unanswered = 0
+
+    def due(self, scans: int, refusals: int, now_ns: int) -> bool:
+        """Whether to ask now, which is then taken as done; to be called at every read.
+
+        Args:
+            scans: that this read gave.
+            refusals: BELs so far.
+            now_ns: monotonic, in [ns].
+        """
+        if scans:
+            self._scan_ns, self._answers_before_silence = now_ns, None
+        if self._scan_ns is None or self._due_ns is None:  # the first read of all: silent from here on
+            self._scan_ns, self._due_ns = now_ns, now_ns + INTERVAL_NS
+        if self._answers_before_silence is None and now_ns - self._scan_ns >= SILENCE_NS:
+            self._answers_before_silence = self._status.answers
+        elif now_ns < self._due_ns:
+            return False
+        self._due_ns = now_ns + INTERVAL_NS
+        return self._ask(refusals)
+
+    def _ask(self, refusals: int) -> bool:
+        if self._asked:
+            answered = self._status.answers > self._answers
+            refused = refusals > self._refusals
+            self._unanswered = 0 if answered else MOST_UNANSWERED if refused else self._unanswered + 1
+            if self._unanswered >= MOST_UNANSWERED:
+                self._status.forget()
+        self._asked, self._answers, self._refusals = True, self._status.answers, refusals
+        return self._unanswered < MOST_UNANSWERED

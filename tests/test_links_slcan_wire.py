@@ -1,0 +1,403 @@
+"""What goes over the wire besides frames: time stamps and status, and the wire itself under another name."""
+
+import os
+import time
+from itertools import pairwise
+
+import pytest
+from bridge_samples import make_recording, read_scans, read_until_lost, stacked
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+from test_links_serial import SilentDevice, wait_for
+
+from firmware_bridge import slcan_status
+from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
+from firmware_bridge.links import slcan_serial
+from firmware_bridge.links.ports import PluggedAdapter, Port
+from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
+from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.slcan_scans import SlcanScans
+from firmware_bridge.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
+from firmware_bridge.xela import USPA44_MAP
+
+MS = 1_000_000
+
+
+def cycle_lines(number: int, stamp_ms: int | None = None) -> list[bytes]:
+    """The lines of one scan; of stamped ones every eighth frame has the next millisecond."""
+    return [
+        encode_frame(
+            CanFrame(
+                can_id,
+                bytes([9, 1, number % 256, 2, number % 256, taxel, 3, 9]),
+                timestamp_ms=None if stamp_ms is None else (stamp_ms + place // 8) % 60_000,
+            )
+        )
+        for place, (can_id, taxel) in enumerate(USPA44_MAP.wire_order("4"))
+    ]
+
+
+# Time stamps.
+
+
+def test_a_scan_has_the_time_of_its_newest_frame():
+    """Each scan 3 ms late but one, which is not; stamps wrap in between."""
+    scans = SlcanScans()
+    start_ns = 5 * 10**12
+    got = []
+    for number in range(20):
+        bus_ns = start_ns + number * 10 * MS
+        late_ns = 0 if number == 7 else 3 * MS
+        got += scans.feed(b"".join(cycle_lines(number, (59_900 + number * 10) % 60_000)), bus_ns + 1 * MS + late_ns)
+    assert [scan.number for scan in got] == list(range(20))
+    delays_ms = [(scan.time_ns - scan.device_ns) / MS for scan in got if scan.device_ns is not None]
+    assert delays_ms == [0.0] * 7 + [0.0] + [3.0] * 12, "the smallest is taken for none"
+
+
+@pytest.mark.parametrize("cut", [1, 26, 100, 416, 1000])
+def test_any_chunking_gives_the_same_times(cut):
+    """Also of two sensors whose frames mix, which no cycle holds whole. What came in time sets the clock, first."""
+    lines = [line for n in range(9) for line in cycle_lines(n, 110 + 10 * n)]
+    pairs = [zip(cycle_lines(n, 110 + 10 * n), other_cycle(n), strict=True) for n in range(9)]
+    mixed = [line for cycles in pairs for pair in cycles for line in pair]
+    for text in (b"".join(lines), b"".join(mixed)):
+        whole, pieces = SlcanScans(), SlcanScans()
+        for scans in (whole, pieces):
+            scans.feed(b"".join(cycle_lines(0, 100)), 10**12 - 10**9)
+        expected = whole.feed(text, 10**12)
+        got = [scan for at in range(0, len(text), cut) for scan in pieces.feed(text[at : at + cut], 10**12)]
+        assert [scan.device_ns for scan in got] == [scan.device_ns for scan in expected]
+        assert {scan.device_ns for scan in got} == {10**12 - 10**9 + (10 + 10 * n) * MS for n in range(9)}
+        assert whole.counters() == pieces.counters()
+
+
+def other_cycle(number: int) -> list[bytes]:
+    """Of controller 6, stamped alike."""
+    return [line[:3] + b"6" + line[4:] for line in cycle_lines(number, 110 + 10 * number)]
+
+
+def test_a_torn_scan_has_the_time_of_its_newest_frame_too():
+    scans = SlcanScans()
+    torn = cycle_lines(1, 20)
+    del torn[12:]
+    got = scans.feed(b"".join(cycle_lines(0, 10)), 10**12)
+    got += scans.feed(b"".join(torn + cycle_lines(2, 30)), 10**12 + 50 * MS)
+    assert [scan.complete for scan in got] == [True, False, True]
+    (first, second, third) = (scan.device_ns or 0 for scan in got)
+    assert (second - first, third - second) == (10 * MS, 10 * MS)
+
+
+def test_the_same_stamp_a_minute_later_is_a_minute_later():
+    scans = SlcanScans()
+    scans.feed(b"".join(cycle_lines(0, 100)), 10**12)  # learns the form
+    first, second = (scans.feed(b"".join(cycle_lines(n, 200)), 10**12 + (100 + n * 60_000) * MS)[0] for n in range(2))
+    assert first.device_ns is not None and second.device_ns == first.device_ns + 60_000 * MS
+
+
+def test_after_an_opening_the_clock_is_another():
+    scans = SlcanScans()
+    scans.feed(b"".join(cycle_lines(0, 50)), 10**12)
+    scans.begin_anew()
+    (scan,) = scans.feed(b"".join(cycle_lines(1, 20)), 10**12 + 30 * MS)
+    assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= MS
+
+
+def test_without_stamps_there_is_no_device_time():
+    (scan,) = SlcanScans().feed(b"".join(cycle_lines(0)), 10**12)
+    assert scan.device_ns is None
+
+
+def test_stamps_say_how_many_bytes_a_scan_needs():
+    plain, stamped = SlcanScans(), SlcanScans()
+    plain.feed(b"".join(cycle_lines(0)), 0)
+    stamped.feed(b"".join(cycle_lines(0, 0)), 0)
+    assert (plain.bytes_until_scan(), stamped.bytes_until_scan()) == (16 * 22, 16 * 26)
+    stamped.feed(cycle_lines(1, 10)[0] + b"t10", 0)
+    assert stamped.bytes_until_scan() == 15 * 26 - 3
+
+
+def test_an_emulated_sensor_is_read_with_its_stamps():
+    recording = make_recording(40)
+    with Emulator([recording]) as emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+    assert (stacked(scans) == recording.tracks[0].counts).all()
+    times = [scan.device_ns for scan in scans if scan.device_ns is not None]
+    assert len(times) == 40 and times == sorted(times)
+    assert all(scan.device_ns is not None and scan.device_ns <= scan.time_ns for scan in scans)
+    # On its own clock the sensor keeps its pace, however late scans were read: to the jitter and a tick.
+    assert max(abs((b - a) / MS - 10) for a, b in pairwise(times)) < 9
+
+
+def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatch):
+    monkeypatch.setattr(slcan_status, "INTERVAL_NS", 20 * MS)
+    recording = make_recording(40)
+    with Emulator([recording], old_canable=True) as emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+        counters = {name: count for name, count in link.counters().items() if count}
+        assert emulator.adapter.refused == 1  # closing what is not open, as ever
+    assert (stacked(scans) == recording.tracks[0].counts).all()
+    assert counters == {"received_bytes": 640 * 22, "frames": 640, "readings": 640, "scans": 40}
+    assert {scan.device_ns for scan in scans} == {None} and link.trouble is None
+
+
+def test_an_adapter_whose_stamps_are_no_milliseconds_of_a_minute_is_told_to_leave_them_out(monkeypatch):
+    monkeypatch.setattr(slcan_status, "SILENCE_NS", 10**12)
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        late = [line[:-5] + b"FA00\r" for line in cycle_lines(0, 0)]
+        for line in late[: MOST_LATE_STAMPS - 1]:
+            os.write(device.device_fd, line)
+        wait_for(lambda: link.read(0.01) == [] and link.counters()["late_stamps"] == MOST_LATE_STAMPS - 1)
+        assert device.received(10) == b"C\rS8\rZ1\rO\r"
+        os.write(device.device_fd, late[0])
+        wait_for(lambda: link.read(0.01) == [] and link.counters()["late_stamps"] == MOST_LATE_STAMPS)
+        assert device.received(7) == b"C\rZ0\rO\r"
+        os.write(device.device_fd, late[0] + b"".join(cycle_lines(1)))
+        (scan,) = read_scans(link, 1)
+        assert scan.complete and scan.device_ns is None
+    assert device_commands_after(link) == b"C\rS8\rO\rC\r"
+
+
+def test_a_stamp_that_flips_now_and_then_is_no_reason_to_leave_them_out(monkeypatch):
+    monkeypatch.setattr(slcan_status, "SILENCE_NS", 10**12)
+    monkeypatch.setattr(slcan_serial, "LATE_STAMPS_FRAMES", 20)
+    flipped = cycle_lines(0, 0)[0][:-5] + b"FA00\r"
+    with SilentDevice() as device:
+        link = SlcanSerialLink(device.port)
+        for opening in range(2):
+            with link:
+                assert device.received(10) == b"C\rS8\rZ1\rO\r"
+                for number in range(MOST_LATE_STAMPS):
+                    os.write(device.device_fd, flipped + b"".join(cycle_lines(2 * number, 20 * number)))
+                    os.write(device.device_fd, b"".join(cycle_lines(2 * number + 1, 20 * number + 10)))
+                    assert None not in [scan.device_ns for scan in read_scans(link, 2)]
+                os.write(device.device_fd, flipped * (MOST_LATE_STAMPS - 1))  # which the next opening does not count
+                late = (2 * opening + 2) * MOST_LATE_STAMPS - opening - 1
+                wait_for(lambda late=late: link.read(0.01) == [] and link.counters()["late_stamps"] == late)
+            assert device.received(5) == b"C\rZ0\r"
+
+
+def device_commands_after(link: SlcanSerialLink) -> bytes:
+    with SilentDevice() as device:
+        link._plugged = PluggedAdapter(device.port)
+        with link:
+            pass
+        return device.received(9)
+
+
+# Status.
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """Asks every 50 ms instead of 5 s."""
+    monkeypatch.setattr(slcan_status, "INTERVAL_NS", 50 * MS)
+    monkeypatch.setattr(slcan_status, "SILENCE_NS", 40 * MS)
+
+
+def read_until(link: SlcanSerialLink, condition, timeout_s: float = 20.0) -> int:
+    """Read until something is so; how many scans came."""
+    scans, end_s = 0, time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, (link.trouble, link.counters())
+        scans += len(link.read(0.01))
+    return scans
+
+
+def test_flags_are_asked_for_and_told(impatient):
+    with Emulator([make_recording(10)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
+        read_until(link, lambda: link.counters()["status_answers"] >= 2)
+        assert link.trouble is None
+        emulator.adapter.flags = 0x08
+        read_until(link, lambda: link.trouble == FRAMES_LOST)
+        assert link.counters()["adapter_overrun"] == 1
+        read_until(link, lambda: link.trouble is None)  # asking has cleared it
+        assert link.counters()["bad_lines"] == 0
+
+
+def test_bus_off_is_told_at_once_and_over_with_the_next_frame():
+    with Emulator([make_recording(10)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
+        read_scans(link, 3)
+        emulator.tell(emulator.adapter.state_line("b", 256, 256))
+        read_until(link, lambda: link.trouble == BUS_OFF)
+        assert link.counters()["adapter_bus_off"] == 1
+        emulator.tell(emulator.adapter.state_line("a", 0, 0))
+        read_until(link, lambda: link.trouble is None)
+        assert read_scans(link, 3)
+
+
+def test_a_silent_bus_with_errors_is_trouble(impatient):
+    """The bitrate or the wiring is wrong: the adapter hears noise, and a frame never."""
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        for answered, answer in enumerate((b"F00\r", b"FA4\r")):
+            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
+            os.write(device.device_fd, answer)
+            wait_for(lambda n=answered: link.read(0.01) == [] and link.counters()["status_answers"] > n)
+            assert link.trouble == (BUS_ERRORS if answer == b"FA4\r" else None)
+        os.write(device.device_fd, b"".join(cycle_lines(0)))
+        read_scans(link, 1)
+        assert link.trouble is None
+
+
+def read_now(device: SilentDevice) -> bytes:
+    os.set_blocking(device.device_fd, False)
+    try:
+        return os.read(device.device_fd, 1000)
+    except BlockingIOError:
+        return b""
+
+
+def test_one_that_refuses_is_asked_once(impatient):
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        asked = b""
+        end_s = time.monotonic() + 0.4
+        while time.monotonic() < end_s:
+            link.read(0.01)
+            if b"F" in (heard := read_now(device)):
+                os.write(device.device_fd, b"\a")
+            asked += heard
+        assert asked.count(b"F\r") == 1
+
+
+def test_who_has_answered_once_is_asked_again_after_an_opening(impatient):
+    with SilentDevice() as device:
+        link = SlcanSerialLink(device.port)
+        with link:
+            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
+            os.write(device.device_fd, b"F00\r")
+            wait_for(lambda: link.read(0.01) == [] and link.counters()["status_answers"] == 1)
+            end_s = time.monotonic() + 0.05 * (slcan_status.MOST_UNANSWERED + 2)
+            while time.monotonic() < end_s:
+                link.read(0.01)
+        read_now(device)
+        with link:
+            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
+
+
+def test_opening_again_does_not_unsay_what_was_said_until_something_else_is(impatient):
+    """A link that lasts opens a silent adapter again and again: its trouble must not come and go with that."""
+    with Emulator([make_recording(10)], loop=True) as emulator:
+        link = SlcanSerialLink(emulator.port)
+        with link:
+            read_scans(link, 1)
+            emulator.tell(emulator.adapter.state_line("b", 256, 256))
+            read_until(link, lambda: link.trouble == BUS_OFF)
+        for _ in range(2):
+            with link:
+                assert (link.read(0.01), link.trouble) == ([], BUS_OFF)
+        answers = link.counters()["status_answers"]
+        with link:
+            read_until(link, lambda: link.counters()["status_answers"] > answers)
+            emulator.adapter.state = "a"
+            read_until(link, lambda: link.trouble is None)
+
+
+def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(monkeypatch):
+    """Some adapters write the setting to an EEPROM each time."""
+    monkeypatch.setattr(slcan_serial, "MOST_SILENT_OPENINGS", 2)
+    monkeypatch.setattr(slcan_serial, "QUIET_S", 0.001)
+    stamped, plain = b"C\rS8\rZ1\rO\rC\rZ0\r", b"C\rS8\rO\rC\r"
+    with SilentDevice() as device:
+        link = SlcanSerialLink(device.port)
+        for expected in (stamped, stamped, plain, plain):
+            with link:
+                pass
+            assert device.received(len(expected)) == expected
+        with link:
+            assert device.received(7) == b"C\rS8\rO\r"
+            os.write(device.device_fd, b"".join(cycle_lines(0)))
+            read_scans(link, 1)
+            assert device.received(7) == b"C\rZ1\rO\r"
+            wait_for(lambda: link.read(0.0) == [])
+            os.write(device.device_fd, b"".join(line for n in range(1, 9) for line in cycle_lines(n, 10 * n)))
+            scans = read_scans(link, 8)
+            assert all(scan.whole and scan.device_ns is not None for scan in scans), "no line of the new form is lost"
+        assert device.received(5) == b"C\rZ0\r", "asked for once"
+        with link:
+            pass
+        assert device.received(len(stamped)) == stamped
+
+
+# The same adapter under another name.
+
+VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
+GRIPPER = Port("/dev/ttyUSB0", (0x0403, 0x6015), "GRIP1", "gripper")
+
+
+def test_an_adapter_is_found_again_by_its_serial_number():
+    adapter = PluggedAdapter("/dev/ttyUSB0")
+    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
+    # Another has its name now, and it has the next.
+    assert adapter.find([GRIPPER, VSCOM._replace(path="/dev/ttyUSB1")]) == "/dev/ttyUSB1"
+    with pytest.raises(NoDeviceError, match=r"no adapter with serial number D30BL366, .* seen: /dev/ttyUSB0"):
+        adapter.find([GRIPPER])
+    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
+
+
+def test_an_adapter_without_a_serial_number_is_its_path():
+    adapter = PluggedAdapter("/dev/ttyACM0")
+    nameless = Port("/dev/ttyACM0", (0xAD50, 0x60C4), None, "CANtact")
+    assert adapter.find([nameless]) == adapter.find([]) == adapter.find([VSCOM]) == "/dev/ttyACM0"
+    # And what comes there later with one is learnt then.
+    assert adapter.find([VSCOM._replace(path="/dev/ttyACM0")]) == "/dev/ttyACM0"
+    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
+
+
+def test_of_a_device_with_several_ports_it_is_the_same_one():
+    first, second = (VSCOM._replace(path=f"/dev/ttyUSB{n}", interface=f"1.{n}") for n in range(2))
+    adapter = PluggedAdapter("/dev/ttyUSB1")
+    assert adapter.find([first, second]) == "/dev/ttyUSB1"
+    moved = [first._replace(path="/dev/ttyUSB4"), second._replace(path="/dev/ttyUSB5")]
+    assert adapter.find(moved) == "/dev/ttyUSB5"
+    with pytest.raises(NoDeviceError, match="no adapter"):
+        adapter.find(moved[:1])
+
+
+def test_two_devices_with_one_serial_number_are_not_guessed_between():
+    """Cheap adapters all have the same."""
+    one, other = (Port(f"/dev/ttyACM{n}", (0xAD50, 0x60C4), "00001", "CANtact", interface="1.0") for n in range(2))
+    adapter = PluggedAdapter(one.path)
+    assert adapter.find([one, other]) == adapter.find([other, one]) == one.path
+    with pytest.raises(NoDeviceError, match="2 adapters with serial number 00001"):
+        adapter.find([other, one._replace(path="/dev/ttyACM2")])
+    assert adapter.find([other]) == other.path  # alone it may be the same, plugged in elsewhere
+    assert adapter.find([one, other]) == other.path  # and is it from then on
+
+
+def test_a_link_through_a_name_for_the_port(tmp_path):
+    (tmp_path / "skin").symlink_to("/dev/ttyUSB0")
+    adapter = PluggedAdapter(str(tmp_path / "skin"))
+    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
+    assert adapter.find([VSCOM._replace(path="/dev/ttyUSB3")]) == "/dev/ttyUSB3"
+
+
+def test_the_cable_out_and_in_again_under_another_name(monkeypatch):
+    """Over real pseudo-terminals, which only the listing takes for USB."""
+    plugged: list[ListPortInfo] = []
+    monkeypatch.setattr(list_ports, "comports", lambda: list(plugged))
+
+    def plug(port: str) -> None:
+        info = ListPortInfo(port)
+        info.vid, info.pid, info.serial_number, info.product = 0x0403, 0x6015, "D30BL366", "USB-CAN Plus"
+        plugged[:] = [info]
+
+    with Emulator([make_recording(10)], loop=True) as first, Emulator([make_recording(10)], loop=True) as second:
+        plug(first.port)
+        link = SlcanSerialLink(first.port)
+        link.name = "slcan:serial=D30BL366"
+        with link:
+            before = read_scans(link, 3)
+            first.hang_up()
+            with pytest.raises(LinkLostError):
+                read_scans(link, 10_000)
+        plugged.clear()
+        for _ in range(2):
+            with pytest.raises(DeviceError, match="no adapter with serial number D30BL366"):
+                link.__enter__()
+        plug(second.port)
+        with link:
+            after = read_scans(link, 3)
+            assert (link.port, link.name) == (second.port, "slcan:serial=D30BL366")
+        assert {scan.sensor for scan in before + after} == {"4"}
+        assert after[0].number > before[-1].number, "one series of numbers"
+        assert after[0].device_ns is not None and 0 <= after[0].time_ns - after[0].device_ns < 10**9
