@@ -1,0 +1,192 @@
+"""A pretended gs_usb adapter: what a candleLight does with requests, frames and a client that dies.
+
+It is no kinder than the device. Its queue holds 64 frames, and what finds no room is lost and told by a flag on the
+next frame. It hears nothing without the right bit timing. A client's death does not stop it. And if the USB device is
+reset while a frame waits to be fetched, it is mute until it is unplugged (candleLight_fw issues 46, 165, up to 2026).
+"""
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from firmware_bridge import gs_usb
+from firmware_bridge.gs_usb import BitTiming, BitTimingLimits
+from firmware_bridge.slcan import CanFrame
+
+QUEUE_FRAMES: Final = 64
+CANDLELIGHT: Final = BitTimingLimits(
+    features=0x13 | gs_usb.HARDWARE_STAMPS,
+    clock_hz=48_000_000,
+    tseg1_min=1,
+    tseg1_max=16,
+    tseg2_min=1,
+    tseg2_max=8,
+    sjw_max=4,
+    brp_min=1,
+    brp_max=1024,
+    brp_inc=1,
+)
+_FRAME: Final = struct.Struct("<IIBBBB8s")
+
+
+class StalledError(Exception):
+    """The adapter refuses a request."""
+
+
+class GsUsbAdapter:
+    """One adapter, from one plugging-in to the next. Its methods may be called from any thread.
+
+    Attributes:
+        started: its channel is on the bus.
+        right_bitrate: the timing it was given makes 1 Mbit/s.
+        sent: frames that it put on the bus for the client.
+        lost_frames: frames that found no room.
+        mute: it will send nothing any more.
+    """
+
+    def __init__(
+        self,
+        limits: BitTimingLimits = CANDLELIGHT,
+        *,
+        channels: int = 1,
+        clock_us: Callable[[], int] = lambda: time.monotonic_ns() // 1000,
+    ) -> None:
+        """Plug it in; `clock_us` is its own clock, of which it gives the last 32 bits."""
+        self.started = False
+        self.right_bitrate = False
+        self.sent: list[CanFrame] = []
+        self.lost_frames = 0
+        self.mute = False
+        self._limits = limits
+        self._channels = channels
+        self._clock_us = clock_us
+        self._stamped = False
+        self._overflowed = False
+        self._queue: deque[bytes] = deque()
+        self._waiting_for_host: bytes | None = None
+        self._changed = threading.Condition()
+        self._plugged = True
+
+    @property
+    def plugged(self) -> bool:
+        """Its cable is in."""
+        return self._plugged
+
+    @property
+    def waiting_frames(self) -> int:
+        """Frames in its queue."""
+        return len(self._queue)
+
+    def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
+        """Frames come over the bus, at `stamp_us` of its clock, by default now."""
+        self._receive(frames, 0, stamp_us, channel)
+
+    def report(self, classes: int, data: bytes = bytes(8)) -> None:
+        """Send an error frame, of classes as in Linux's error.h."""
+        self._receive((CanFrame(classes, data),), gs_usb.ERROR, None, 0)
+
+    def unplug(self) -> None:
+        """Pull the cable out: whoever waits for it is told."""
+        with self._changed:
+            self._plugged = False
+            self._changed.notify_all()
+
+    def request_out(self, number: int, payload: bytes) -> None:
+        """Obey a request.
+
+        Raises:
+            StalledError: it knows no such request, or the payload is too short.
+        """
+        lengths = {gs_usb.HOST_FORMAT: 4, gs_usb.BIT_TIMING: 20, gs_usb.MODE: 8}
+        if len(payload) < lengths.get(number, 1 << 16):
+            raise StalledError(f"request {number} with {len(payload)} bytes")
+        with self._changed:
+            if number == gs_usb.BIT_TIMING:
+                self._set_timing(BitTiming(*struct.unpack_from("<5I", payload)))
+            elif number == gs_usb.MODE:
+                wanted, features = struct.unpack_from("<II", payload)
+                self.started = wanted == 1
+                if self.started:
+                    self._stamped = features & self._limits.features & gs_usb.HARDWARE_STAMPS != 0
+
+    def request_in(self, number: int) -> bytes:
+        """Answer a request.
+
+        Raises:
+            StalledError: it knows no such request.
+        """
+        if number == gs_usb.BIT_TIMING_LIMITS:
+            return struct.pack("<10I", *self._limits)
+        if number == gs_usb.DEVICE_CONFIG:
+            return struct.pack("<4B2I", 0, 0, 0, self._channels - 1, 2, 1)
+        raise StalledError(f"request {number}")
+
+    def take(self, data: bytes) -> bool:
+        """Take a host frame to send; False while there is no room for its echo."""
+        with self._changed:
+            if len(self._queue) >= QUEUE_FRAMES:
+                return False
+            if len(data) < gs_usb.FRAME_BYTES or not self.started:
+                return True
+            echo_id, raw_id, dlc, _, _, _, payload = _FRAME.unpack_from(data)
+            extended, remote = raw_id & gs_usb.EXTENDED != 0, raw_id & gs_usb.REMOTE != 0
+            self.sent.append(CanFrame(raw_id & 0x1FFFFFFF, payload[:dlc], extended, remote))
+            self._enqueue(echo_id, raw_id, dlc, 0, payload, None)
+            return True
+
+    def fetch(self, timeout_s: float | None) -> bytes | None:
+        """The next host frame, after waiting for it; None when there is none in time, or the cable is out."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._plugged or (self._hand_over() and not self.mute), timeout_s)
+            if not self._plugged or self.mute:
+                return None
+            data, self._waiting_for_host = self._waiting_for_host, None
+            self._hand_over()
+            return data
+
+    def reset_usb(self) -> None:
+        """The host resets the USB device, which is not what restarts it."""
+        with self._changed:
+            self.mute = self.mute or self._waiting_for_host is not None
+
+    def _receive(self, frames: tuple[CanFrame, ...], flags: int, stamp_us: int | None, channel: int) -> None:
+        with self._changed:
+            for frame in frames:
+                if not (self.started and self.right_bitrate):
+                    return
+                if len(self._queue) >= QUEUE_FRAMES:
+                    self._overflowed = True
+                    self.lost_frames += 1
+                    continue
+                raw_id = frame.can_id | flags | gs_usb.EXTENDED * frame.extended | gs_usb.REMOTE * frame.remote
+                self._enqueue(gs_usb.RECEIVED, raw_id, len(frame.data), channel, frame.data, stamp_us)
+
+    def _enqueue(self, echo_id: int, raw_id: int, dlc: int, channel: int, payload: bytes, stamp_us: int | None) -> None:
+        flags = gs_usb.OVERFLOW_FLAG if self._overflowed and echo_id == gs_usb.RECEIVED else 0
+        self._overflowed = self._overflowed and not flags
+        data = _FRAME.pack(echo_id, raw_id, dlc, channel, flags, 0, payload)
+        if self._stamped:
+            data += struct.pack("<I", (self._clock_us() if stamp_us is None else stamp_us) & 0xFFFFFFFF)
+        self._queue.append(data)
+        self._hand_over()
+        self._changed.notify_all()
+
+    def _hand_over(self) -> bool:
+        """One frame leaves the queue for the endpoint, and stays there until the host fetches it."""
+        if self._waiting_for_host is None and self._queue:
+            self._waiting_for_host = self._queue.popleft()
+        return self._waiting_for_host is not None
+
+    def _set_timing(self, timing: BitTiming) -> None:
+        limits = self._limits
+        if not (
+            limits.tseg1_min <= timing.prop_seg + timing.phase_seg1 <= limits.tseg1_max
+            and limits.tseg2_min <= timing.phase_seg2 <= limits.tseg2_max
+            and 1 <= timing.sjw <= limits.sjw_max
+            and limits.brp_min <= timing.brp <= limits.brp_max
+        ):
+            return  # it takes no notice, and says nothing
+        self.right_bitrate = limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S

@@ -1,0 +1,259 @@
+"""USB with pretended gs_usb adapters, as a backend of pyusb: what libusb would answer, its errors included."""
+
+# What each method is for, pyusb says; and since it is untyped, pyright takes its empty methods to return None.
+# ruff: noqa: D102
+# pyright: reportIncompatibleMethodOverride=false
+
+import errno
+from array import array
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any, Final
+
+import usb.backend
+import usb.core
+
+from firmware_bridge.gs_usb_adapter import GsUsbAdapter, StalledError
+
+IO: Final = -1
+ACCESS: Final = -3
+NO_DEVICE: Final = -4
+NOT_FOUND: Final = -5
+BUSY: Final = -6
+TIMEOUT: Final = -7
+OVERFLOW: Final = -8
+PIPE: Final = -9
+
+_ERRNO: Final = {
+    IO: errno.EIO,
+    ACCESS: errno.EACCES,
+    NO_DEVICE: errno.ENODEV,
+    NOT_FOUND: errno.ENOENT,
+    BUSY: errno.EBUSY,
+    TIMEOUT: errno.ETIMEDOUT,
+    OVERFLOW: errno.EOVERFLOW,
+    PIPE: errno.EPIPE,
+}
+_GET_DESCRIPTOR: Final = 6
+_ENGLISH: Final = b"\x04\x03\x09\x04"
+_TEXTS: Final = 3
+_DIRECTION_IN: Final = 0x80
+
+
+class GsUsbPort:
+    """A place on the bus where an adapter may be plugged in.
+
+    Attributes:
+        adapter: the one that is there, or was there last.
+        serial_number, product: its texts; None where it has none.
+        kernel_driver: the kernel's driver holds it.
+        claimed: some program holds it.
+        handles: how often it is open.
+        permitted: the user may open it.
+        gone_as: the error of libusb that unplugging gives; host controllers differ.
+    """
+
+    def __init__(
+        self,
+        adapter: Callable[[], GsUsbAdapter] = GsUsbAdapter,
+        *,
+        serial_number: str | None = "0039003A5542501020393739",
+        product: str | None = "candleLight USB to CAN adapter",
+        usb_id: tuple[int, int] = (0x1D50, 0x606F),
+        packet_bytes: int = 32,
+    ) -> None:
+        """Plug one in; `adapter` makes it, each time anew."""
+        self.serial_number = serial_number
+        self.product = product
+        self.kernel_driver = False
+        self.claimed = False
+        self.handles = 0
+        self.permitted = True
+        self.gone_as = NO_DEVICE
+        self.usb_id = usb_id
+        self.packet_bytes = packet_bytes
+        self.address = 5
+        self._make = adapter
+        self.adapter = adapter()
+
+    def plug(self) -> None:
+        """Plug it in again: it begins anew, under another address."""
+        self.address += 1
+        self.claimed = False
+        self.adapter = self._make()
+
+
+class _Plugged:
+    """What libusb knows a device by: gone for good once it was unplugged."""
+
+    def __init__(self, port: GsUsbPort) -> None:
+        self.port = port
+        self.adapter = port.adapter
+        self.claimed_here = False
+
+    def check(self) -> GsUsbAdapter:
+        if not self.adapter.plugged:
+            raise _error(self.port.gone_as)
+        return self.adapter
+
+
+class GsUsbBackend(usb.backend.IBackend):
+    """A bus with ports."""
+
+    def __init__(self, *ports: GsUsbPort) -> None:
+        """Set up a bus, by default with one adapter on it."""
+        super().__init__()
+        self.ports = list(ports) or [GsUsbPort()]
+
+    # What stands in the descriptors.
+
+    def enumerate_devices(self) -> Iterator[_Plugged]:
+        return iter([_Plugged(port) for port in self.ports if port.adapter.plugged])
+
+    def get_device_descriptor(self, dev: _Plugged) -> SimpleNamespace:
+        vendor, product = dev.port.usb_id
+        return SimpleNamespace(
+            bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
+            bMaxPacketSize0=64, idVendor=vendor, idProduct=product, bcdDevice=0, iManufacturer=1, iProduct=2,
+            iSerialNumber=3 if dev.port.serial_number is not None else 0, bNumConfigurations=1, bus=1,
+            address=dev.port.address, port_number=1, port_numbers=(1,), speed=2,
+        )  # fmt: skip
+
+    def get_configuration_descriptor(self, dev: _Plugged, config: int) -> SimpleNamespace:
+        if config:
+            raise IndexError(config)
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1, bConfigurationValue=1, iConfiguration=0,
+            bmAttributes=0x80, bMaxPower=75, extra_descriptors=b"",
+        )  # fmt: skip
+
+    def get_interface_descriptor(self, dev: _Plugged, intf: int, alt: int, config: int) -> SimpleNamespace:
+        if intf or alt:
+            raise IndexError(intf, alt)
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=4, bInterfaceNumber=0, bAlternateSetting=0, bNumEndpoints=2,
+            bInterfaceClass=255, bInterfaceSubClass=255, bInterfaceProtocol=255, iInterface=0, extra_descriptors=b"",
+        )  # fmt: skip
+
+    def get_endpoint_descriptor(self, dev: _Plugged, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+        return SimpleNamespace(
+            bLength=7, bDescriptorType=5, bEndpointAddress=(0x81, 0x02)[ep], bmAttributes=2, bInterval=0, bRefresh=0,
+            bSynchAddress=0, wMaxPacketSize=dev.port.packet_bytes, extra_descriptors=b"",
+        )  # fmt: skip
+
+    # Who holds a device.
+
+    def open_device(self, dev: _Plugged) -> _Plugged:
+        dev.check()
+        if not dev.port.permitted:
+            raise _error(ACCESS)
+        dev.port.handles += 1
+        return dev
+
+    def close_device(self, dev_handle: _Plugged) -> None:
+        self._let_go(dev_handle)
+        dev_handle.port.handles -= 1
+
+    def get_configuration(self, dev_handle: _Plugged) -> int:
+        dev_handle.check()
+        return 1
+
+    def set_configuration(self, dev_handle: _Plugged, config_value: int) -> None:
+        dev_handle.check()
+
+    def claim_interface(self, dev_handle: _Plugged, intf: int) -> None:
+        dev_handle.check()
+        if dev_handle.port.kernel_driver or (dev_handle.port.claimed and not dev_handle.claimed_here):
+            raise _error(BUSY)
+        dev_handle.port.claimed = dev_handle.claimed_here = True
+
+    def release_interface(self, dev_handle: _Plugged, intf: int) -> None:
+        dev_handle.check()
+        self._let_go(dev_handle)
+
+    def is_kernel_driver_active(self, dev_handle: _Plugged, intf: int) -> bool:
+        dev_handle.check()
+        return dev_handle.port.kernel_driver
+
+    def detach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
+        dev_handle.check()
+        if not dev_handle.port.kernel_driver:
+            raise _error(NOT_FOUND)
+        dev_handle.port.kernel_driver = False
+
+    def attach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
+        dev_handle.check()
+        if dev_handle.port.claimed:
+            raise _error(BUSY)
+        dev_handle.port.kernel_driver = True
+
+    def reset_device(self, dev_handle: _Plugged) -> None:
+        dev_handle.check().reset_usb()
+
+    # Transfers.
+
+    def ctrl_transfer(
+        self,
+        dev_handle: _Plugged,
+        bmRequestType: int,  # noqa: N803
+        bRequest: int,  # noqa: N803
+        wValue: int,  # noqa: N803
+        wIndex: int,  # noqa: N803
+        data: "array[int]",
+        timeout: int,
+    ) -> int:
+        adapter = dev_handle.check()
+        try:
+            if not bmRequestType & _DIRECTION_IN:
+                adapter.request_out(bRequest, data.tobytes())
+                return len(data)
+            if bmRequestType == _DIRECTION_IN and bRequest == _GET_DESCRIPTOR and wValue >> 8 == _TEXTS:
+                answer = self._text(dev_handle.port, wValue & 0xFF)
+            else:
+                answer = adapter.request_in(bRequest)
+        except StalledError as error:
+            raise _error(PIPE) from error
+        answer = answer[: len(data)]
+        data[: len(answer)] = array("B", answer)
+        return len(answer)
+
+    def bulk_read(self, dev_handle: _Plugged, ep: int, intf: int, buff: Any, timeout: int) -> int:
+        adapter = dev_handle.check()
+        self._check_claim(dev_handle)
+        data = adapter.fetch(timeout / 1000 if timeout else None)
+        if data is None:
+            dev_handle.check()  # the cable may have come out meanwhile
+            raise _error(TIMEOUT)
+        if len(data) > len(buff):
+            raise _error(OVERFLOW)
+        buff[: len(data)] = array("B", data)
+        return len(data)
+
+    def bulk_write(self, dev_handle: _Plugged, ep: int, intf: int, data: "array[int]", timeout: int) -> int:
+        adapter = dev_handle.check()
+        self._check_claim(dev_handle)
+        if not adapter.take(data.tobytes()):
+            raise _error(TIMEOUT)
+        return len(data)
+
+    def _check_claim(self, handle: _Plugged) -> None:
+        if not handle.claimed_here:
+            raise _error(IO)
+
+    def _let_go(self, handle: _Plugged) -> None:
+        if handle.claimed_here:
+            handle.port.claimed = handle.claimed_here = False
+
+    def _text(self, port: GsUsbPort, index: int) -> bytes:
+        if index == 0:
+            return _ENGLISH
+        text = {2: port.product, 3: port.serial_number}.get(index)
+        if text is None:
+            raise StalledError(f"text {index}")
+        encoded = text.encode("utf-16-le")
+        return bytes((2 + len(encoded), _TEXTS)) + encoded
+
+
+def _error(code: int) -> usb.core.USBError:
+    kind = usb.core.USBTimeoutError if code == TIMEOUT else usb.core.USBError
+    return kind(f"libusb error {code}", code, _ERRNO[code])

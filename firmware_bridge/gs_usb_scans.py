@@ -1,0 +1,64 @@
+"""What a gs_usb adapter sends to scans: the pure stages in a row. No I/O, no clock."""
+
+from typing import Final
+
+from firmware_bridge.bus_errors import BusErrors
+from firmware_bridge.device_clock import DeviceClock
+from firmware_bridge.frame_scans import FrameScans
+from firmware_bridge.gs_usb import GsUsbDecoder
+from firmware_bridge.scan import Scan
+from firmware_bridge.xela import USPA44_MAP, ModelMap
+
+TICK_NS: Final = 1_000
+WRAP_TICKS: Final = 1 << 32
+"""Microseconds in 32 bits: 71.6 minutes."""
+
+
+class GsUsbScans:
+    """Bytes to scans, over any number of starts of the adapter."""
+
+    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
+        self._scans = FrameScans(model)
+        self._errors = BusErrors()
+        self._decoder_counts: dict[str, int] = {}
+        self._start_decoder(GsUsbDecoder(stamped=False))
+
+    def begin_anew(self) -> None:
+        """Give up what is half read, since the link was broken."""
+        self._scans.begin_anew()
+
+    def start(self, *, stamped: bool, channels: int) -> None:
+        """The adapter was started: what it had half sent is gone, and its clock may be another."""
+        self._decoder_counts = self._sum_decoder_counts()
+        self._start_decoder(GsUsbDecoder(stamped=stamped, channels=channels))
+        self._errors.restarted()
+
+    def feed(self, data: bytes, time_ns: int) -> list[Scan]:
+        """Scans that close within `data`, which arrived at `time_ns` [ns] of monotonic time."""
+        scans: list[Scan] = []
+        for host_frame in self._decoder.feed(data):
+            if host_frame.overflow:
+                self._errors.overflow(time_ns)
+            if host_frame.error is not None:
+                self._errors.error_frame(host_frame.error, host_frame.frame.data, time_ns)
+                continue
+            self._errors.frame_heard()
+            stamp_us = host_frame.stamp_us
+            device = None if stamp_us is None else self._clock.at(stamp_us, time_ns)
+            scans += self._scans.feed(host_frame.frame, time_ns, device)
+        return scans
+
+    def trouble(self, time_ns: int) -> str | None:
+        """What the adapter reports at `time_ns` [ns] of monotonic time that the user must know of."""
+        return self._errors.trouble(time_ns)
+
+    def counters(self) -> dict[str, int]:
+        """Counters of all stages."""
+        return self._sum_decoder_counts() | self._errors.counters() | self._scans.counters()
+
+    def _start_decoder(self, decoder: GsUsbDecoder) -> None:
+        self._decoder = decoder
+        self._clock = DeviceClock(TICK_NS, WRAP_TICKS)
+
+    def _sum_decoder_counts(self) -> dict[str, int]:
+        return {name: self._decoder_counts.get(name, 0) + count for name, count in self._decoder.counters().items()}

@@ -1,0 +1,206 @@
+"""A CAN interface of python-can: socketcan, PEAK, Kvaser and others; esd is on socketcan."""
+
+import errno
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from types import ModuleType
+from typing import Any, Final, Self
+
+from firmware_bridge.bus_errors import BusErrors
+from firmware_bridge.device_clock import DeviceClock
+from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.frame_scans import FrameScans
+from firmware_bridge.gs_usb import BITRATE_BIT_S
+from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.can_networks import can_networks, is_pretended
+from firmware_bridge.scan import Scan
+from firmware_bridge.slcan import CanFrame
+from firmware_bridge.xela import USPA44_MAP, ModelMap
+
+SEND_TIMEOUT_S: Final = 1.0
+TICK_NS: Final = 1_000
+
+PRETENDED: Final = ("virtual", "udp_multicast")
+_WITHOUT_BITRATE: Final = (*PRETENDED, "socketcan")
+"""Elsewhere set, or none at all."""
+_NOT_THROUGH_PYTHON_CAN: Final = {
+    "slcan": "use slcan:PORT: python-can's waits 2 s, carries 32 scans a second at its usual speed, and one byte of "
+    "noise ends it",
+    "gs_usb": "use gs_usb:SERIAL: python-can's never sees that the adapter was unplugged or has lost frames",
+}
+# Some of python-can's interfaces let through whatever a driver that is not there, or not whole, leads to.
+_NO_DRIVER: Final = (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError)
+
+
+class CanBusLink(Link):
+    """Scans from a sensor on an interface that python-can knows.
+
+    A wall clock that is set back while nothing comes lets `read` wait for so much longer, since python-can counts its
+    time-outs by it.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        *,
+        model: ModelMap = USPA44_MAP,
+        triggers: Sequence[CanFrame] = (),
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Prepare a link; nothing is opened yet.
+
+        Args:
+            interface: one of python-can's, such as "socketcan".
+            channel: as the interface names it, such as "can0".
+            model: which CAN id is which taxel.
+            triggers: frames that wake older controllers, sent once after opening.
+            clock_ns: monotonic, in [ns].
+
+        Raises:
+            SourceError: python-can knows no such interface, or this link is not for it.
+            DeviceError: python-can is not installed.
+        """
+        self.name = f"can:{interface}:{channel}"
+        pretended = interface in PRETENDED or (interface == "socketcan" and is_pretended(channel))
+        self.kind: SourceKind = "emulated" if pretended else "device"
+        self.ended = False
+        self.trouble: str | None = None
+        if interface in _NOT_THROUGH_PYTHON_CAN:
+            raise SourceError(f"source is {self.name!r}: {_NOT_THROUGH_PYTHON_CAN[interface]}")
+        self._can = _python_can()
+        known = set(self._can.VALID_INTERFACES) - set(_NOT_THROUGH_PYTHON_CAN)
+        if interface not in known:
+            raise SourceError(f"source is {self.name!r}, expected can:INTERFACE:CHANNEL of {', '.join(sorted(known))}")
+        self._interface = interface
+        self._channel = channel
+        self._triggers = tuple(triggers)
+        self._clock_ns = clock_ns
+        self._scans = FrameScans(model)
+        self._errors = BusErrors()
+        self._device_clock = DeviceClock(TICK_NS, None)
+        self._counts = dict.fromkeys(("frames", "error_frames", "fd_frames"), 0)
+        self._bus: Any = None
+
+    def __enter__(self) -> Self:
+        if self._interface == "socketcan":
+            _check_network(self._channel)
+            self._errors.reopened()  # a socket restarts no controller, and the kernel tells of bus-off once
+        else:
+            self._errors.restarted()
+        self._scans.begin_anew()
+        self._bus = self._open()
+        try:
+            for frame in self._triggers:
+                message = self._can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
+                self._bus.send(message, timeout=SEND_TIMEOUT_S)
+        except (self._can.CanError, OSError) as error:
+            self._close()
+            raise DeviceError(f"{self.name}: does not send frames: {error}") from error
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        if self._bus is not None:
+            self._close()
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Scans that closed since the last call; waits at most `timeout_s` for the first.
+
+        Raises:
+            LinkLostError: the interface is gone, or down.
+        """
+        if self._bus is None:
+            raise ValueError("the link is not open: use it in a with statement")
+        end_ns = self._clock_ns() + int(timeout_s * 1e9)
+        left_s = timeout_s
+        while True:
+            try:
+                message = self._bus.recv(max(left_s, 0.0))
+                if message is None and self._bus.state is self._can.BusState.ERROR:
+                    self._errors.left_the_bus()
+            except (self._can.CanError, OSError) as error:
+                self._errors.restarted()  # as a network does that comes up, or an adapter that is plugged in
+                raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
+            now_ns = self._clock_ns()
+            scans = [] if message is None else self._take(message, now_ns)
+            self.trouble = self._errors.trouble(now_ns)
+            left_s = (end_ns - now_ns) / 1e9
+            if scans or left_s <= 0:
+                return scans
+
+    def counters(self) -> dict[str, int]:
+        """Frames by sort, and the counters of bus and assembler; clock_restarts: steps back of the stamps' clock."""
+        counts = self._counts | {"clock_restarts": self._device_clock.restarts}
+        return counts | self._errors.counters() | self._scans.counters()
+
+    def _take(self, message: Any, time_ns: int) -> list[Scan]:
+        if message.is_error_frame:
+            self._counts["error_frames"] += 1
+            if self._interface == "socketcan":
+                self._errors.error_frame(message.arbitration_id, bytes(message.data), time_ns)
+            else:
+                self._errors.unsorted_error()  # each driver says it in its own way
+            return []
+        self._errors.frame_heard()
+        if message.is_fd:
+            self._counts["fd_frames"] += 1
+            return []
+        self._counts["frames"] += 1
+        frame = CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_remote_frame)
+        # Of the wall clock, of the driver's own, or none: zero.
+        stamp_us = round(message.timestamp * 1e6)
+        device = self._device_clock.at(stamp_us, time_ns) if stamp_us else None
+        return self._scans.feed(frame, time_ns, device)
+
+    def _open(self) -> Any:
+        settings: dict[str, Any] = {} if self._interface in _WITHOUT_BITRATE else {"bitrate": BITRATE_BIT_S}
+        if self._interface == "socketcan":  # the kernel does it; elsewhere it would cost more than it saves
+            settings["can_filters"] = [{"can_id": 0, "can_mask": 0, "extended": False}]
+        numbered = self._channel.isascii() and self._channel.isdigit() and self._interface not in _WITHOUT_BITRATE
+        channel = int(self._channel) if numbered else self._channel
+        try:
+            return self._can.Bus(channel=channel, interface=self._interface, ignore_config=True, **settings)
+        except (self._can.CanError, OSError) as error:
+            raise DeviceError(f"{self.name}: {_reason(error)}") from error
+        except _NO_DRIVER as error:
+            raise DeviceError(
+                f"{self.name}: cannot be opened, is its driver installed and the channel's name right? {error}"
+            ) from error
+
+    def _close(self) -> None:
+        bus, self._bus = self._bus, None
+        with suppress(self._can.CanError, OSError):  # gone already
+            bus.shutdown()
+
+
+def _python_can() -> ModuleType:
+    # What it has to say comes as an error; its log would say it again on stderr.
+    logging.getLogger("can").addHandler(logging.NullHandler())
+    try:
+        import can
+    except ImportError as error:
+        raise DeviceError("can: sources need python-can: pip install 'tactile-edge-sr[can]'") from error
+    return can
+
+
+def _check_network(name: str) -> None:
+    """Say what to do about a network that is not there or down, which socketcan opens as if nothing were."""
+    networks = {network.name: network for network in can_networks()}
+    if name not in networks:
+        raise DeviceError(
+            f"no CAN network {name}: plug the adapter in, and load its driver. CAN networks seen: "
+            f"{', '.join(networks) or 'none'}"
+        )
+    if problem := networks[name].problem:
+        raise DeviceError(f"CAN network {name} {problem}")
+
+
+def _reason(error: Exception) -> str:
+    code = getattr(error, "errno", None)
+    if code in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
+        return "this kernel has no CAN: sudo modprobe can_raw"
+    if code in (errno.EACCES, errno.EPERM):
+        return f"no permission: {error}"
+    return f"cannot be opened: {error}"

@@ -1,0 +1,208 @@
+"""A gs_usb adapter (candleLight and its kin) on USB, without the kernel's driver."""
+
+import array
+import errno
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Final, Self
+
+import usb.core
+import usb.util
+from usb.backend import IBackend
+
+from firmware_bridge import gs_usb
+from firmware_bridge.errors import DeviceError, LinkLostError
+from firmware_bridge.gs_usb_scans import GsUsbScans
+from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
+from firmware_bridge.scan import Scan
+from firmware_bridge.slcan import CanFrame
+from firmware_bridge.xela import USPA44_MAP, ModelMap
+
+INTERFACE: Final = 0
+CHANNEL: Final = 0
+ENDPOINT_IN: Final = 0x81
+ENDPOINT_OUT: Final = 0x02
+USUAL_PACKET_BYTES: Final = 64
+REQUEST_TIMEOUT_MS: Final = 1000
+QUIET_MS: Final = 20
+"""Frames of a stopped channel that are still in the adapter follow each other much faster."""
+MOST_OLD_TRANSFERS: Final = 1000
+"""Its queue has 64; one that goes on for longer does not obey."""
+
+_BUSY = "in use: end what holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
+
+
+class GsUsbLink(Link):
+    """Scans from a sensor behind a gs_usb adapter.
+
+    What an adapter still holds when its client goes, or starts anew without fetching it, can leave it mute until it is
+    unplugged (candleLight_fw issues 46 and 165). So the channel is stopped and what is left is fetched, both on
+    opening, since an earlier client may have died, and on closing; and the USB device is never reset.
+
+    Attributes:
+        serial_number: of the adapter; once it is known, only that adapter is opened again.
+    """
+
+    def __init__(
+        self,
+        serial_number: str | None = None,
+        *,
+        model: ModelMap = USPA44_MAP,
+        triggers: Sequence[CanFrame] = (),
+        backend: IBackend | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Prepare a link; nothing is opened yet.
+
+        Args:
+            serial_number: of the adapter, or None for the only one there is.
+            model: which CAN id is which taxel.
+            triggers: frames that wake older controllers, sent once after opening.
+            backend: of pyusb; by default libusb.
+            clock_ns: monotonic, in [ns].
+        """
+        self.name = "gs_usb" if serial_number is None else f"gs_usb:{serial_number}"
+        self.kind: SourceKind = "device"
+        self.ended = False
+        self.trouble: str | None = None
+        self.serial_number = serial_number
+        self._triggers = tuple(triggers)
+        self._backend = backend
+        self._clock_ns = clock_ns
+        self._scans = GsUsbScans(model)
+        self._received_bytes = 0
+        self._transfers = 0
+        self._device: usb.core.Device | None = None
+        self._driver_detached = False
+        self._packet = array.array("B", bytes(USUAL_PACKET_BYTES))
+
+    def __enter__(self) -> Self:
+        self._scans.begin_anew()
+        described, device = find_gs_usb(self.serial_number, self._backend)
+        try:
+            self._claim(device)
+            self._start(device)
+        except (usb.core.USBError, NotImplementedError, ValueError) as error:
+            self._release(device)
+            raise DeviceError(f"{self.name}: {_reason(error, described)}") from error
+        self.serial_number = described.serial_number
+        self._device = device
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        device, self._device = self._device, None
+        if device is None:
+            return
+        with suppress(usb.core.USBError):  # gone already: nobody left to tell
+            self._stop(device)
+        self._release(device)
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Scans that closed since the last call; waits at most `timeout_s` for the first.
+
+        An adapter sends each frame in a transfer of its own: as many are fetched as it takes until a scan closes.
+
+        Raises:
+            LinkLostError: the adapter is gone.
+        """
+        if self._device is None:
+            raise ValueError("the link is not open: use it in a with statement")
+        end_ns = self._clock_ns() + int(timeout_s * 1e9)
+        left_ns = end_ns - self._clock_ns()
+        while True:
+            data = self._fetch(self._device, max(1, math.ceil(left_ns / 1e6)))
+            now_ns = self._clock_ns()
+            scans = self._scans.feed(data, now_ns)
+            self.trouble = self._scans.trouble(now_ns)
+            left_ns = end_ns - now_ns
+            if scans or left_ns <= 0:
+                return scans
+
+    def counters(self) -> dict[str, int]:
+        """Received bytes, transfers, and the counters of decoder, bus and assembler."""
+        return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
+
+    def _fetch(self, device: usb.core.Device, timeout_ms: int) -> bytes:
+        # libusb waits for ever where the time-out is 0.
+        try:
+            count: int = device.read(ENDPOINT_IN, self._packet, timeout_ms)  # pyright: ignore[reportAssignmentType]
+        except usb.core.USBTimeoutError:
+            return b""
+        except usb.core.USBError as error:
+            if error.errno == errno.EINTR:
+                return b""
+            raise LinkLostError(f"{self.name}: link lost, the cable or the adapter is gone: {error}") from error
+        self._transfers += 1
+        self._received_bytes += count
+        return self._packet[:count].tobytes()
+
+    def _claim(self, device: usb.core.Device) -> None:
+        with suppress(NotImplementedError):  # a platform whose kernel has no such driver
+            if device.is_kernel_driver_active(INTERFACE):
+                device.detach_kernel_driver(INTERFACE)
+                self._driver_detached = True
+        try:
+            configuration = device.get_active_configuration()
+        except usb.core.USBError as error:
+            if error.errno is not None:
+                raise
+            device.set_configuration()  # pyusb found none set; to set one again would reset the adapter
+            configuration = device.get_active_configuration()
+        usb.util.claim_interface(device, INTERFACE)
+        # One packet a transfer: a longer one would wait for more wherever frames fill their packets.
+        interface = usb.util.find_descriptor(configuration, bInterfaceNumber=INTERFACE)
+        endpoint = usb.util.find_descriptor(interface, bEndpointAddress=ENDPOINT_IN)
+        packet_bytes = getattr(endpoint, "wMaxPacketSize", 0) & 0x7FF
+        self._packet = array.array("B", bytes(packet_bytes or USUAL_PACKET_BYTES))
+
+    def _start(self, device: usb.core.Device) -> None:
+        _request(device, gs_usb.HOST_FORMAT, gs_usb.host_format())
+        self._stop(device)
+        channels = gs_usb.channel_count(_ask(device, gs_usb.DEVICE_CONFIG, gs_usb.CONFIG_BYTES))
+        limits = gs_usb.BitTimingLimits.from_bytes(_ask(device, gs_usb.BIT_TIMING_LIMITS, gs_usb.LIMITS_BYTES))
+        _request(device, gs_usb.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
+        features = limits.features & gs_usb.HARDWARE_STAMPS
+        self._scans.start(stamped=features != 0, channels=channels)
+        _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
+        for number, frame in enumerate(self._triggers):
+            data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS, limits)
+            device.write(ENDPOINT_OUT, data, REQUEST_TIMEOUT_MS)
+
+    def _stop(self, device: usb.core.Device) -> None:
+        _request(device, gs_usb.MODE, gs_usb.mode(started=False))
+        with suppress(usb.core.USBTimeoutError):
+            for _ in range(MOST_OLD_TRANSFERS):
+                device.read(ENDPOINT_IN, self._packet, QUIET_MS)
+
+    def _release(self, device: usb.core.Device) -> None:
+        with suppress(usb.core.USBError):
+            usb.util.release_interface(device, INTERFACE)
+        if self._driver_detached:
+            with suppress(usb.core.USBError, NotImplementedError):
+                device.attach_kernel_driver(INTERFACE)
+        self._driver_detached = False
+        usb.util.dispose_resources(device)
+
+
+def _request(device: usb.core.Device, number: int, payload: bytes) -> None:
+    device.ctrl_transfer(gs_usb.REQUEST_OUT, number, CHANNEL, INTERFACE, payload, REQUEST_TIMEOUT_MS)
+
+
+def _ask(device: usb.core.Device, number: int, length: int) -> bytes:
+    return bytes(device.ctrl_transfer(gs_usb.REQUEST_IN, number, CHANNEL, INTERFACE, length, REQUEST_TIMEOUT_MS))
+
+
+def _reason(error: Exception, described: GsUsbDevice) -> str:
+    code = getattr(error, "errno", None)
+    if code in (errno.EACCES, errno.EPERM):
+        return f"no permission: {udev_rule(described.usb_id)}"
+    if code == errno.EBUSY:
+        return _BUSY
+    if code == errno.ETIMEDOUT:
+        return f"does not answer: unplug it and plug it in again ({described})"
+    if code is None:
+        return f"{error} ({described})"
+    return f"cannot be used as a gs_usb adapter: {error} ({described})"

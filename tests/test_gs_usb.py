@@ -1,0 +1,298 @@
+"""gs_usb's requests, bit timing and frames: the pure part."""
+
+import random
+import struct
+
+import pytest
+from bridge_samples import make_counts
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from firmware_bridge import gs_usb
+from firmware_bridge.bus_errors import LOST_RECENTLY_NS, BusErrors
+from firmware_bridge.controller import scan_frames
+from firmware_bridge.gs_usb import BitTimingLimits, GsUsbDecoder, HostFrame, bit_timing
+from firmware_bridge.gs_usb_adapter import CANDLELIGHT
+from firmware_bridge.gs_usb_scans import GsUsbScans
+from firmware_bridge.slcan import CanFrame
+
+SCAN = scan_frames(make_counts(1)[0], 4, random.Random(0))
+
+
+def host_frame(frame, *, echo_id=0xFFFFFFFF, channel=0, flags=0, more_id=0, stamp_us=None, fd=False, dlc=None):
+    data = frame.data.ljust(64 if fd else 8, b"\0")
+    dlc = len(frame.data) if dlc is None else dlc
+    stamp = b"" if stamp_us is None else struct.pack("<I", stamp_us)
+    return struct.pack("<IIBBBB", echo_id, frame.can_id | more_id, dlc, channel, flags | 2 * fd, 0) + data + stamp
+
+
+# Bit timing.
+
+
+def test_the_timing_of_a_candlelight():
+    timing = bit_timing(CANDLELIGHT)
+    assert (timing.quanta, timing.sample_point, timing.brp) == (16, 0.875, 3)
+    assert timing.to_bytes() == struct.pack("<5I", 6, 7, 2, 1, 3)
+
+
+LIMITS = st.builds(
+    BitTimingLimits,
+    features=st.just(0),
+    clock_hz=st.one_of(
+        st.sampled_from([8, 16, 24, 36, 40, 42, 48, 60, 80, 160, 170]).map((1_000_000).__mul__),
+        st.integers(0, 2**32 - 1),
+    ),
+    tseg1_min=st.integers(0, 4),
+    tseg1_max=st.sampled_from([0, 8, 16, 256, 2**32 - 1]),
+    tseg2_min=st.integers(0, 4),
+    tseg2_max=st.sampled_from([0, 8, 16, 128, 2**32 - 1]),
+    sjw_max=st.sampled_from([0, 1, 4, 128]),
+    brp_min=st.integers(0, 3),
+    brp_max=st.sampled_from([0, 1, 32, 1024, 2**32 - 1]),
+    brp_inc=st.integers(0, 2),
+)
+
+
+@given(LIMITS)
+def test_any_timing_is_one_the_controller_can_do(limits):
+    try:
+        timing = bit_timing(limits)
+    except ValueError as refused:
+        assert "use another adapter" in str(refused)
+        return
+    assert timing.quanta * timing.brp * 1_000_000 == limits.clock_hz
+    assert limits.tseg1_min <= timing.prop_seg + timing.phase_seg1 <= limits.tseg1_max
+    assert limits.tseg2_min <= timing.phase_seg2 <= limits.tseg2_max
+    assert 1 <= timing.sjw <= min(timing.phase_seg1, timing.phase_seg2, max(limits.sjw_max, 1))
+    assert limits.brp_min <= timing.brp <= limits.brp_max
+    assert 0.75 <= timing.sample_point <= 0.90 and min(timing) >= 1
+
+
+@pytest.mark.parametrize(("clock_mhz", "sample_point"), [(24, 21 / 24), (80, 70 / 80), (170, 149 / 170), (36, 16 / 18)])
+def test_other_clocks(clock_mhz, sample_point):
+    limits = CANDLELIGHT._replace(clock_hz=clock_mhz * 1_000_000)
+    if clock_mhz not in (36,):
+        limits = limits._replace(tseg1_max=256, tseg2_max=128)
+    timing = bit_timing(limits)
+    assert timing.sample_point == sample_point and timing.sjw == max(1, min(4, timing.phase_seg2 // 2))
+
+
+@pytest.mark.parametrize(
+    "changed", [{"clock_hz": 48_500_000}, {"tseg1_max": 3, "tseg2_min": 2}, {"brp_max": 1}, {"clock_hz": 0}]
+)
+def test_a_controller_that_cannot_do_it_is_refused(changed):
+    with pytest.raises(ValueError, match="cannot do 1 Mbit/s"):
+        bit_timing(CANDLELIGHT._replace(**changed))
+
+
+def test_answers_that_are_too_short():
+    with pytest.raises(ValueError, match="39 bytes, expected 40"):
+        BitTimingLimits.from_bytes(bytes(39))
+    with pytest.raises(ValueError, match="11 bytes, expected 12"):
+        gs_usb.channel_count(bytes(11))
+    assert BitTimingLimits.from_bytes(struct.pack("<10I", *CANDLELIGHT)) == CANDLELIGHT
+    assert gs_usb.channel_count(bytes((0, 0, 0, 1)) + bytes(8)) == 2
+
+
+def test_requests():
+    assert gs_usb.mode(started=True, features=16) == struct.pack("<II", 1, 16)
+    assert gs_usb.mode(started=False, features=16) == bytes(8)
+    assert gs_usb.host_format() == b"\xef\xbe\0\0"
+
+
+def test_a_frame_to_send():
+    frame = CanFrame(0x201, b"\x07\0")
+    sent = gs_usb.encode_frame(frame, 3, CANDLELIGHT)
+    assert sent == struct.pack("<IIBBBB8s", 3, 0x201, 2, 0, 0, 0, b"\x07")
+    quirky = CANDLELIGHT._replace(features=gs_usb.LPC546XX_QUIRK)
+    assert gs_usb.encode_frame(frame, 3, quirky) == sent + b"\0"
+    extended = gs_usb.encode_frame(CanFrame(0x1234567, b"", True, True), 0, CANDLELIGHT)
+    assert extended[4:8] == (0x1234567 | 0xC0000000).to_bytes(4, "little")
+
+
+# Frames from bytes.
+
+FRAMES = st.builds(
+    host_frame,
+    st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8)),
+    echo_id=st.sampled_from([0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0, 9]),
+    channel=st.sampled_from([0, 0, 1]),
+    flags=st.sampled_from([0, 1, 4, 8]),
+    more_id=st.sampled_from([0, 0, 0, gs_usb.EXTENDED, gs_usb.REMOTE, gs_usb.ERROR]),
+    stamp_us=st.integers(0, 2**32 - 1),
+    fd=st.sampled_from([False, False, True]),
+)
+
+
+@given(
+    st.lists(st.one_of(FRAMES, st.binary(max_size=50)), max_size=8).map(b"".join), st.integers(0, 2**32), st.booleans()
+)
+def test_any_cut_gives_the_same_and_nothing_raises(stream, seed, stamped):
+    whole = GsUsbDecoder(stamped=stamped, channels=2)
+    expected = whole.feed(stream)
+    pieces = GsUsbDecoder(stamped=stamped, channels=2)
+    cuts = random.Random(seed)
+    got, position = [], 0
+    while position < len(stream):
+        size = cuts.choice([1, 1, 7, 20, 24, 32, 64])
+        got += pieces.feed(stream[position : position + size])
+        position += size
+    assert (got, pieces.counters()) == (expected, whole.counters())
+    assert len(whole._pending) < 80
+
+
+@given(st.lists(FRAMES, max_size=8))
+def test_every_frame_is_accounted_for(frames):
+    decoder = GsUsbDecoder(stamped=True, channels=2)
+    decoder.feed(b"".join(frames))
+    assert sum(decoder.counters().values()) == len(frames) and decoder.counters()["skipped_bytes"] == 0
+
+
+@pytest.mark.parametrize("stamp_us", [None, 0xFFFFFFF0])
+def test_what_is_in_a_frame(stamp_us):
+    decoder = GsUsbDecoder(stamped=stamp_us is not None)
+    standard = CanFrame(0x334, bytes(range(8)))
+    extended = CanFrame(0x12345, b"\1", extended=True)
+    remote = CanFrame(0x7, b"", remote=True)
+    short = CanFrame(0x7FF, b"")
+    got = decoder.feed(
+        host_frame(standard, stamp_us=stamp_us, flags=1)
+        + host_frame(extended, more_id=gs_usb.EXTENDED, stamp_us=stamp_us)
+        + host_frame(remote, more_id=gs_usb.REMOTE, stamp_us=stamp_us, dlc=8)
+        + host_frame(short, stamp_us=stamp_us)
+        + host_frame(standard, stamp_us=stamp_us, dlc=15)
+    )
+    assert got == [
+        HostFrame(standard, None, stamp_us, True),
+        HostFrame(extended, None, stamp_us, False),
+        HostFrame(remote, None, stamp_us, False),
+        HostFrame(short, None, stamp_us, False),
+        HostFrame(standard, None, stamp_us, False),
+    ]
+
+
+def test_what_is_left_out_is_counted():
+    decoder = GsUsbDecoder(stamped=True, channels=2)
+    frame = SCAN[0]
+    stream = (
+        host_frame(frame, echo_id=3, stamp_us=1)
+        + host_frame(frame, channel=1, stamp_us=1)
+        + host_frame(frame, fd=True, stamp_us=1)
+        + host_frame(CanFrame(0x40, bytes(8)), more_id=gs_usb.ERROR, stamp_us=1)
+        + host_frame(frame, stamp_us=1)
+    )
+    error, received = decoder.feed(stream)
+    assert (error.error, received.frame) == (0x40, frame)
+    counts = {"frames": 1, "error_frames": 1, "echoes": 1, "other_channels": 1, "fd_frames": 1, "skipped_bytes": 0}
+    assert decoder.counters() == counts
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"echo_id": 10},
+        {"echo_id": 0xFFFFFFFE},
+        {"more_id": 0x800},
+        {"dlc": 16},
+        {"channel": 1},
+        {"flags": 0x10},
+    ],
+)
+def test_a_header_that_no_adapter_sends_is_skipped(wrong):
+    decoder = GsUsbDecoder(stamped=True)
+    stream = host_frame(SCAN[0], stamp_us=7, **wrong) + host_frame(SCAN[1], stamp_us=8)
+    assert [one.frame for one in decoder.feed(stream)] == [SCAN[1]]
+    assert decoder.counters()["skipped_bytes"] == 24
+
+
+@given(st.integers(1, 23))
+@example(12)
+def test_frames_are_found_again_behind_a_wreck(lost):
+    """The head of a frame is lost: no later one is, however the adapter fills its packets up."""
+    decoder = GsUsbDecoder(stamped=True)
+    stream = b"".join(host_frame(frame, stamp_us=0x01020304) + bytes(8) for frame in SCAN)
+    assert [one.frame for one in decoder.feed(stream[lost:])] == SCAN[1:]
+
+
+# Errors, as Linux's error.h has them.
+
+
+def test_errors_by_sort():
+    errors = BusErrors()
+    errors.error_frame(0x04 | 0x200, bytes((0, 0x04)) + bytes(6), 0)
+    assert errors.trouble(0) is None
+    errors.error_frame(0x04 | 0x200, bytes((0, 0x10)) + bytes(6), 0)
+    assert "error-passive" in (errors.trouble(0) or "")
+    for _ in range(3):
+        errors.error_frame(0x40, bytes(8), 0)
+    assert "bus-off" in (errors.trouble(0) or "")
+    errors.frame_heard()
+    assert errors.trouble(0) is None
+    errors.error_frame(0x88, bytes(8), 0)
+    errors.error_frame(0x04, bytes((0, 0x01)) + bytes(6), 0)
+    errors.unsorted_error()
+    errors.overflow(5)
+    assert errors.counters() == {
+        "bus_off": 1,
+        "error_passive": 1,
+        "error_warnings": 1,
+        "other_errors": 2,
+        "controller_overflows": 1,
+        "overflows": 1,
+    }
+
+
+@pytest.mark.parametrize(("classes", "data"), [(0x100, bytes(8)), (0x04, bytes((0, 0x40))), (0x204, bytes((0, 0x08)))])
+def test_passive_ends_with_what_the_controller_says(classes, data):
+    errors = BusErrors()
+    errors.error_frame(0x04, bytes((0, 0x20)), 0)
+    errors.frame_heard()
+    errors.error_frame(0x80, bytes(8), 0)
+    assert errors.trouble(0) is not None
+    errors.error_frame(classes, data, 0)
+    assert errors.trouble(0) is None
+
+
+def test_a_loss_is_told_for_a_while():
+    errors = BusErrors()
+    errors.overflow(1_000)
+    assert "lost frames" in (errors.trouble(1_000 + LOST_RECENTLY_NS - 1) or "")
+    assert errors.trouble(1_000 + LOST_RECENTLY_NS) is None
+
+
+def test_a_new_start_ends_a_state():
+    errors = BusErrors()
+    errors.error_frame(0x40, b"", 0)
+    errors.restarted()
+    assert errors.trouble(0) is None
+
+
+# To scans.
+
+
+def test_device_time_goes_on_over_its_wrap_after_71_minutes():
+    scans = GsUsbScans()
+    scans.start(stamped=True, channels=1)
+    host_ns, delay_ns = 5_000_000_000_000, 300_000
+    got = []
+    for cycle in range(40):  # 0x1000000 us are 16.8 s: number 17 is the first behind the wrap, and comes late
+        for index, frame in enumerate(SCAN):
+            at_us = cycle * 1_000_000 + index * 130
+            data = host_frame(frame, stamp_us=(0xFF000000 + at_us) & 0xFFFFFFFF)
+            got += scans.feed(data, host_ns + at_us * 1_000 + delay_ns * (cycle % 2))
+    assert [scan.time_ns - (scan.device_ns or 0) for scan in got] == [0, delay_ns] * 20
+
+
+def test_without_stamps_there_is_no_device_time():
+    scans = GsUsbScans()
+    scans.start(stamped=False, channels=1)
+    (scan,) = scans.feed(b"".join(map(host_frame, SCAN)), 1)
+    assert scan.device_ns is None and scan.whole
+
+
+def test_counters_go_on_over_a_new_start():
+    scans = GsUsbScans()
+    for starts in (1, 2):
+        scans.start(stamped=False, channels=1)
+        scans.feed(host_frame(SCAN[0]) + b"torn", 1)
+        assert scans.counters()["frames"] == starts
