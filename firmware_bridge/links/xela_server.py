@@ -1,0 +1,248 @@
+"""The vendor's server, over WebSocket."""
+
+import socket
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from threading import Event
+from typing import Final, NamedTuple, Self
+from urllib.parse import urlsplit
+
+from websockets.exceptions import (
+    ConnectionClosed,
+    InvalidHandshake,
+    InvalidMessage,
+    InvalidStatus,
+    WebSocketException,
+)
+from websockets.sync.client import ClientConnection, connect
+
+from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.scan import Scan
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.server_scans import ServerScans
+from firmware_bridge.xela_server import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
+
+DEFAULT_PORT: Final = 5000
+OPENING_S: Final = 3.0
+REOPENING_S: Final = 1.0
+"""Of a server that was met: one that hangs must not hold up for longer who reads other sources beside it."""
+FIRST_MESSAGE_S: Final = 0.5
+"""A server greets at once; one that has nothing to say is no error."""
+QUIET_S: Final = 0.75
+"""Without a message for so long the server is asked whether it is there."""
+ANSWER_S: Final = 1.0
+"""Who reads this link by itself is told of a pulled cable, or of a server that hangs, after 1.75 s without a message.
+LastingLink opens it anew before that, and what hangs is told by its handshake."""
+CLOSING_S: Final = 0.2
+MOST_WAITING: Final = 64
+"""Messages taken at once; what is beyond waits for the next read."""
+
+
+class ServerAddress(NamedTuple):
+    """Where a server is."""
+
+    host: str
+    port: int
+    url: str
+
+
+class XelaServerLink(Link):
+    """Scans from the vendor's xela_server, all sensors of the right geometry.
+
+    A server in its simulation mode says nothing of it: its scans count as a device's.
+
+    Attributes:
+        url: of the server.
+        version: of the server, as it says.
+        trouble: sensors that are left out or silent, and whether what the server says is old.
+    """
+
+    def __init__(
+        self, url: str, *, geometry: SensorGeometry = USPA44, clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        """Prepare a link; nothing is opened yet.
+
+        Args:
+            url: ws://HOST[:PORT].
+            geometry: of the sensors; others of the server are left out.
+            clock_ns: monotonic, in [ns].
+
+        Raises:
+            SourceError: no such URL.
+        """
+        self._address = server_address(url)
+        self.name = f"xela-server:{url}"
+        self.kind: SourceKind = "device"
+        self.ended = False
+        self.trouble: str | None = None
+        self.url = self._address.url
+        self._scans = ServerScans(geometry)
+        self._clock_ns = clock_ns
+        self._received_bytes = 0
+        self._open = ExitStack()
+        self._connection: ClientConnection | None = None
+        self._met = False
+        self._heard_ns = 0
+        self._pong: tuple[Event, int] | None = None
+        self._first: list[Scan] = []
+
+    @property
+    def version(self) -> str:
+        """Of the server, as it says; empty until it has."""
+        return self._scans.version
+
+    def __enter__(self) -> Self:
+        self._scans.begin()
+        self._pong = None
+        self._connection = self._connect()
+        self._heard_ns = self._clock_ns()
+        try:
+            self._first = self._take(FIRST_MESSAGE_S)
+        except BaseException:
+            self.__exit__()
+            raise
+        self._met = True
+        self.kind = "emulated" if self.version.endswith(PRETENDED_VERSION) else "device"
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._connection = None
+        self._open.close()
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Scans that closed since the last call; waits at most `timeout_s` for the first message.
+
+        Raises:
+            LinkLostError: the server is gone, or fell silent and does not answer.
+            DeviceError: none of its sensors is one that can be used.
+        """
+        if self._connection is None:
+            raise ValueError("the link is not open: use it in a with statement")
+        if self._first:
+            first, self._first = self._first, []
+            return first
+        return self._take(timeout_s)
+
+    def counters(self) -> dict[str, int]:
+        """Received bytes and the counters of decoder and scans."""
+        return {"received_bytes": self._received_bytes} | self._scans.counters()
+
+    def _take(self, timeout_s: float) -> list[Scan]:
+        scans: list[Scan] = []
+        connection = self._connection
+        if connection is None:
+            return scans
+        try:
+            try:
+                for _ in range(MOST_WAITING):
+                    message = connection.recv(timeout_s, decode=False)
+                    timeout_s = 0
+                    self._heard_ns, self._pong = self._clock_ns(), None
+                    self._received_bytes += len(message)
+                    scans += self._scans.feed(message, self._heard_ns)
+            except TimeoutError:
+                self._watch(connection)  # which finds now and then that the connection has just closed
+        except ConnectionClosed as error:
+            if scans:  # what came before the end counts; the next read tells of it
+                return scans
+            raise LinkLostError(f"{self.url}: link lost: {_ending(error)}") from error
+        self.trouble = self._scans.trouble
+        if self._scans.foreign and not self._scans.any_sensor:
+            raise DeviceError(f"{self.url}: no sensor that can be used: {self.trouble}")
+        return scans
+
+    def _watch(self, connection: ClientConnection) -> None:
+        """Ask a server that says nothing whether it is there: a connection can be dead without being closed."""
+        now_ns = self._clock_ns()
+        if self._pong is None:
+            if now_ns - self._heard_ns >= QUIET_S * NS_PER_S:
+                self._pong = connection.ping(), now_ns
+        elif self._pong[0].is_set():
+            self._heard_ns, self._pong = now_ns, None
+        elif now_ns - self._pong[1] >= ANSWER_S * NS_PER_S:
+            raise LinkLostError(
+                f"{self.url}: link lost: silent, and no answer within {ANSWER_S:g} s: the network or the server hangs"
+            )
+
+    def _connect(self) -> ClientConnection:
+        host, port, url = self._address
+        opening_s = REOPENING_S if self._met else OPENING_S
+        try:
+            plain = socket.create_connection((host, port), opening_s)
+        except (OSError, UnicodeError) as error:
+            raise DeviceError(f"{url}: {_unreachable(host, error, opening_s)}") from error
+        try:
+            # The server is on this machine or beside it: no proxy, and no compression that costs time on both sides.
+            # Pings of our own: websockets would give up a server that talks but does not answer them.
+            connection = connect(
+                url,
+                sock=plain,
+                proxy=None,
+                compression=None,
+                open_timeout=opening_s,
+                close_timeout=CLOSING_S,
+                ping_interval=None,
+                max_size=LONGEST_MESSAGE_BYTES,
+            )
+        except (OSError, WebSocketException, ValueError) as error:
+            raise DeviceError(f"{url}: {_no_handshake(error, opening_s)}") from error
+        return self._open.enter_context(connection)
+
+
+def server_address(url: str) -> ServerAddress:
+    """Host, port and URL of ws://HOST[:PORT]; port 5000 where none is named.
+
+    Raises:
+        SourceError: anything else.
+    """
+    expected = "expected ws://HOST or ws://HOST:PORT"
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, DEFAULT_PORT if parts.port is None else parts.port
+    except ValueError as error:
+        raise SourceError(f"address of the xela_server is {url!r}, {expected}: {error}") from error
+    if parts.scheme == "wss":
+        raise SourceError(f"address of the xela_server is {url!r}: it does not speak TLS, {expected}")
+    extra = parts.username is not None or parts.query or parts.fragment or parts.path not in ("", "/")
+    if parts.scheme != "ws" or not host or not port or extra or not url.isprintable() or " " in url:
+        raise SourceError(f"address of the xela_server is {url!r}, {expected}")
+    return ServerAddress(host, port, f"ws://{f'[{host}]' if ':' in host else host}:{port}")
+
+
+def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> str:
+    if isinstance(error, ConnectionRefusedError):
+        remedy = "start xela_server there, or name its port"
+        if host in ("localhost", "::1") or host.startswith("127."):
+            remedy += "; some versions (1.7.6) listen on the machine's own address alone: see hostname -I"
+        return f"connection refused: {remedy}"
+    if isinstance(error, (socket.gaierror, UnicodeError)):  # the latter of a name that has no place in the DNS
+        return "no such host: name it by its IP address, or see that it is in the DNS"
+    if isinstance(error, TimeoutError):
+        return f"no answer within {opening_s:g} s: is the machine on, on this network, and its firewall open?"
+    return f"cannot be reached: {error.strerror or error}"
+
+
+def _no_handshake(error: Exception, opening_s: float) -> str:
+    if isinstance(error, TimeoutError):
+        return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is no xela_server"
+    if isinstance(error, InvalidStatus):
+        return f"answers with HTTP status {error.response.status_code}: not the xela_server, but another program"
+    if isinstance(error, InvalidMessage):
+        return "does not answer as a WebSocket does: another program, or one that expects TLS, is at this port"
+    if isinstance(error, InvalidHandshake):
+        return f"is no xela_server: {error}"
+    return f"the connection broke while it was opened: {error}"
+
+
+def _ending(error: ConnectionClosed) -> str:
+    received = error.rcvd
+    if received is not None:
+        reason = f", {received.reason!r}" if received.reason else ""
+        return f"the server closed it (code {int(received.code)}{reason})"
+    sent = error.sent
+    if sent is not None:
+        return f"the server sent what no xela_server sends: {sent.reason or f'code {int(sent.code)}'}"
+    return "the server is gone"

@@ -1,0 +1,285 @@
+"""Readings of the vendor's server to scans. No I/O, no clock.
+
+The server sends what it has at its own pace, old readings again, and readings of a taxel with older ones of its
+neighbours: 507 messages a second were seen of a sensor that renewed seven taxels meanwhile. So its pace says nothing. A
+taxel has come anew if its counts are others than before, or if it is due by `ups`: then it was renewed, to the same
+counts. A scan closes when all have come that are renewed about as often as most; then it holds the newest of each.
+
+- A still pad gives scans as often as `ups` says, repeated ones if it has no noise. A loose cable gives none, as on the
+  wire, however long the server goes on telling of the last reading: a taxel is absent while its `ups` is 0, and all are
+  while the sensor's time stands still; a sensor of which nothing came for so long is in trouble. Where either is said
+  of all taxels and their counts go on changing, the server does not know, and the usual `ups` stands for what is 0.
+- Where a message brings most taxels, it is of one cycle, and the others in it are taken as repeated: noise does that
+  now and then, and waiting for them would cost a cycle.
+- Within a cycle nothing tells which readings belong together; those of slow servers are of two cycles, as on the wire.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.device_clock import DeviceClock
+from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.scan import ABSENT, Scan, ScanSeries, VendorReading
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.xela_server import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
+
+USUAL_UPS_HZ: Final = 83.0
+"""By the vendor's data sheet; for a server that does not tell."""
+DUE_PERIODS: Final = 1.5
+"""A taxel that comes taxel by taxel comes in less, where anything of it is new; and none is given up for one late."""
+DUE_IN_CYCLE_PERIODS: Final = 0.5
+SLOW_SHARE: Final = 0.5
+"""Of the median `ups`: a taxel renewed less often is not waited for."""
+SILENT_NS: Final = NS_PER_S
+"""A reading older than this when it is sent is one of a sensor that is heard no more, whatever `ups` still says."""
+STALE_NS: Final = 150_000_000
+"""A reading older than this when it arrives is counted; more than what a clock may be set back unseen."""
+MANY_STALE: Final = 50
+"""More stale scans than others by so many are told of, until the others have made up for it."""
+LONGEST_AGE_S: Final = 60.0
+"""Of a reading when it is sent; beyond, or below zero, the server's clock was set meanwhile."""
+FARTHEST_BACK: Final = 32
+"""So many rising numbers in a row below the highest are no late ones but a new count."""
+MOST_MISSED: Final = 100_000
+_TICK_NS: Final = 1000
+_COUNTED: Final[tuple[str, ...]] = (
+    "repeated_messages",
+    "reordered_messages",
+    "missed_messages",
+    "server_restarts",
+    "stale_scans",
+)
+_COUNTED_BY_SENSOR: Final[tuple[str, ...]] = ("scans", "torn_wire", "torn_source", "repeated", "missing_taxels")
+
+
+class ServerScans:
+    """Messages in, scans out, for all sensors of one server."""
+
+    def __init__(self, geometry: SensorGeometry = USPA44) -> None:
+        self.version = ""
+        self._geometry = geometry
+        self._decoder = ServerDecoder(geometry)
+        self._sensors: dict[str, _ServerSensor] = {}
+        self._more_stale = 0
+        self._lags = False
+        self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+        self.begin()
+
+    @property
+    def foreign(self) -> dict[str, str]:
+        """Sensors that cannot be used, by name: what the server says they are."""
+        return self._decoder.foreign
+
+    @property
+    def trouble(self) -> str | None:
+        """What a user must know of the server and its sensors; None while all is well."""
+        wanted = f"expected {self._geometry.taxel_count}"
+        told = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
+        silent = [name for name, sensor in self._sensors.items() if sensor.silent]
+        told += [f"nothing comes of sensor {name}: see to its cable and its power" for name in silent]
+        if self._lags:
+            late = f"what is read is older than {STALE_NS // 1_000_000} ms"
+            told.append(f"{late}: the server lags, the network does, or this program is too slow")
+        return "; ".join(told) or None
+
+    @property
+    def any_sensor(self) -> bool:
+        """A sensor that can be used has been heard."""
+        return bool(self._sensors)
+
+    def begin(self) -> None:
+        """Meet the server anew, as after a connection: its count, its clock and its readings are others."""
+        self._sequence: int | None = None
+        self._may_begin = True
+        self._late_ones: list[int] = []
+        self._clock = DeviceClock(_TICK_NS, None)
+        for sensor in self._sensors.values():
+            sensor.begin()
+
+    def feed(self, text: str | bytes, arrival_ns: int) -> list[Scan]:
+        """Scans that this message closes.
+
+        Args:
+            text: one message.
+            arrival_ns: monotonic time at which it was read, in [ns], never before that of the message before.
+        """
+        message = self._decoder.decode(text)
+        self.version = message.version or self.version
+        if message.kind == "welcome":
+            self._may_begin = True
+        if message.sequence is None or not self._in_order(message.sequence):
+            return []
+        sent_ns = None if message.sent_s is None else self._clock.host_ns(round(message.sent_s * 1e6), arrival_ns)
+        scans: list[Scan] = []
+        heard = {reading.sensor: reading for reading in message.readings}
+        new = [name for name in heard if name not in self._sensors][: MOST_SENSORS - len(self._sensors)]
+        for name in [*self._sensors, *new]:
+            sensor = self._sensors.get(name)
+            if sensor is None:
+                sensor = self._sensors[name] = _ServerSensor(name, self._geometry)
+            scan = None
+            if name in heard:
+                age_ns = _age_ns(heard[name], message)
+                device_ns = None if sent_ns is None or age_ns is None else sent_ns - age_ns
+                scan = sensor.feed(heard[name], arrival_ns, device_ns, old=(age_ns or 0) > SILENT_NS)
+            if scan is not None:
+                self._follow_age(scan)
+                scans.append(scan)
+            sensor.look(arrival_ns)
+        return scans
+
+    def counters(self) -> dict[str, int]:
+        """Those of the decoder and of what came of it.
+
+        repeated_messages and reordered_messages were dropped; missed_messages: numbers that never came;
+        server_restarts: the count began anew; stale_scans: a reading was older than STALE_NS when it arrived; and as of
+        every link scans, torn_wire, torn_source, repeated and missing_taxels.
+        """
+        totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
+        for sensor in list(self._sensors.values()):
+            for name, count in sensor.counted.items():
+                totals[name] += count
+        return self._decoder.counters() | self._counted | totals
+
+    def _follow_age(self, scan: Scan) -> None:
+        stale = scan.device_ns is not None and scan.time_ns - scan.device_ns > STALE_NS
+        self._counted["stale_scans"] += stale
+        self._more_stale = min(max(self._more_stale + (1 if stale else -1), 0), 2 * MANY_STALE)
+        self._lags = self._more_stale > (0 if self._lags else MANY_STALE)
+
+    def _in_order(self, sequence: int) -> bool:
+        """Whether the message is the next that counts; keeps where the count stands."""
+        last = self._sequence
+        if last is None:
+            self._take(sequence)
+            return True
+        if sequence == last:
+            self._counted["repeated_messages"] += 1
+            return False
+        if last < sequence <= last + MOST_MISSED:
+            self._counted["missed_messages"] += sequence - last - 1
+            self._take(sequence)
+            return True
+        if sequence < last and not self._may_begin:
+            if self._late_ones and sequence <= self._late_ones[-1]:
+                self._late_ones.clear()
+            self._late_ones.append(sequence)
+            if len(self._late_ones) < FARTHEST_BACK:
+                self._counted["reordered_messages"] += 1
+                return False
+        self._counted["server_restarts"] += 1
+        self.begin()
+        self._take(sequence)
+        return True
+
+    def _take(self, sequence: int) -> None:
+        self._sequence, self._may_begin = sequence, False
+        self._late_ones.clear()
+
+
+class _ServerSensor:
+    """What came of one sensor, and which of its taxels have come since its last scan."""
+
+    def __init__(self, name: str, geometry: SensorGeometry) -> None:
+        self.counted: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
+        self._geometry = geometry
+        self._series = ScanSeries(name, geometry)
+        self._usual_hz = np.full(geometry.taxel_count, USUAL_UPS_HZ)
+        self._heard_ns: int | None = None
+        self._acquired_s: float | None = None
+        self._acquired_ns = 0
+        self._said_dead = False
+        self._belied_ns: int | None = None
+        self.silent = False
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what came: of a server that begins anew everything is new, but for a reading that it still has."""
+        self._counts: NDArray[np.int32] | None = None
+        self._come = np.zeros(self._geometry.taxel_count, dtype=bool)
+        self._come_ns = np.zeros(self._geometry.taxel_count, dtype=np.int64)
+
+    def look(self, now_ns: int) -> None:
+        """Whether anything came of late."""
+        self._heard_ns = now_ns if self._heard_ns is None else self._heard_ns
+        self.silent = now_ns - self._heard_ns > SILENT_NS
+
+    def feed(self, reading: ServerReading, arrival_ns: int, device_ns: int | None, *, old: bool = False) -> Scan | None:
+        """The scan that a reading closes; `old` of one that was so already when it was sent."""
+        still = self._stands_still(reading, arrival_ns)
+        device_ns = None if still else device_ns
+        ups_hz = self._rates_hz(reading, arrival_ns, old=old or still)
+        changed = ups_hz > 0 if self._counts is None else (reading.counts != self._counts).any(axis=0)
+        changes = int(np.count_nonzero(changed))
+        self._counts = reading.counts
+
+        alive = ups_hz > 0
+        patience = DUE_IN_CYCLE_PERIODS if 2 * changes >= max(1, np.count_nonzero(alive)) else DUE_PERIODS
+        come = changed | (alive & ((arrival_ns - self._come_ns) * ups_hz >= patience * NS_PER_S))
+        self._come_ns[come] = arrival_ns
+        self._come |= come
+        if not self._come.any():
+            return None
+        self._heard_ns = arrival_ns
+        waited_for = alive
+        if alive.any():
+            median_hz = sorted(ups_hz[alive].tolist())[int(np.count_nonzero(alive)) // 2]
+            waited_for = ups_hz >= SLOW_SHARE * median_hz
+        if (waited_for & ~self._come).any():
+            return None
+        return self._close(np.where(self._come, reading.counts, ABSENT), arrival_ns, device_ns, self._vendor(reading))
+
+    def _rates_hz(self, reading: ServerReading, arrival_ns: int, *, old: bool) -> NDArray[np.float64]:
+        """How often a second each taxel is renewed; 0 of all that are said to be dead, unless their counts change.
+
+        A server that does not know says 0 as well.
+        """
+        told = reading.ups_hz is not None and any(reading.ups_hz)
+        said_dead = old or (reading.ups_hz is not None and not told)
+        # From one such message to the next: the first one may bring a last reading.
+        if said_dead and self._said_dead and self._counts is not None and (reading.counts != self._counts).any():
+            self._belied_ns = arrival_ns
+        self._said_dead = said_dead
+        if said_dead and (self._belied_ns is None or arrival_ns - self._belied_ns > SILENT_NS):
+            return np.zeros_like(self._usual_hz)
+        return np.array(reading.ups_hz) if told else self._usual_hz
+
+    def _stands_still(self, reading: ServerReading, arrival_ns: int) -> bool:
+        """The server tells of the same reading for so long, whatever its clock says of its age."""
+        if reading.acquired_s is None:
+            return False
+        if reading.acquired_s != self._acquired_s:
+            self._acquired_s, self._acquired_ns = reading.acquired_s, arrival_ns
+        return arrival_ns - self._acquired_ns > SILENT_NS
+
+    def _close(
+        self, counts: NDArray[np.int32], arrival_ns: int, device_ns: int | None, vendor: VendorReading | None
+    ) -> Scan:
+        scan = self._series.close(counts.reshape(self._geometry.scan_shape), arrival_ns, device_ns, vendor)
+        self._come[:] = False
+        missing = int(np.count_nonzero(~scan.fresh))
+        self.counted["scans"] += 1
+        self.counted["missing_taxels"] += missing
+        self.counted["torn_wire"] += missing > 0
+        self.counted["torn_source"] += missing == 0 and scan.torn
+        self.counted["repeated"] += scan.repeated
+        return scan
+
+    def _vendor(self, reading: ServerReading) -> VendorReading:
+        ups_hz = None
+        if reading.ups_hz is not None and any(reading.ups_hz):
+            ups_hz = np.array(reading.ups_hz, dtype=np.float32).reshape(self._geometry.rows, self._geometry.cols)
+        return VendorReading(reading.newtons, reading.temperature_k, ups_hz)
+
+
+def _age_ns(reading: ServerReading, message: ServerMessage) -> int | None:
+    """How old a reading was when it was sent, by the server's clock alone; None where that cannot be.
+
+    So only the sending needs to be mapped to the clock here, and an old reading is seen even where every one is old.
+    """
+    if message.sent_s is None or reading.acquired_s is None:
+        return None
+    age_s = message.sent_s - reading.acquired_s
+    return round(age_s * NS_PER_S) if 0 <= age_s <= LONGEST_AGE_S else None

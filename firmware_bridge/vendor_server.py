@@ -1,0 +1,192 @@
+"""A pretended xela_server: what it says, and when it knows what. No I/O, no clock."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording import Recording, Track
+from firmware_bridge.scan import ABSENT
+from firmware_bridge.xela_server import PRETENDED_VERSION, WELCOME
+
+VERSIONS: Final = ("1.7.6", "1.7.7", "1.8.0")
+NEWTONS_PER_COUNT: Final = np.array([0.0007, 0.0007, 0.00085])[:, None, None]
+"""About what sensors in the field have; of x, y, z."""
+TEMPERATURE_K: Final = 302.5
+_ROUNDED: Final = 1e-6
+"""Of a cycle: a message that goes out with it knows of it, however its time was rounded."""
+SIM_RATE_HZ: Final = 100.0
+SIM_SCANS: Final = 200
+GARBAGE: Final[tuple[str | bytes, ...]] = (
+    "",
+    '{"message": 12, "time": 17',
+    '{"message": 1e3}',
+    '{"message": -1, "1": {"taxels": 16}}',
+    '{"message": 7, "message": 8}',
+    '{"message": 7, "1": {"taxels": 16, "data": "8197,829A"}}',
+    '{"message": NaN}',
+    "[" * 5000,
+    b"\xff\xfe not text",
+    '{"message": ' + "9" * 6000 + "}",
+    "null",
+    "x" * 50_000,
+)
+"""What no server should send, one after the other; none of it may hurt a client."""
+
+
+class _Player(NamedTuple):
+    """A sensor that plays a track: its readings without gaps, and which of them were there."""
+
+    counts: NDArray[np.int32]
+    present: NDArray[np.bool_]
+    rate_hz: float
+
+
+class VendorServer:
+    """What a server that reads some sensors knows of them at any time, and how its version says it.
+
+    Attributes:
+        silent: taxels of all sensors that are renewed no more, row-major from the top left.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        version: str = "1.8.0",
+        rate_hz: float | None = None,
+        spread: float = 0.0,
+        queue_s: float = 0.0,
+        loop: bool = False,
+        others: Sequence[tuple[str, int]] = (),
+    ) -> None:
+        """Prepare to play.
+
+        Args:
+            recordings: each track is one sensor.
+            version: one of VERSIONS.
+            rate_hz: cycles a second of each sensor; by default as recorded.
+            spread: over how much of a cycle its taxels come, 0..1; at 0 all at once.
+            queue_s: how old what it says is, in [s].
+            loop: begin again after the last cycle.
+            others: model and number of taxels of sensors that are no 4x4 ones, as the last of all.
+
+        Raises:
+            ValueError: an option is out of range.
+            RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
+        """
+        if version not in VERSIONS:
+            raise ValueError(f"version is {version!r}, expected one of {', '.join(VERSIONS)}")
+        if not (0 <= spread <= 1 and 0 <= queue_s < math.inf):
+            raise ValueError(f"spread is {spread} and queue {queue_s} s, expected 0..1 and 0 or more")
+        self.silent: frozenset[int] = frozenset()
+        self._version = version
+        self._spread = spread
+        self._queue_s = queue_s
+        self._loop = loop
+        self._others = tuple(others)
+        self._players = [_player(recording, track, rate_hz) for recording in recordings for track in recording.tracks]
+        self._held: dict[int, NDArray[np.int32]] = {}
+
+    @property
+    def sensors(self) -> int:
+        """How many sensors it plays."""
+        return len(self._players)
+
+    def ended(self, elapsed_s: float) -> bool:
+        """Every cycle of every sensor was there to be told of."""
+        if self._loop:
+            return False
+        heard_s = elapsed_s - self._queue_s
+        return all(heard_s * one.rate_hz - self._spread >= len(one.counts) for one in self._players)
+
+    def cycle(self, sensor: int, elapsed_s: float) -> int:
+        """The newest cycle of a sensor, counted from 0, whose taxels all have come; -1 before the first."""
+        player = self._players[sensor]
+        last_taxel = (USPA44.taxel_count - 1) / USPA44.taxel_count
+        newest = math.floor((elapsed_s - self._queue_s) * player.rate_hz + _ROUNDED - self._spread * last_taxel)
+        return max(-1, newest) if self._loop else min(max(-1, newest), len(player.counts) - 1)
+
+    def welcome(self, unix_s: float) -> str:
+        """Its greeting."""
+        return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version + PRETENDED_VERSION})
+
+    def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
+        """What it says of all sensors at a time in [s] from its start, by its own clock `unix_s` [s]."""
+        told: dict[str, Any] = {
+            "message": sequence,
+            "time": unix_s,
+            "sensors": len(self._players) + len(self._others),
+            "type": "welcome" if self._version == "1.7.7" else "routine",
+            "version": self._version + PRETENDED_VERSION,
+        }
+        for index in range(len(self._players)):
+            told[str(index + 1)] = self._sensor(index, elapsed_s, unix_s)
+        for index, (model, taxels) in enumerate(self._others, len(self._players) + 1):
+            data = ",".join(["8000"] * 3 * taxels)
+            told[str(index)] = {"sensor": str(index), "data": data, "model": model, "taxels": taxels, "ups": [58.0]}
+        told["sendtime" if self._version == "1.8.0" else "complete"] = unix_s
+        return json.dumps(told)
+
+    def _sensor(self, index: int, elapsed_s: float, unix_s: float) -> dict[str, Any]:
+        player = self._players[index]
+        heard_s = max(0.0, elapsed_s - self._queue_s)
+        taxels = np.arange(USPA44.taxel_count)
+        begun = heard_s * player.rate_hz + _ROUNDED - self._spread * taxels / USPA44.taxel_count
+        cycles = np.maximum(0, np.floor(begun)).astype(int)
+        rows = cycles % len(player.counts) if self._loop else np.minimum(cycles, len(player.counts) - 1)
+        counts = player.counts[rows, :, taxels]
+        silent = np.isin(taxels, list(self.silent))
+        held = self._held[index] = np.where(silent[:, None], self._held.get(index, counts), counts)
+        ups_hz = np.where(player.present[rows, taxels] & ~silent, player.rate_hz, 0.0)
+        values = held.ravel().tolist()
+        by_hex = ",".join(f"{value:04X}" for value in values)
+        rest = player.counts[0].T
+        scale = NEWTONS_PER_COUNT.ravel()
+        told: dict[str, Any] = {
+            "time": unix_s - min(elapsed_s, self._queue_s) - (heard_s % (1 / player.rate_hz)),
+            "sensor": str(index + 1),
+            "data": values if self._version == "1.7.7" else by_hex,
+            "model": "uSPa44",
+            "taxels": USPA44.taxel_count,
+            "calibrated": np.round((held - rest) * scale, 6).ravel().tolist(),
+            "temp": [TEMPERATURE_K if self._version == "1.8.0" else 0.0] * USPA44.taxel_count,
+            "ups": np.round(ups_hz, 2).tolist(),
+        }
+        if self._version == "1.8.0":
+            told["integer"] = values
+        return told
+
+
+def sim_recording() -> Recording:
+    """What stands for a sensor where none is wired: waves over the pad."""
+    phase = 2 * np.pi * np.arange(SIM_SCANS)[:, None, None, None] / SIM_SCANS
+    place = np.arange(USPA44.taxel_count).reshape(1, 1, USPA44.rows, USPA44.cols)
+    rest = np.array([33_000, 33_000, 37_000])[None, :, None, None]
+    swing = np.array([100, 100, 800])[None, :, None, None]
+    counts = np.round(rest + swing * (1 + np.sin(phase + place))).astype(np.int32)
+    return Recording(Path("sim"), (Track("sim", counts, None),), SIM_RATE_HZ)
+
+
+def _player(recording: Recording, track: Track, rate_hz: float | None) -> _Player:
+    if track.counts.shape[1:] != USPA44.scan_shape:
+        raise RecordingError(f"{recording.path}: scans of shape {track.counts.shape[1:]}, expected {USPA44.scan_shape}")
+    known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
+    own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
+    if own_rate_hz is None:
+        raise RecordingError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
+    if not 0 < own_rate_hz < math.inf:
+        raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
+    counts = track.counts.reshape(len(track.counts), 3, -1).copy()
+    present = counts[:, 0] != ABSENT
+    # What does not come the server goes on sending as it was; what never came yet is 0.
+    counts[0][:, ~present[0]] = 0
+    for scan in range(1, len(counts)):
+        counts[scan][:, ~present[scan]] = counts[scan - 1][:, ~present[scan]]
+    return _Player(counts, present, own_rate_hz)

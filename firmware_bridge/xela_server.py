@@ -1,0 +1,267 @@
+"""Messages of the vendor's server to readings. No I/O, no clock.
+
+A message is a JSON object: `message`, a number that counts up, or "Welcome"; `time` of sending, in [s] of the server's
+clock; and under "1", "2", ... what the server last heard of each sensor, new or not: `data`, the counts x, y, z of one
+taxel after the other, row by row from the top left. Versions differ:
+
+    1.7.6   data "8197,829A,..."       hexadecimal
+    1.7.7   data [33175, 33434, ...]   and "welcome" as `type` of every message, so that `type` tells nothing
+    1.8.0   data hexadecimal, and the same as `integer`
+
+`ups`, how often a second a taxel is renewed, is the sign of life, and with it that `time` of a sensor moves on.
+`calibrated` (in newtons), `temp` (in kelvin) and `ups` are absent, null or zeros where the server does not know.
+
+Nothing of what comes is trusted: a message that cannot be used is counted by what is wrong with it, never raised.
+"""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.geometry import USPA44, SensorGeometry
+
+HIGHEST_COUNT: Final = 0xFFFF
+LONGEST_MESSAGE_BYTES: Final = 1 << 18
+"""Sixteen sensors say all they can in a third of it."""
+MOST_SENSORS: Final = 16
+HIGHEST_UPS_HZ: Final = 10_000.0
+HIGHEST_NEWTONS: Final = 1000.0
+KELVIN: Final = (200.0, 500.0)
+LATEST_S: Final = 1e11
+"""Of a time since 1970, in [s]: what is beyond is no time."""
+WELCOME: Final = "Welcome"
+PRETENDED_VERSION: Final = "_emulated"
+"""Ends the version of a server of ours, so that nobody takes it for the vendor's."""
+_HEX_WORDS: Final = re.compile("[0-9A-Fa-f]{1,4}(?:,[0-9A-Fa-f]{1,4})*,?").fullmatch
+_COUNTED: Final[tuple[str, ...]] = (
+    "messages",
+    "welcomes",
+    "without_readings",
+    "too_long",
+    "bad_json",
+    "duplicate_keys",
+    "bad_sequence",
+    "bad_sensor",
+    "foreign_sensor",
+    "disagreeing",
+    "bad_ups",
+    "bad_calibrated",
+    "bad_temperature",
+    "bad_time",
+)
+
+
+class ServerReading(NamedTuple):
+    """What the server last heard of one sensor.
+
+    Attributes:
+        sensor: the server's number for it, such as "1".
+        counts: (3, taxels) int32, axes x, y, z.
+        ups_hz: how often a second each taxel is renewed; None where not told.
+        newtons: (3, rows, cols) float32, by the vendor's calibration; None where not told.
+        temperature_k: (rows, cols) float32, in [K], NaN where not told; None where of no taxel.
+        acquired_s: when it was read from the sensor, in [s] of the server's clock; None where not told.
+    """
+
+    sensor: str
+    counts: NDArray[np.int32]
+    ups_hz: tuple[float, ...] | None
+    newtons: NDArray[np.float32] | None
+    temperature_k: NDArray[np.float32] | None
+    acquired_s: float | None
+
+
+class ServerMessage(NamedTuple):
+    """One message. `sequence` is None only of a welcome and of what is bad; `sent_s` is of the server's clock."""
+
+    kind: Literal["welcome", "readings", "bad"]
+    sequence: int | None = None
+    sent_s: float | None = None
+    version: str = ""
+    readings: tuple[ServerReading, ...] = ()
+
+
+class ServerDecoder:
+    """Understands messages one by one, whatever the server's version.
+
+    Attributes:
+        foreign: sensors that are not of this geometry, by name: what the server says they are.
+    """
+
+    def __init__(self, geometry: SensorGeometry = USPA44) -> None:
+        self.foreign: dict[str, str] = {}
+        self._geometry = geometry
+        self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+
+    def decode(self, text: str | bytes) -> ServerMessage:
+        """What one message says.
+
+        Args:
+            text: the message, as text or in UTF-8.
+        """
+        self._counted["messages"] += 1
+        told = self._told(text)
+        if told is None:
+            return ServerMessage("bad")
+        version = told.get("version")
+        version = version[:40] if isinstance(version, str) else ""
+        if told.get("message") == WELCOME:
+            self._counted["welcomes"] += 1
+            return ServerMessage("welcome", version=version)
+        sequence = told.get("message")
+        if type(sequence) is not int or not 0 <= sequence < 1 << 63:
+            return self._bad("bad_sequence")
+        named = [name for name, value in told.items() if _is_name(name) and isinstance(value, dict)]
+        if not named:
+            self._counted["without_readings"] += 1
+        self._counted["bad_sensor"] += max(0, len(named) - MOST_SENSORS)
+        readings = [self._reading(name, told[name]) for name in named[:MOST_SENSORS]]
+        found = tuple(reading for reading in readings if reading is not None)
+        return ServerMessage("readings", sequence, self._time_s(told.get("time")), version, found)
+
+    def counters(self) -> dict[str, int]:
+        """Messages and what was wrong with them.
+
+        messages; welcomes; without_readings: that name no sensor; too_long; bad_json; duplicate_keys; bad_sequence: no
+        number that tells the order; of sensors: bad_sensor: not its counts; foreign_sensor: of another geometry;
+        disagreeing: `integer` is not `data`, which wins; bad_ups, bad_calibrated, bad_temperature, bad_time: left out.
+        """
+        return dict(self._counted)
+
+    def _told(self, text: str | bytes) -> dict[str, Any] | None:
+        if len(text) > LONGEST_MESSAGE_BYTES:
+            self._counted["too_long"] += 1
+            return None
+        try:
+            told = json.loads(text, object_pairs_hook=_without_duplicates)
+        except _DuplicateError:
+            self._counted["duplicate_keys"] += 1
+            return None
+        except (ValueError, RecursionError):  # no JSON, no UTF-8, a number too long for int(), or brackets in brackets
+            self._counted["bad_json"] += 1
+            return None
+        if not isinstance(told, dict):
+            self._counted["bad_json"] += 1
+            return None
+        return told
+
+    def _bad(self, kind: str) -> ServerMessage:
+        self._counted[kind] += 1
+        return ServerMessage("bad")
+
+    def _reading(self, name: str, told: dict[str, Any]) -> ServerReading | None:
+        taxels = told.get("taxels")
+        if type(taxels) is int and 0 < taxels != self._geometry.taxel_count:
+            model = told.get("model")
+            self.foreign[name] = f"{_printable(model)} with {min(taxels, 9999)} taxels"
+            self._counted["foreign_sensor"] += 1
+            return None
+        known = type(taxels) is int and taxels == self._geometry.taxel_count
+        counts = self._counts(told.get("data"), told.get("integer")) if known else None
+        if counts is None:
+            self._counted["bad_sensor"] += 1
+            return None
+        self.foreign.pop(name, None)
+        return ServerReading(
+            name,
+            np.ascontiguousarray(np.array(counts, dtype=np.int32).reshape(-1, 3).T),
+            self._ups_hz(told.get("ups")),
+            self._newtons(told.get("calibrated")),
+            self._temperature_k(told.get("temp")),
+            self._time_s(told.get("time")),
+        )
+
+    def _counts(self, data: object, integer: object) -> list[int] | None:
+        """Of `data`, which every version has, and where that cannot be used of `integer`."""
+        size = 3 * self._geometry.taxel_count
+        of_data = _from_hex(data, size) if isinstance(data, str) else _whole_numbers(data, size)
+        if integer is None and of_data is not None:
+            return of_data
+        of_integer = _whole_numbers(integer, size)
+        self._counted["disagreeing"] += of_data != of_integer
+        return of_integer if of_data is None else of_data
+
+    def _ups_hz(self, told: object) -> tuple[float, ...] | None:
+        ups_hz = _numbers(told, self._geometry.taxel_count)
+        if ups_hz is None or not 0 <= min(ups_hz) <= max(ups_hz) <= HIGHEST_UPS_HZ:
+            self._counted["bad_ups"] += told is not None
+            return None
+        return tuple(ups_hz)
+
+    def _newtons(self, told: object) -> NDArray[np.float32] | None:
+        newtons = _numbers(told, 3 * self._geometry.taxel_count)
+        if newtons is None or max(max(newtons), -min(newtons)) > HIGHEST_NEWTONS:
+            self._counted["bad_calibrated"] += told is not None
+            return None
+        by_axis = np.array(newtons, dtype=np.float32).reshape(-1, 3).T
+        return np.ascontiguousarray(by_axis).reshape(self._geometry.scan_shape)
+
+    def _temperature_k(self, told: object) -> NDArray[np.float32] | None:
+        kelvin = _numbers(told, self._geometry.taxel_count)
+        if kelvin is None:
+            self._counted["bad_temperature"] += told is not None
+            return None
+        measured = [one for one in kelvin if one]
+        if not measured:  # zeros: the sensor has no thermometer
+            return None
+        if not KELVIN[0] <= min(measured) <= max(measured) <= KELVIN[1]:
+            self._counted["bad_temperature"] += 1
+            return None
+        known = np.array([one or math.nan for one in kelvin], dtype=np.float32)
+        return known.reshape(self._geometry.rows, self._geometry.cols)
+
+    def _time_s(self, told: object) -> float | None:
+        if isinstance(told, bool) or not isinstance(told, (int, float)) or not 0 < told < LATEST_S:
+            self._counted["bad_time"] += told is not None
+            return None
+        return float(told)
+
+
+class _DuplicateError(ValueError):
+    """A key is there twice, and no one can say which of both is meant."""
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    told = dict(pairs)
+    if len(told) != len(pairs):
+        raise _DuplicateError
+    return told
+
+
+def _is_name(key: str) -> bool:
+    return 0 < len(key) <= 3 and key.isascii() and key.isdigit()
+
+
+def _printable(model: object) -> str:
+    return repr(model[:20]) if isinstance(model, str) else "a model without a name"
+
+
+def _from_hex(text: str, size: int) -> list[int] | None:
+    # Not int() alone: it takes signs, spaces, underscores and 0x as well.
+    if not _HEX_WORDS(text):
+        return None
+    words = text.removesuffix(",").split(",")
+    return [int(word, 16) for word in words] if len(words) == size else None
+
+
+def _whole_numbers(told: object, size: int) -> list[int] | None:
+    if not isinstance(told, list) or len(told) != size:
+        return None
+    if set(map(type, told)) != {int} or not 0 <= min(told) <= max(told) <= HIGHEST_COUNT:
+        return None
+    return told
+
+
+def _numbers(told: object, size: int) -> Sequence[float] | None:
+    """So many finite numbers; True is none, although Python counts it as one."""
+    if not isinstance(told, list) or len(told) != size or not set(map(type, told)) <= {int, float}:
+        return None
+    try:
+        return told if all(map(math.isfinite, told)) else None
+    except OverflowError:  # a whole number that no float can hold
+        return None

@@ -1,0 +1,33 @@
+"""Messages of a pretended server, made by hand."""
+
+import json
+
+import numpy as np
+from bridge_samples import REST_COUNTS
+
+UNIX_S = 1_768_365_606.25
+MS = 1_000_000
+
+
+def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, **changes) -> dict:
+    """What a server of 1.8.0 says of one sensor; a change to None leaves the key out."""
+    values = np.asarray(counts).reshape(3, 16).T.ravel().tolist()
+    entry = {
+        "time": time_s,
+        "sensor": "1",
+        "data": ",".join(f"{value:04X}" for value in values),
+        "model": "uSPa44",
+        "taxels": 16,
+        "calibrated": [0.125] * 48,
+        "integer": values,
+        "temp": [301.5] * 16,
+        "ups": [ups] * 16 if isinstance(ups, float) else ups,
+        "extradots": [["1.0", "1.42", "21.62"]],
+    }
+    return {key: value for key, value in (entry | changes).items() if value is not None}
+
+
+def message(sequence: object, *entries: dict, time_s: object = UNIX_S, **more) -> str:
+    """A message about sensors 1, 2, ..."""
+    sensors = {str(number): entry for number, entry in enumerate(entries, 1)}
+    return json.dumps({"message": sequence, "time": time_s, "version": "1.8.0b_208601", **sensors, **more})

@@ -1,0 +1,386 @@
+import numpy as np
+import pytest
+from bridge_samples import REST_COUNTS, make_recording
+from server_samples import MS, UNIX_S, message, sensor_entry
+
+from edge.taxels import HOLD_SCANS, TaxelWatch
+from firmware_bridge.scan import Scan
+from firmware_bridge.server_scans import FARTHEST_BACK, MOST_MISSED, ServerScans
+from firmware_bridge.vendor_server import VendorServer
+from firmware_bridge.xela_server import MOST_SENSORS
+
+
+class Server:
+    """Says what it is told to, at times that are told; arrivals are 2 ms after the sending."""
+
+    def __init__(self) -> None:
+        self.scans = ServerScans()
+        self.sequence = 0
+        self.clock_s = UNIX_S
+
+    def say(self, at_ms: float, counts=REST_COUNTS, *, age_ms: float = 0.0, number: int | None = None, **changes):
+        """The scans that one message about one sensor closes, sent at a time in [ms]."""
+        sent_s = self.clock_s + at_ms / 1e3
+        entry = sensor_entry(counts, **({"time_s": sent_s - age_ms / 1e3} | changes))
+        text = message(self.sequence if number is None else number, entry, time_s=sent_s)
+        self.sequence += 1
+        return self.scans.feed(text, round((at_ms + 2) * MS))
+
+    def counted(self, *names: str) -> tuple[int, ...]:
+        counters = self.scans.counters()
+        return tuple(counters[name] for name in names)
+
+
+def fresh_taxels(scan: Scan) -> list[int]:
+    return np.flatnonzero(scan.fresh).tolist()
+
+
+def cycle(number: int, taxels=range(16)) -> np.ndarray:
+    """Counts in which these taxels are of one cycle, the others at rest."""
+    counts = REST_COUNTS.reshape(3, 16).copy()
+    counts[:, list(taxels)] += number
+    return counts
+
+
+def test_a_scan_for_every_renewal_however_often_it_is_told():
+    """A message every 2 ms, a renewal every 10."""
+    server = Server()
+    scans = [scan for step in range(50) for scan in server.say(2 * step, cycle(1 + step // 5))]
+    assert len(scans) == 10 and all(scan.whole for scan in scans)
+    assert [scan.number for scan in scans] == list(range(10))
+    assert [scan.time_ns for scan in scans] == [(10 * n + 2) * MS for n in range(10)]
+    assert server.counted("scans", "torn_wire", "torn_source", "repeated") == (10, 0, 0, 0)
+
+
+def test_taxels_that_come_one_by_one_make_whole_scans():
+    """507 messages a second, four renewals of a taxel, one taxel at a time."""
+    server = Server()
+    scans = []
+    for step in range(507 * 3):
+        begun = [int(step / 507 * 4 - taxel / 16 + 1) for taxel in range(16)]
+        scans += server.say(1e3 * step / 507, REST_COUNTS.reshape(3, 16) + np.array(begun), ups=4.0)
+    assert 11 <= len(scans) <= 13
+    assert all(scan.complete and scan.renewed.sum() >= 15 for scan in scans)
+
+
+def test_a_still_pad_gives_repeated_scans_as_often_as_it_is_renewed():
+    server = Server()
+    scans = [scan for step in range(500) for scan in server.say(2 * step)]
+    assert scans[0].whole and all(scan.repeated for scan in scans[1:])
+    assert 60 <= len(scans) <= 67  # a second of 100 Hz, each due after a period and a half
+
+
+def test_within_a_cycle_a_taxel_with_the_same_counts_is_taken_as_repeated():
+    """Noise does it; waiting for it would cost the cycle."""
+    server = Server()
+    server.say(0)
+    (scan,) = server.say(10, cycle(1, range(15)))
+    assert scan.complete and np.flatnonzero(~scan.renewed).tolist() == [15]
+    assert server.counted("torn_source") == (1,)
+
+
+def test_half_a_cycle_waits_for_the_other_half():
+    server = Server()
+    server.say(0)
+    assert server.say(4, cycle(1, range(7))) == []
+    (scan,) = server.say(10, cycle(1))
+    assert scan.whole and (scan.counts.reshape(3, 16) == cycle(1)).all()
+
+
+def test_a_taxel_without_updates_is_absent_and_dies():
+    """Whatever the server goes on saying of it."""
+    server = Server()
+    watch = TaxelWatch((4, 4))
+    for step in range(2 * HOLD_SCANS):
+        ups = [100.0] * 15 + [0.0 if step else 100.0]
+        (scan,) = server.say(10 * step, cycle(step, range(15)), ups=ups)
+        watch.push(scan, None)
+        assert fresh_taxels(scan) == list(range(15 if step else 16))
+        assert watch.reasons == ({15: "silent"} if step > HOLD_SCANS else {})
+    assert server.counted("torn_wire", "missing_taxels") == (2 * HOLD_SCANS - 1, 2 * HOLD_SCANS - 1)
+
+
+def test_a_taxel_that_changes_is_new_whatever_ups_says():
+    server = Server()
+    ups = [100.0] * 15 + [0.0]
+    server.say(0, ups=ups)
+    (scan,) = server.say(10, cycle(1), ups=ups)
+    assert scan.whole
+
+
+@pytest.mark.parametrize("unknown", [{"ups": 0.0}, {"time_s": UNIX_S}, {"ups": 0.0, "time_s": UNIX_S}])
+def test_a_server_that_does_not_know_but_whose_counts_change_is_used(unknown):
+    """A third of the taxels in every message: none of the scans is torn for it."""
+    server = Server()
+    scans = []
+    for step in range(1200):
+        grown = (step + np.arange(16) % 3) // 3
+        scans += server.say(10 * step / 3, REST_COUNTS.reshape(3, 16) + grown, **unknown)
+    assert 395 <= len(scans) <= 401 and sum(scan.whole for scan in scans) >= 0.98 * len(scans)
+    assert server.scans.trouble is None
+    if "ups" in unknown:
+        assert all(scan.vendor is not None and scan.vendor.ups_hz is None for scan in scans)
+    late = [scan for step in range(400, 800) for scan in server.say(10 * step, cycle(900), **unknown)]
+    assert [scan for scan in late if scan.time_ns > 5100 * MS] == [] and server.scans.trouble is not None
+
+
+def test_the_last_reading_of_a_dying_sensor_is_no_sign_of_life():
+    server = Server()
+    server.say(0)
+    assert len([scan for step in range(1, 300) for scan in server.say(10 * step, cycle(1), ups=0.0)]) == 1
+
+
+@pytest.mark.parametrize(
+    "dead",
+    [
+        pytest.param({"ups": 0.0}, id="ups falls to 0"),
+        pytest.param({"time_s": UNIX_S}, id="its time stands still"),
+        pytest.param({"taxels": 15}, id="nothing usable is said of it"),
+    ],
+)
+def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
+    """However long the server goes on with the last reading."""
+    server = Server()
+    for step in range(20):
+        assert server.say(10 * step, cycle(step))
+    scans = [scan for step in range(20, 420) for scan in server.say(10 * step, cycle(19), **dead)]
+    assert server.scans.trouble is not None and "nothing comes of sensor 1: see to its cable" in server.scans.trouble
+    assert not any(scan.renewed.any() for scan in scans) and len(scans) <= 67  # a second long it may be a still pad
+    assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
+    server.scans.begin()  # opening it anew brings no scan either
+    assert server.say(5000, cycle(19), **dead) == [] and server.scans.trouble is not None
+    server.say(5010, cycle(20))
+    assert server.say(5020, cycle(21)) and server.scans.trouble is None
+
+
+@pytest.mark.parametrize("set_by_s", [0.0, -3600.0, 3600.0])
+def test_a_sensor_that_died_long_ago_stays_dead(set_by_s):
+    """Its last reading is then of an age that no clock vouches for, or of times to come."""
+    server = Server()
+    assert server.say(0, cycle(1))
+    server.clock_s += set_by_s
+    scans = [scan for step in range(1, 700) for scan in server.say(100 * step, cycle(1), time_s=UNIX_S)]
+    assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
+    assert server.scans.trouble is not None and "nothing comes of sensor 1" in server.scans.trouble
+    server.scans.begin()
+    assert server.say(80_000, cycle(1), time_s=UNIX_S) == []
+
+
+def test_a_still_pad_is_no_dead_cable():
+    server = Server()
+    for step in range(300):
+        scans = server.say(10 * step)
+        assert all(scan.repeated for scan in scans if step)
+    assert server.counted("scans") >= (150,) and server.scans.trouble is None
+
+
+def test_a_sensor_that_is_no_more_named_is_told_of():
+    server = Server()
+    server.say(0)
+    for step in range(1, 150):
+        assert server.scans.feed(message(step, time_s=UNIX_S + step / 100), 10 * step * MS) == []
+    assert server.scans.trouble is not None and "sensor 1" in server.scans.trouble
+
+
+def test_it_comes_back():
+    server = Server()
+    server.say(0)
+    for step in range(1, 50):
+        server.say(10 * step, ups=0.0)
+    (scan,) = server.say(500, cycle(3))
+    assert scan.whole
+
+
+def test_a_slow_taxel_does_not_hold_up_the_others():
+    server = Server()
+    scans = []
+    for step in range(100):
+        counts = cycle(step, range(15))
+        counts[:, 15] += step // 20
+        scans += server.say(10 * step, counts, ups=[100.0] * 15 + [5.0])
+    assert len(scans) == 100
+    assert sum(scan.complete for scan in scans) in (5, 6, 7, 8, 9, 10)
+
+
+def test_without_ups_the_usual_is_taken():
+    server = Server()
+    assert len([scan for step in range(100) for scan in server.say(10 * step, cycle(step), ups=None)]) == 100
+    assert 40 <= len([scan for step in range(100, 200) for scan in server.say(10 * step, cycle(99), ups=None)]) <= 60
+
+
+def test_what_the_vendor_says_besides():
+    (scan,) = Server().say(0)
+    assert scan.vendor is not None and scan.vendor.temperature_k is not None and scan.vendor.ups_hz is not None
+    assert scan.vendor.temperature_k.shape == scan.vendor.ups_hz.shape == (4, 4)
+    assert scan.vendor_force_n == (2.0, 2.0, 2.0)
+    (torn,) = Server().say(0, ups=[100.0] * 15 + [0.0])
+    assert torn.vendor_force_n is None  # of one taxel it is an old one
+
+
+# The count of messages.
+
+
+def test_repeated_reordered_and_missed_messages():
+    server = Server()
+    numbers = [5, 5, 6, 8, 7, 8, 11]
+    scans = [len(server.say(10 * step, cycle(step), number=number)) for step, number in enumerate(numbers)]
+    assert scans == [1, 0, 1, 1, 0, 0, 1]
+    assert server.counted("repeated_messages", "reordered_messages", "missed_messages") == (2, 1, 3)
+
+
+def test_a_restart_is_known_by_its_welcome():
+    server = Server()
+    server.say(0, number=5000)
+    server.scans.feed('{"message": "Welcome"}', 3 * MS)
+    (scan,) = server.say(10, number=0)
+    assert scan.number == 1 and server.counted("server_restarts", "reordered_messages") == (1, 0)
+
+
+def test_a_welcome_in_between_is_no_restart():
+    server = Server()
+    server.say(0, number=5000)
+    server.scans.feed('{"message": "Welcome"}', 3 * MS)
+    server.say(10, cycle(1), number=5001)
+    server.say(20, cycle(2), number=3)
+    assert server.counted("server_restarts", "reordered_messages", "missed_messages") == (0, 1, 0)
+
+
+def test_a_restart_without_a_welcome_is_believed_after_a_while():
+    server = Server()
+    server.say(0, number=5000)
+    scans = [len(server.say(10 * step, cycle(step), number=step)) for step in range(1, FARTHEST_BACK + 5)]
+    assert scans == [0] * (FARTHEST_BACK - 1) + [1] * 5
+    assert server.counted("server_restarts", "missed_messages") == (1, 0)
+
+
+def test_late_messages_in_no_order_are_no_restart():
+    server = Server()
+    server.say(0, number=5000)
+    for step in range(4 * FARTHEST_BACK):
+        assert server.say(10 * step, cycle(step), number=100 - step % 3) == []
+    assert server.counted("server_restarts") == (0,)
+
+
+def test_a_number_out_of_a_hat_does_not_stop_the_scans():
+    server = Server()
+    server.say(0, number=1)
+    assert server.say(10, cycle(1), number=1 << 62)
+    assert server.counted("missed_messages", "server_restarts") == (0, 1)
+    scans = [len(server.say(10 * step, cycle(step), number=step)) for step in range(2, FARTHEST_BACK + 4)]
+    assert scans[-1] == 1
+    assert MOST_MISSED < 1 << 62
+
+
+def test_a_new_connection_begins_anew_and_goes_on_numbering():
+    server = Server()
+    server.say(0, number=5000)
+    server.scans.begin()
+    (scan,) = server.say(10, number=0)
+    assert (scan.number, scan.complete) == (1, True)
+    assert server.counted("server_restarts", "reordered_messages") == (0, 0)
+
+
+def test_memory_is_bounded():
+    scans = ServerScans()
+    for number in range(3 * MOST_SENSORS):
+        scans.feed(message(number, **{str(number): sensor_entry()}), number * MS)
+    assert scans.counters()["scans"] <= MOST_SENSORS + 3 * MOST_SENSORS * MOST_SENSORS
+    assert len(scans._sensors) == MOST_SENSORS
+
+
+# Times.
+
+
+def test_when_it_was_acquired():
+    server = Server()
+    (first,) = server.say(0, age_ms=6)
+    assert first.device_ns is not None and first.time_ns - first.device_ns == pytest.approx(6 * MS, abs=2000)
+    (second,) = server.say(10, cycle(1), age_ms=40)
+    assert second.device_ns is not None and second.time_ns - second.device_ns == pytest.approx(40 * MS, abs=2000)
+    assert server.counted("stale_scans") == (0,)
+
+
+def test_what_the_server_kept_too_long_is_counted():
+    server = Server()
+    for step in range(10):
+        server.say(10 * step, cycle(step), age_ms=300)
+    assert server.counted("stale_scans") == (10,) and server.scans.trouble is None
+    for step in range(10, 60):
+        server.say(10 * step, cycle(step), age_ms=300)
+    assert server.scans.trouble is not None and "what is read is older than 150 ms" in server.scans.trouble
+    for step in range(60, 80):
+        server.say(10 * step, cycle(step))
+    assert server.scans.trouble is not None  # no flicker
+    for step in range(80, 160):
+        server.say(10 * step, cycle(step))
+    assert server.scans.trouble is None
+
+
+def test_what_lay_on_the_way_is_counted():
+    """Sent at the usual pace, read late, as behind a client that hung."""
+    server = Server()
+    for step in range(10):
+        server.say(10 * step, cycle(step))
+    sent = [
+        message(100 + n, sensor_entry(cycle(50 + n), time_s=UNIX_S + 0.2 + n / 100), time_s=UNIX_S + 0.2 + n / 100)
+        for n in range(20)
+    ]
+    for text in sent:
+        server.scans.feed(text, 700 * MS)
+    # Those that were sent more than 150 ms before; the first two of a queue read at once close one scan each.
+    assert server.counted("stale_scans") == (20,)
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 0.05, -0.05])
+def test_a_step_of_the_servers_clock_does_not_hurt(step_s):
+    server = Server()
+    for step in range(20):
+        server.say(10 * step, cycle(step))
+    server.clock_s += step_s
+    scans = [scan for step in range(20, 60) for scan in server.say(10 * step, cycle(step))]
+    assert len(scans) == 40 and server.counted("stale_scans") == (0,)
+    assert all(scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= 51 * MS for scan in scans)
+
+
+def test_another_connection_may_be_another_clock():
+    server = Server()
+    server.say(0)
+    server.scans.begin()
+    server.clock_s -= 0.05
+    (scan,) = server.say(10, cycle(1))
+    assert scan.device_ns == pytest.approx(scan.time_ns, abs=2000)
+
+
+@pytest.mark.parametrize("age_ms", [-5.0, 3_600_000.0])
+def test_an_age_that_cannot_be_is_none(age_ms):
+    (scan,) = Server().say(0, age_ms=age_ms)
+    assert scan.device_ns is None
+
+
+@pytest.mark.parametrize(
+    ("spread", "message_hz", "fewest"),
+    [(0.0, 100, 100), (0.9, 100, 99), (0.5, 507, 98), (0.3, 60, 60), (1.0, 333, 80)],
+)
+def test_whatever_the_pace_of_the_messages_scans_are_whole(spread, message_hz, fewest):
+    """A second of 100 Hz. A message with the end of one cycle and the start of another skips a scan."""
+    server = VendorServer([make_recording(100)], spread=spread)
+    scans, found = ServerScans(), []
+    for number in range(message_hz):
+        found += scans.feed(server.message(number, number / message_hz, UNIX_S), round(1e9 * number / message_hz))
+    assert fewest <= len(found) <= 100
+    assert all(scan.complete for scan in found) and sum(scan.whole for scan in found) >= 0.98 * len(found)
+
+
+def test_counters_are_asked_for_while_another_thread_finds_a_sensor():
+    server = Server()
+    server.say(0)
+
+    class CountedMeanwhile(dict[str, int]):
+        def items(self):
+            server.scans.feed(message(server.sequence, **{"7": sensor_entry()}), 10 * MS)
+            return super().items()
+
+    (sensor,) = server.scans._sensors.values()
+    sensor.counted = CountedMeanwhile(sensor.counted)
+    assert server.counted("scans") == (1,)
+    assert len(server.scans._sensors) == 2

@@ -1,0 +1,231 @@
+import json
+
+import numpy as np
+import pytest
+from bridge_samples import REST_COUNTS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from server_samples import UNIX_S, message, sensor_entry
+
+from firmware_bridge.vendor_server import GARBAGE
+from firmware_bridge.xela_server import LONGEST_MESSAGE_BYTES, MOST_SENSORS, ServerDecoder
+
+VALUES = np.asarray(REST_COUNTS).reshape(3, 16).T.ravel().tolist()
+
+
+def decoded(text):
+    """The message and the counters that are not zero, `messages` left out."""
+    decoder = ServerDecoder()
+    told = decoder.decode(text)
+    counters = decoder.counters()
+    assert counters.pop("messages") == 1
+    return told, {name: count for name, count in counters.items() if count}
+
+
+def only_reading(entry):
+    told, counters = decoded(message(5, entry))
+    (reading,) = told.readings
+    return reading, counters
+
+
+def test_a_message_of_1_8_0():
+    told, counters = decoded(message(19299, sensor_entry(), sensor_entry(REST_COUNTS + 1)))
+    assert (told.kind, told.sequence, told.sent_s, told.version) == ("readings", 19299, UNIX_S, "1.8.0b_208601")
+    assert counters == {}
+    first, second = told.readings
+    assert (first.sensor, second.sensor) == ("1", "2")
+    assert (first.counts.reshape(3, 4, 4) == REST_COUNTS).all() and first.counts.dtype == np.int32
+    assert (second.counts.reshape(3, 4, 4) == REST_COUNTS + 1).all()
+    assert first.ups_hz == (100.0,) * 16 and first.acquired_s == UNIX_S
+    assert first.newtons is not None and first.newtons.shape == (3, 4, 4)
+    assert first.temperature_k is not None and (first.temperature_k == np.float32(301.5)).all()
+
+
+def test_axes_and_places():
+    """x, y, z of one taxel side by side; taxels row by row from the top left."""
+    entry = sensor_entry(data=list(range(48)), integer=None, calibrated=[float(value) for value in range(48)])
+    reading, _ = only_reading(entry)
+    counts = reading.counts.reshape(3, 4, 4)
+    assert counts[:, 0, 0].tolist() == [0, 1, 2] and counts[:, 0, 1].tolist() == [3, 4, 5]
+    assert counts[:, 1, 0].tolist() == [12, 13, 14] and counts[:, 3, 3].tolist() == [45, 46, 47]
+    assert (reading.newtons == counts).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"integer": None},
+        {"data": VALUES, "integer": None},
+        {"data": None},
+        {"data": "8197,829A"},
+        {"data": ",".join(f"{value:x}" for value in VALUES) + ",", "integer": None},
+    ],
+)
+def test_every_form_of_the_counts(changes):
+    reading, counters = only_reading(sensor_entry(**changes))
+    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all()
+    assert set(counters) <= {"disagreeing"}
+
+
+def test_data_wins_where_the_two_disagree():
+    reading, counters = only_reading(sensor_entry(integer=[7] * 48))
+    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all() and counters == {"disagreeing": 1}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        None,
+        "",
+        "8000," * 47,
+        ",".join(["8000"] * 49),
+        ",".join(["8000"] * 47 + ["80 0"]),
+        ",".join(["8000"] * 47 + ["-800"]),
+        ",".join(["8000"] * 47 + ["8_00"]),
+        ",".join(["8000"] * 47 + ["0x80"]),
+        ",".join(["8000"] * 47 + ["18000"]),
+        ",".join(["8000"] * 47 + ["\uff18\uff10\uff10\uff10"]),
+        ",".join(["8000"] * 47 + [""]),
+        [0] * 47,
+        [0] * 49,
+        [0] * 47 + [65536],
+        [0] * 47 + [-1],
+        [0] * 47 + [True],
+        [0] * 47 + [1.0],
+        [0] * 47 + ["1"],
+        [0] * 47 + [None],
+        [[0] * 3] * 16,
+        {"0": 1},
+        12,
+    ],
+)
+def test_counts_that_are_none(data):
+    told, counters = decoded(message(5, sensor_entry(data=data, integer=None)))
+    assert told.readings == () and counters == {"bad_sensor": 1}
+
+
+@pytest.mark.parametrize("taxels", [None, "16", 16.0, True, -16])
+def test_a_number_of_taxels_that_is_none(taxels):
+    told, counters = decoded(message(5, sensor_entry(taxels=taxels)))
+    assert told.readings == () and counters == {"bad_sensor": 1}
+
+
+def test_other_sensors_are_named_and_left_out():
+    decoder = ServerDecoder()
+    text = message(5, sensor_entry(), sensor_entry(model="uSPa46", taxels=24), sensor_entry(model=None, taxels=1))
+    for _ in range(3):
+        assert [reading.sensor for reading in decoder.decode(text).readings] == ["1"]
+    assert decoder.foreign == {"2": "'uSPa46' with 24 taxels", "3": "a model without a name with 1 taxels"}
+    assert decoder.counters()["foreign_sensor"] == 6
+
+
+def test_a_name_from_the_wire_is_kept_short_and_printable():
+    decoder = ServerDecoder()
+    decoder.decode(message(5, sensor_entry(model="\x1b[2J" + "M" * 1000, taxels=10**30)))
+    assert len(decoder.foreign["1"]) < 60 and decoder.foreign["1"].isprintable()
+
+
+@pytest.mark.parametrize(
+    ("changes", "field", "counted"),
+    [
+        ({"ups": None}, "ups_hz", None),
+        ({"ups": [1.0] * 15}, "ups_hz", "bad_ups"),
+        ({"ups": [1.0] * 15 + [-1.0]}, "ups_hz", "bad_ups"),
+        ({"ups": [1.0] * 15 + [1e9]}, "ups_hz", "bad_ups"),
+        ({"ups": [1.0] * 15 + [float("nan")]}, "ups_hz", "bad_ups"),
+        ({"ups": "58"}, "ups_hz", "bad_ups"),
+        ({"calibrated": None}, "newtons", None),
+        ({"calibrated": [0.0] * 16}, "newtons", "bad_calibrated"),
+        ({"calibrated": [0.0] * 47 + [float("inf")]}, "newtons", "bad_calibrated"),
+        ({"calibrated": [0.0] * 47 + [10**400]}, "newtons", "bad_calibrated"),
+        ({"calibrated": [0.0] * 47 + [1001]}, "newtons", "bad_calibrated"),
+        ({"calibrated": [0.0] * 47 + [True]}, "newtons", "bad_calibrated"),
+        ({"temp": None}, "temperature_k", None),
+        ({"temp": [0.0] * 16}, "temperature_k", None),
+        ({"temp": [25.0] * 16}, "temperature_k", "bad_temperature"),
+        ({"temp": [300.0] * 17}, "temperature_k", "bad_temperature"),
+        ({"time": None}, "acquired_s", None),
+        ({"time": "now"}, "acquired_s", "bad_time"),
+        ({"time": True}, "acquired_s", "bad_time"),
+        ({"time": -1}, "acquired_s", "bad_time"),
+        ({"time": 1e300}, "acquired_s", "bad_time"),
+        ({"time": float("nan")}, "acquired_s", "bad_time"),
+    ],
+)
+def test_what_else_is_wrong_costs_itself_alone(changes, field, counted):
+    reading, counters = only_reading(sensor_entry(**changes))
+    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all()
+    assert getattr(reading, field) is None
+    assert counters == ({} if counted is None else {counted: 1})
+
+
+def test_a_null_is_as_good_as_nothing():
+    entry = sensor_entry() | {"calibrated": None, "temp": None, "ups": None, "integer": None}
+    reading, counters = only_reading(entry)
+    assert (reading.ups_hz, reading.newtons, reading.temperature_k, counters) == (None, None, None, {})
+
+
+def test_a_taxel_without_thermometer():
+    reading, _ = only_reading(sensor_entry(temp=[0.0] + [301.5] * 15))
+    assert reading.temperature_k is not None
+    assert np.isnan(reading.temperature_k[0, 0]) and np.isnan(reading.temperature_k).sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "counted"),
+    [
+        ('{"message": "Welcome", "version": "1.7.6"}', "welcome", "welcomes"),
+        ('{"message": 12}', "readings", "without_readings"),
+        ('{"message": 12, "sensors": 0, "type": "welcome"}', "readings", "without_readings"),
+        ('{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}', "readings", "without_readings"),
+        ('{"message": "welcome"}', "bad", "bad_sequence"),
+        ("{}", "bad", "bad_sequence"),
+        ('{"message": true}', "bad", "bad_sequence"),
+        ('{"message": 1.0}', "bad", "bad_sequence"),
+        ('{"message": -1}', "bad", "bad_sequence"),
+        ('{"message": 99999999999999999999}', "bad", "bad_sequence"),
+        ('{"message": 1, "message": 2}', "bad", "duplicate_keys"),
+        ('{"message": 1, "1": {"ups": 1, "ups": 2}}', "bad", "duplicate_keys"),
+        ('{"message": ' + "9" * 6000 + "}", "bad", "bad_json"),
+        ("[" * 100_000, "bad", "bad_json"),
+        ('{"1":' * 40_000, "bad", "bad_json"),
+        (b"\xff\xfe\x00", "bad", "bad_json"),
+        (b"", "bad", "bad_json"),
+        ("[1]", "bad", "bad_json"),
+        (" " * (LONGEST_MESSAGE_BYTES + 1), "bad", "too_long"),
+    ],
+)
+def test_other_messages(text, kind, counted):
+    told, counters = decoded(text)
+    assert (told.kind, told.readings, counters) == (kind, (), {counted: 1})
+
+
+def test_no_more_sensors_than_there_can_be():
+    told, counters = decoded(message(1, *[sensor_entry()] * (MOST_SENSORS + 3)))
+    assert len(told.readings) == MOST_SENSORS and counters == {"bad_sensor": 3}
+
+
+def test_garbage_is_counted_and_never_raised():
+    decoder = ServerDecoder()
+    for text in GARBAGE:
+        assert decoder.decode(text).readings == ()
+    assert decoder.counters()["messages"] == len(GARBAGE)
+
+
+SCRAPS = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_subnormal=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(sorted(sensor_entry())), SCRAPS, st.binary(max_size=20), st.integers(0, 2000))
+def test_whatever_stands_in_a_key_is_borne(key, scrap, noise, place):
+    decoder = ServerDecoder()
+    decoder.decode(json.dumps({"message": scrap, "time": scrap, "version": scrap, "1": scrap}))
+    text = message(5, sensor_entry(**{key: scrap})).encode()
+    for told in (decoder.decode(text), decoder.decode(text[:place] + noise + text[place:])):
+        for reading in told.readings:
+            assert reading.counts.shape == (3, 16) and 0 <= reading.counts.min() <= reading.counts.max() <= 65535
+            assert reading.ups_hz is None or len(reading.ups_hz) == 16
