@@ -1,20 +1,24 @@
 import os
-import select
+import threading
+import time
 import tty
-from types import SimpleNamespace
+from contextlib import suppress
 
 import pytest
 from bridge_samples import make_counts, write_recording
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
 from firmware_bridge.links import source
+from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
+from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.ports import Port, find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.source import FORMS, open_source
-from firmware_bridge.slcan import CLOSE, CanFrame, encode_frame
+from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.xela import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
@@ -26,12 +30,28 @@ BUILT_IN = Port("/dev/ttyS0", None, None, "n/a")
 
 
 def test_the_ports_of_this_machine(monkeypatch):
-    found = [
-        SimpleNamespace(device="/dev/ttyUSB1", vid=0x0403, pid=0x6015, serial_number="D30BL366", description="x"),
-        SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None, description="n/a"),
-    ]
-    monkeypatch.setattr(list_ports, "comports", lambda: found)
-    assert serial_ports() == [BUILT_IN, Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30BL366", "x")]
+    usb, none = ListPortInfo("/dev/ttyUSB1"), ListPortInfo("/dev/ttyS0")
+    usb.vid, usb.pid, usb.serial_number, usb.description = 0x0403, 0x6015, "D30BL366", "x"
+    usb.product, usb.manufacturer, usb.location = "USB-CAN Plus", "VScom", "1-2.1:1.0"
+    monkeypatch.setattr(list_ports, "comports", lambda: [usb, none])
+    expected = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30BL366", "x", "USB-CAN Plus", "VScom", "1.0")
+    assert serial_ports() == [BUILT_IN, expected]
+    usb.location = "1-2.1"
+    assert serial_ports()[1].interface is None
+
+
+def test_a_device_that_goes_while_ports_are_listed(monkeypatch):
+    """pyserial: int(None, 16)."""
+    looks = []
+
+    def comports():
+        looks.append(None)
+        if len(looks) < 3:
+            raise TypeError("int() can't convert non-string with explicit base")
+        return [ListPortInfo("/dev/ttyS0")]
+
+    monkeypatch.setattr(list_ports, "comports", comports)
+    assert serial_ports() == [BUILT_IN]
 
 
 def test_what_a_port_says():
@@ -41,12 +61,37 @@ def test_what_a_port_says():
 
 
 @pytest.mark.parametrize(
+    ("product", "manufacturer", "adapter"),
+    [
+        ("USB-CAN Plus", "VScom", True),
+        ("USB-CAN Plus", None, True),
+        (None, None, True),
+        ("CANUSB", "LAWICEL", True),
+        ("Serial to CAN", None, True),
+        ("BARCODE SCANNER", None, False),
+        ("3D SCANNER", "CANON", False),
+        ("FT231X USB UART", "FTDI", False),
+        ("Robotiq gripper", None, False),
+        (None, "Robotiq", False),
+    ],
+)
+def test_of_a_chip_that_many_devices_have_the_words_decide(product, manufacturer, adapter):
+    port = VSCOM._replace(product=product, manufacturer=manufacturer)
+    assert port.adapter == ("VScom USB-CAN Plus" if adapter else None)
+    # Others have ids of their own.
+    assert CANABLE._replace(product=product, manufacturer=manufacturer).adapter == "CANable, slcan firmware"
+    if not adapter:
+        with pytest.raises(NoDeviceError, match="no known adapter"):
+            find_adapter([port])
+
+
+@pytest.mark.parametrize(
     ("ports", "found"),
     [
         ([OTHER, VSCOM, BUILT_IN], VSCOM),
         ([CANABLE], CANABLE),
         ([CANABLE_2], CANABLE_2),
-        ([CANABLE, VSCOM], VSCOM),
+        ([CANABLE, VSCOM], None),
         ([CANABLE_2, CANABLE, CANABLE], None),
         ([VSCOM, SECOND_VSCOM], None),
         ([VSCOM, SECOND_VSCOM, CANABLE], None),
@@ -68,6 +113,8 @@ def test_the_messages_say_what_to_do():
         find_adapter([VSCOM, SECOND_VSCOM])
     with pytest.raises(NoDeviceError, match=r"--source slcan:/dev/ttyACM1"):
         find_adapter([CANABLE_2, CANABLE_2])
+    with pytest.raises(NoDeviceError, match=r"found, CANable, .* at /dev/ttyACM0, VScom USB-CAN Plus at /dev/ttyUSB0:"):
+        find_adapter([CANABLE, VSCOM])
     with pytest.raises(NoDeviceError, match=r"no known adapter.*--source slcan:PORT.*seen: none"):
         find_adapter([])
 
@@ -76,7 +123,7 @@ def test_by_serial_number():
     assert find_by_serial("D30XXXXX", [VSCOM, SECOND_VSCOM, BUILT_IN]) == SECOND_VSCOM
     with pytest.raises(NoDeviceError, match=r"no port with serial number D3, .*D30BL366"):
         find_by_serial("D3", [VSCOM])
-    with pytest.raises(NoDeviceError, match="2 port"):
+    with pytest.raises(NoDeviceError, match=r"2 port .* expected one: name one by its path"):
         find_by_serial("D30BL366", [VSCOM, VSCOM])
 
 
@@ -100,7 +147,7 @@ def two_vscom(monkeypatch):
 def test_slcan_sources(two_vscom, text, port, baudrate):
     link = open_source(text)
     assert isinstance(link, SlcanSerialLink)
-    assert (link.port, link._baudrate, link.name, link.kind) == (port, baudrate, text, "device")
+    assert (link.port, link.baudrate, link.name, link.kind) == (port, baudrate, text, "device")
 
 
 @pytest.mark.parametrize(
@@ -110,11 +157,6 @@ def test_slcan_sources(two_vscom, text, port, baudrate):
         "slcan",
         "slcan:",
         "slcan:@9600",
-        "slcan:/dev/ttyUSB0@",
-        "slcan:/dev/ttyUSB0@fast",
-        "slcan:/dev/ttyUSB0@0",
-        "slcan:/dev/ttyUSB0@-1",
-        "slcan:/dev/ttyUSB0@²",
         "slcan:serial=",
         "slcan:serial=@9600",
         "replay",
@@ -123,13 +165,39 @@ def test_slcan_sources(two_vscom, text, port, baudrate):
         "demo",
         "Demo",
         "/dev/ttyUSB0",
-        "gs_usb:0",
+        "gs_usb:",
+        "gs_usb0",
+        "can",
+        "can:",
+        "can:socketcan",
+        "can:socketcan:",
+        "can0",
     ],
 )
 def test_other_sources_are_refused(two_vscom, text):
     with pytest.raises(SourceError) as refused:
         open_source(text)
     assert repr(text) in str(refused.value) and all(form in str(refused.value) for form in FORMS)
+
+
+@pytest.mark.parametrize("baud", ["", "fast", "0", "-1", "²", "0115200", "99999999999", "9" * 5000])
+def test_a_baud_that_is_none_is_refused(two_vscom, baud):
+    with pytest.raises(SourceError, match=rf"^baud is '{baud[:20]}', expected .*slcan:/dev/ttyUSB0@115200$") as refused:
+        open_source(f"slcan:/dev/ttyUSB0@{baud}")
+    assert len(str(refused.value)) < 120
+
+
+def test_gs_usb_sources():
+    for text, serial_number in (("gs_usb", None), ("gs_usb:0039", "0039")):
+        link = open_source(text, model=ID_MAPS["A"])
+        assert isinstance(link, GsUsbLink)
+        assert (link.serial_number, link.name, link.kind, len(link._triggers)) == (serial_number, text, "device", 7)
+
+
+def test_can_sources():
+    link = open_source("can:virtual:a:b", model=ID_MAPS["A"])
+    assert isinstance(link, CanBusLink)
+    assert (link._interface, link._channel, link.name, len(link._triggers)) == ("virtual", "a:b", "can:virtual:a:b", 7)
 
 
 def test_no_source_is_the_one_adapter(monkeypatch):
@@ -158,7 +226,7 @@ def test_replay_sources(tmp_path):
 
 
 def test_nothing_but_demo_is_the_demo(tmp_path):
-    for text in ("", "demo:", "gs_usb:0", "/dev/ttyUSB0"):
+    for text in ("", "demo:", "gs_usb:", "/dev/ttyUSB0"):
         with pytest.raises(SourceError):
             open_source(text, demo_recording=tmp_path)
 
@@ -172,19 +240,29 @@ def read_one_scan(model, ids):
     """What comes of one frame of each id, put on a line that `open_source` reads, and what it sent."""
     master, slave = os.openpty()
     tty.setraw(slave)
-    sent = b""
+    sent = bytearray()
+
+    def take():
+        """As an adapter does; with nobody there the link waits a second for each command to be taken."""
+        with suppress(OSError):  # the terminal is closed
+            while True:
+                sent.extend(os.read(master, 4096))
+
+    adapter = threading.Thread(target=take, daemon=True)
+    adapter.start()
     try:
         with open_source(f"slcan:{os.ttyname(slave)}", model=model) as link:
             for can_id in [*ids, ids[0]]:
                 os.write(master, encode_frame(CanFrame(can_id, bytes((1, 2, 3, 4, 5, can_id >> 8, can_id & 0xF0, 7)))))
-            scans = [scan for _ in range(20) for scan in link.read(0.05)]
-        # The kernel passes it on in pieces, in its own time: all is there with the closing command.
-        while not sent.endswith(b"\r" + CLOSE) and select.select([master], [], [], 5)[0]:
-            sent += os.read(master, 4096)
+            scans, end_s = [], time.monotonic() + 20
+            while not scans and time.monotonic() < end_s:
+                scans = link.read(0.05)
+            scans += link.read(0.05)
     finally:
-        os.close(master)
         os.close(slave)
-    return scans, sent
+        adapter.join()
+        os.close(master)
+    return scans, bytes(sent)
 
 
 def test_the_id_map_is_the_one_asked_for():
@@ -200,5 +278,7 @@ def test_older_controllers_are_woken_and_others_are_not():
     (scan,), sent = read_one_scan(ID_MAPS["A"], ids)
     assert scan.complete and scan.sensor == "1"
     assert all(b"t20%d20700\r" % board in sent for board in range(1, 8))
-    _, sent = read_one_scan(ID_MAPS["uSPa44"], [0x004])
+    ids = [sda << 8 | taxel << 4 | 4 for sda in range(4) for taxel in range(4)]
+    (scan,), sent = read_one_scan(ID_MAPS["uSPa44"], ids)
+    assert scan.complete and scan.sensor == "4"
     assert b"t2" not in sent

@@ -1,11 +1,18 @@
 """From what a user writes to a link."""
 
+import math
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link
+from firmware_bridge.links.lasting import LastingLink
 from firmware_bridge.links.ports import find_adapter, find_by_serial, serial_ports
+from firmware_bridge.links.several import NamedLink, SeveralLinks
+from firmware_bridge.mounting import Mounting, placed_map
 from firmware_bridge.xela import USPA44_MAP, ModelMap, trigger_frames
 
 if TYPE_CHECKING:
@@ -14,12 +21,60 @@ if TYPE_CHECKING:
 FORMS: Final = (
     "slcan:/dev/ttyUSB0[@baud]",
     "slcan:serial=D30BL366[@baud]",
+    "xela-server:ws://HOST[:5000]",
+    "gs_usb[:SERIAL]",
+    "can:INTERFACE:CHANNEL",
     "replay:FILE[,FILE]",
     "demo",
 )
 
 
+_NAME = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
+_BAUD = re.compile(r"[1-9][0-9]{0,7}")
+_FINITE: Final = ("demo", "replay:")
+"""Sources that come to an end, and do not come back from it."""
+
 # Each link is loaded only where it is asked for: start-up time and memory are for what runs.
+
+
+def open_sources(
+    texts: Sequence[str],
+    rate_hz: float | None = None,
+    demo_recording: str | Path | None = None,
+    model: ModelMap = USPA44_MAP,
+    give_up_s: float | None = math.inf,
+    *,
+    mountings: Mapping[str, Mounting] = MappingProxyType({}),
+) -> Link:
+    """The links that `texts` name as one, not yet entered; what is lost is opened again.
+
+    Args:
+        texts: each one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4". Of several sources, those without
+            a name are called by their place, from 1.
+        rate_hz: as in `open_source`.
+        demo_recording: as in `open_source`.
+        model: as in `open_source`.
+        give_up_s: how long a lost source may be away, in [s]; None leaves its loss to the caller.
+        mountings: how sensors sit, by name, that of their source included.
+
+    Raises:
+        SourceError: no such form, one name twice, or sources of several kinds.
+        NoDeviceError: as in `open_source`.
+        RecordingError: as in `open_source`.
+    """
+    named: dict[str, Link] = {}
+    for number, text in enumerate(texts or [None], 1):
+        match = None if text is None else _NAME.fullmatch(text)
+        name, form = (match[1], match[2]) if match else (str(number) if len(texts) > 1 else "", text)
+        own = {sensor.removeprefix(f"{name}/"): one for sensor, one in mountings.items() if _is_of(sensor, name)}
+        link = open_source(form, rate_hz, demo_recording, model, own)
+        if give_up_s is not None and not (form or "").startswith(_FINITE):
+            link = LastingLink(link, give_up_s)
+        if name in named:
+            raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")
+        named[name] = NamedLink(name, link) if name else link
+    links = list(named.values())
+    return links[0] if len(links) == 1 else SeveralLinks(links)
 
 
 def open_source(
@@ -27,6 +82,7 @@ def open_source(
     rate_hz: float | None = None,
     demo_recording: str | Path | None = None,
     model: ModelMap = USPA44_MAP,
+    mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> Link:
     """The link that `text` names, not yet entered; for None the one known adapter there is.
 
@@ -35,22 +91,37 @@ def open_source(
         rate_hz: scans a second at which recordings are played; a device has its own.
         demo_recording: what "demo" plays.
         model: which CAN id is which taxel, for a device.
+        mountings: how its sensors sit, by name. What edge-sr recorded is in place already.
 
     Raises:
         SourceError: no such form.
         NoDeviceError: no adapter, or several, and none was named.
         RecordingError: a recording that cannot be used.
     """
+    model = placed_map(model, mountings)
     if text is None:
         return _slcan_link(find_adapter(serial_ports()).path, None, model)
     scheme, _, rest = text.partition(":")
     if scheme == "slcan":
         return _slcan(text, rest, model)
+    if scheme == "xela-server" and rest:
+        return _placed(_xela_server(rest), mountings, tells_newtons=True)
+    if text == "gs_usb" or (scheme == "gs_usb" and rest):
+        from firmware_bridge.links.gs_usb_link import GsUsbLink
+
+        return GsUsbLink(rest or None, model=model, triggers=trigger_frames(model))
+    interface, _, channel = rest.partition(":")
+    if scheme == "can" and channel:
+        from firmware_bridge.links.can_bus import CanBusLink
+
+        return CanBusLink(interface, channel, model=model, triggers=trigger_frames(model))
     if scheme == "replay" and rest:
         from firmware_bridge.links.replay import ReplayLink
 
         # A file may have a comma in its name.
-        return ReplayLink([rest] if Path(rest).exists() else rest.split(","), rate_hz)
+        paths = [rest] if Path(rest).exists() else rest.split(",")
+        raw = {Path(path).stem for path in paths if path.lower().endswith(".csv")}
+        return _placed(ReplayLink(paths, rate_hz), {name: one for name, one in mountings.items() if name in raw})
     if text == "demo" and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
 
@@ -62,8 +133,10 @@ def _slcan(text: str, rest: str, model: ModelMap) -> Link:
     port, at, baud = rest.rpartition("@")
     if not at:
         port = rest
-    if port in ("", "serial=") or (at and not (baud.isascii() and baud.isdigit() and int(baud) > 0)):
+    if port in ("", "serial="):
         raise _refusal(text)
+    if at and not _BAUD.fullmatch(baud):
+        raise SourceError(f"baud is {baud[:20]!r}, expected 1 to 99999999 behind the @: --source slcan:{port}@115200")
     if port.startswith("serial="):
         port = find_by_serial(port.removeprefix("serial="), serial_ports()).path
     link = _slcan_link(port, int(baud) if at else None, model)
@@ -75,6 +148,32 @@ def _slcan_link(port: str, baud: int | None, model: ModelMap) -> "SlcanSerialLin
     from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
 
     return SlcanSerialLink(port, DEFAULT_BAUD if baud is None else baud, model=model, triggers=trigger_frames(model))
+
+
+def _xela_server(url: str) -> Link:
+    try:
+        from firmware_bridge.links.xela_server import XelaServerLink
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "websockets":
+            raise
+        raise SourceError(
+            "xela-server needs websockets, which is not installed: pip install 'tactile-edge-sr[xela-server]'"
+        ) from error
+    return XelaServerLink(url)
+
+
+def _is_of(sensor: str, source: str) -> bool:
+    return sensor.startswith(f"{source}/") if source else "/" not in sensor
+
+
+def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: bool = False) -> Link:
+    """Taxels in their places, for a link without CAN ids; forces along the pad's axes, where it tells of any."""
+    moved = {name: one for name, one in mountings.items() if one.moves_taxels or (tells_newtons and one.reverses_axes)}
+    if not moved:
+        return link
+    from firmware_bridge.links.placed import PlacedLink
+
+    return PlacedLink(link, moved)
 
 
 def _refusal(text: str) -> SourceError:

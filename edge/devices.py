@@ -1,0 +1,59 @@
+"""`edge-sr devices`: what is plugged in, what to type to read it, and what is in the way."""
+
+import json
+from collections.abc import Sequence
+from typing import TextIO
+
+from edge.wrapping import columns, wrapped
+from firmware_bridge.errors import DeviceError
+from firmware_bridge.links.devices import Found, devices
+
+NOTHING = (
+    "no adapter found: check both plugs of a VScom (the second is the sensor's power), what `dmesg` said when it was "
+    "plugged in, and that this user is in the group dialout"
+)
+SERVER_HINT = "The vendor's server, where one runs, is not looked for: --source xela-server:ws://HOST:5000"
+
+
+def run(*, as_json: bool, stdout: TextIO) -> int:
+    """Print what there is, opening nothing.
+
+    Args:
+        as_json: an object, for programs.
+        stdout: where it goes.
+
+    Returns:
+        The exit code, 0.
+
+    Raises:
+        DeviceError: nothing a sensor is usually behind; what else there is was printed.
+    """
+    found, notes = devices()
+    if as_json:
+        stdout.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
+    else:
+        stdout.write("".join(f"{line}\n" for line in page(found, notes, columns())))
+    if not any(one.adapter for one in found):
+        raise DeviceError(NOTHING)
+    return 0
+
+
+def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
+    """Lines for a reader, adapters first, then what could not be looked at.
+
+    Args:
+        found: what there is.
+        notes: what could not be looked at.
+        width: of a line, in columns; wider are only words that are, and what is to be typed.
+    """
+    lines: list[str] = []
+    for one in sorted(found, key=lambda one: not one.adapter):
+        serial = f"serial {one.serial_number}" if one.serial_number else None
+        lines += wrapped("  ".join(word for word in (one.path, one.usb_id, serial) if word), width, indent="  ")
+        lines += wrapped(f"{'looks like ' if one.adapter else ''}{one.looks_like}", width, "  ", "  ")
+        lines.append(f"  --source {one.source}")
+        for problem in one.problems:
+            lines += wrapped(problem, width, "  ! ", "    ")
+    for note in (*notes, SERVER_HINT):
+        lines += wrapped(note, width)
+    return lines

@@ -1,0 +1,189 @@
+"""What a sensor may be behind on this machine, and what stands in its way. Opens nothing, sends nothing."""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+from firmware_bridge.errors import DeviceError
+from firmware_bridge.gs_usb import BITRATE_BIT_S
+from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
+from firmware_bridge.links.ports import NO_PERMISSION, Port, serial_ports
+
+_IP_TIMEOUT_S: Final = 2.0
+SLOW_LATENCY_MS: Final = 16
+
+
+class Found(NamedTuple):
+    """One port, adapter or network interface.
+
+    Attributes:
+        kind: how it is read.
+        path: of a port; bus and address of a USB device; name of an interface.
+        usb_id: vendor and product, "0403:6015".
+        serial_number: of the USB device.
+        looks_like: what it is taken for.
+        adapter: whether that is something a sensor is usually behind.
+        source: what to write behind --source.
+        problems: what is wrong with it, and what to do, a line each.
+    """
+
+    kind: Literal["serial", "gs_usb", "socketcan"]
+    path: str
+    usb_id: str | None
+    serial_number: str | None
+    looks_like: str
+    adapter: bool
+    source: str
+    problems: tuple[str, ...]
+
+
+def devices() -> tuple[list[Found], list[str]]:
+    """Everything there is: serial ports, gs_usb adapters, CAN interfaces; and what could not be looked at, and why."""
+    notes: list[str] = []
+    gs_usb: list[Found] = []
+    try:
+        gs_usb = _gs_usb_adapters()
+    except DeviceError as error:
+        notes.append(str(error))
+    return [*serial_devices(serial_ports()), *gs_usb, *can_interfaces()], notes
+
+
+def serial_devices(
+    ports: Sequence[Port],
+    sys_root: Path = SYS_ROOT,
+    proc_root: Path = Path("/proc"),
+    may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
+) -> list[Found]:
+    """The serial ports, in their order.
+
+    Args:
+        ports: of `serial_ports`.
+        sys_root: where sysfs is.
+        proc_root: where procfs is.
+        may_open: whether this user may read and write a path.
+    """
+    serials = [port.serial_number for port in ports]
+    found: list[Found] = []
+    for port in ports:
+        if port.adapter is not None:
+            looks_like = port.adapter
+        else:
+            words = " by ".join(word for word in (port.product or port.description, port.manufacturer) if word)
+            looks_like = f"{words}: no known adapter"
+        alone = port.serial_number is not None and serials.count(port.serial_number) == 1
+        problems: list[str] = []
+        if not may_open(port.path):
+            problems.append(NO_PERMISSION)
+        if holders := _holders(port.path, proc_root):
+            problems.append(f"held by {', '.join(holders)}: end it first")
+        latency_ms = _latency_ms(port.path, sys_root)
+        if latency_ms >= SLOW_LATENCY_MS:
+            problems.append(
+                f"latency timer at {latency_ms} ms: edge-sr asks for 1 ms when it opens it; others read in bunches"
+            )
+        found.append(
+            Found(
+                "serial",
+                port.path,
+                None if port.usb_id is None else _usb_id(port.usb_id),
+                port.serial_number,
+                looks_like,
+                port.adapter is not None,
+                f"slcan:serial={port.serial_number}" if alone else f"slcan:{port.path}",
+                tuple(problems),
+            )
+        )
+    return found
+
+
+def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | None] | None = None) -> list[Found]:
+    """The CAN interfaces that the kernel has, by name.
+
+    Args:
+        sys_root: where sysfs is.
+        bitrate_hz: of an interface, in bit/s, None where it cannot be known; by default `ip` is asked.
+    """
+    bitrate_hz = bitrate_hz or _bitrate_hz
+    found: list[Found] = []
+    for network in can_networks(sys_root):
+        name, driver = network.name, network.driver
+        bitrate = bitrate_hz(name)
+        problems = [] if network.problem is None else [network.problem]
+        if bitrate not in (None, 0, BITRATE_BIT_S):
+            problems.append(f"runs at {bitrate} bit/s, the sensor at {BITRATE_BIT_S}")
+        looks_like = f"CAN interface, {f'driver {driver}' if driver else 'virtual or of slcand'}"
+        found.append(Found("socketcan", name, None, None, looks_like, True, f"can:socketcan:{name}", tuple(problems)))
+    return found
+
+
+def _gs_usb_adapters() -> list[Found]:
+    # Loads libusb, which nothing else here needs.
+    from firmware_bridge.links.gs_usb_devices import gs_usb_devices, udev_rule
+
+    return [
+        Found(
+            "gs_usb",
+            f"bus {one.bus} device {one.address}",
+            _usb_id(one.usb_id),
+            one.serial_number,
+            one.product or "gs_usb adapter",
+            True,
+            f"gs_usb:{one.serial_number}" if one.serial_number else "gs_usb",
+            () if one.serial_number or one.product else (f"no permission: {udev_rule(one.usb_id)}",),
+        )
+        for one in gs_usb_devices()
+    ]
+
+
+def _usb_id(usb_id: tuple[int, int]) -> str:
+    return f"{usb_id[0]:04x}:{usb_id[1]:04x}"
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return None
+
+
+def _latency_ms(path: str, sys_root: Path) -> int:
+    """How long a USB serial chip holds bytes back, in [ms]; 0 where it does not tell."""
+    text = _text(sys_root / "bus/usb-serial/devices" / Path(path).name / "latency_timer") or ""
+    return int(text) if text.isdecimal() else 0
+
+
+def _holders(path: str, proc_root: Path) -> list[str]:
+    """Who else has it open, as far as this user may see: of other users' processes only root may."""
+    real_path = Path(path).resolve()
+    holders: list[str] = []
+    for process in sorted(proc_root.glob("[0-9]*"), key=lambda process: int(process.name)):
+        if process.name != str(os.getpid()) and real_path in _opened(process):
+            holders.append(f"{_text(process / 'comm') or 'a process'} ({process.name})")
+    return holders
+
+
+def _opened(process: Path) -> set[Path]:
+    opened: set[Path] = set()
+    with suppress(OSError):  # the process has gone, or is another user's
+        for descriptor in (process / "fd").iterdir():
+            with suppress(OSError):  # closed meanwhile
+                opened.add(descriptor.readlink())
+    return opened
+
+
+def _bitrate_hz(name: str) -> int | None:
+    """As `ip` tells it: sysfs does not."""
+    ip = shutil.which("ip")
+    if ip is None:
+        return None
+    try:
+        command = [ip, "-json", "-details", "link", "show", name]
+        done = subprocess.run(command, capture_output=True, check=True, timeout=_IP_TIMEOUT_S)
+        return json.loads(done.stdout)[0]["linkinfo"]["info_data"]["bittiming"]["bitrate"]
+    except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError):
+        return None

@@ -1,0 +1,175 @@
+"""A link that comes back: what is lost or silent is opened again, for as long as it takes."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Final
+
+from firmware_bridge.errors import DeviceError, LinkLostError
+from firmware_bridge.links.base import Link, Notice, NoticeKind, SourceKind
+from firmware_bridge.scan import Scan
+
+FIRST_RETRY_S: Final = 0.1
+SOON_RETRY_S: Final = 0.5
+"""With what opening takes, a link that is back is used within a second."""
+LATE_RETRY_S: Final = 2.0
+SOON_S: Final = 60.0
+"""Of an outage; after that somebody went to fetch a cable, and a robot's processor has better to do."""
+SILENT_S: Final = 0.7
+"""Without a scan: an adapter that was reset keeps its port and says nothing until its channel is opened anew. The
+slowest sensor on record renews a taxel four times a second."""
+
+
+class LastingLink(Link):
+    """Reads a link and opens it again whenever it is lost, and now and then while it is silent."""
+
+    def __init__(
+        self,
+        link: Link,
+        give_up_s: float = math.inf,
+        *,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        """Wrap a link that is not open yet.
+
+        Args:
+            link: whose first opening must succeed.
+            give_up_s: an outage, or a silence, may last so long, in [s]; at 0 no outage, but any silence.
+            clock_ns: monotonic, in [ns].
+            sleep: sleeps for a time in [s].
+        """
+        self.name = link.name
+        self.kind: SourceKind = link.kind
+        self.ended = False
+        self.trouble: str | None = None
+        self._link = link
+        self._give_up_s = give_up_s
+        self._clock_ns = clock_ns
+        self._sleep = sleep
+        self._open = False
+        self._lost_ns: int | None = None
+        self._retry_ns = 0
+        self._delay_s = FIRST_RETRY_S
+        self._heard_ns = 0
+        self._silent_s = SILENT_S
+        self._silent = False
+        self._outages = 0
+        self._reopenings = 0
+        self._notices: list[Notice] = []
+
+    def __enter__(self) -> "LastingLink":
+        self._link.__enter__()
+        self.kind = self._link.kind
+        self._open = True
+        self._heard_ns = self._clock_ns()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        if self._open:
+            self._open = False
+            self._link.__exit__(*exc_info)
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Scans that closed since the last call; none while the link is away.
+
+        Raises:
+            LinkLostError: it was away for longer than may be.
+        """
+        if not self._open:
+            self._await_retry(timeout_s)
+            return []
+        try:
+            scans = self._link.read(timeout_s)
+        except LinkLostError as error:
+            self._close(f"{error}")
+            return []
+        self.ended = self._link.ended
+        self._follow_trouble()
+        if scans:
+            self._hear()
+        else:
+            self._suspect()
+        return scans
+
+    def notices(self) -> list[Notice]:
+        """What happened to the link since the last call."""
+        notices, self._notices = self._notices, []
+        return notices + self._link.notices()
+
+    def counters(self) -> dict[str, int]:
+        """The link's own; outages: how often it was lost or fell silent; reopenings: how often it was opened again."""
+        return {**self._link.counters(), "outages": self._outages, "reopenings": self._reopenings}
+
+    def _follow_trouble(self) -> None:
+        if self._link.trouble != self.trouble:
+            self.trouble = self._link.trouble
+            self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
+
+    def _hear(self) -> None:
+        now_ns = self._clock_ns()
+        if self._lost_ns is not None or self._silent:
+            away_s = (now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)) / 1e9
+            self._tell("back", f"{self.name} is back after {away_s:.1f} s")
+            self._lost_ns, self._silent = None, False
+            self._delay_s, self._silent_s = FIRST_RETRY_S, SILENT_S
+        self._heard_ns = now_ns
+
+    def _suspect(self) -> None:
+        """Open a silent link anew, ever more seldom."""
+        now_ns = self._clock_ns()
+        if self.ended or self._give_up_s == 0 or now_ns - self._heard_ns < self._silent_s * 1e9:
+            return
+        if not self._silent and self._lost_ns is None:
+            self._silent = True
+            self._outages += 1
+            self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it anew")
+        away_ns = now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)
+        if away_ns >= self._give_up_s * 1e9:
+            raise LinkLostError(
+                f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: see to the sensor's power and its cable"
+            )
+        self._silent_s += min(self._silent_s, LATE_RETRY_S)
+        self._reopen(now_ns)
+
+    def _reopen(self, now_ns: int) -> None:
+        if self._open:
+            self._open = False
+            self._link.__exit__(None, None, None)
+        try:
+            self._link.__enter__()
+        except DeviceError as error:
+            self._close(f"{error}", now_ns)
+        else:
+            self._reopenings += 1
+            self.kind = self._link.kind
+            self._open = True
+
+    def _close(self, why: str, now_ns: int | None = None) -> None:
+        now_ns = self._clock_ns() if now_ns is None else now_ns
+        if self._open:
+            self._open = False
+            self._link.__exit__(None, None, None)
+        if self._give_up_s == 0:
+            raise LinkLostError(why)
+        if self._lost_ns is None:
+            self._outages += not self._silent
+            self._lost_ns = now_ns if not self._silent else self._heard_ns
+            self._tell("lost", f"{why}; trying again until it is back")
+        elif now_ns - self._lost_ns >= self._give_up_s * 1e9:
+            raise LinkLostError(f"{self.name} was away for {self._give_up_s:g} s: {why}")
+        longest_s = SOON_RETRY_S if now_ns - self._lost_ns < SOON_S * 1e9 else LATE_RETRY_S
+        self._retry_ns = now_ns + int(min(self._delay_s, longest_s) * 1e9)
+        self._delay_s = min(2 * self._delay_s, LATE_RETRY_S)
+
+    def _await_retry(self, timeout_s: float) -> None:
+        wait_s = (self._retry_ns - self._clock_ns()) / 1e9
+        if wait_s > 0:
+            self._sleep(min(wait_s, timeout_s))
+        now_ns = self._clock_ns()
+        if now_ns >= self._retry_ns:
+            self._heard_ns, self._silent_s = now_ns, SILENT_S  # its silence begins with the opening
+            self._reopen(now_ns)
+
+    def _tell(self, kind: NoticeKind, text: str) -> None:
+        self._notices.append(Notice(self._clock_ns(), kind, self.name, text))

@@ -1,0 +1,224 @@
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from edge import cli
+from edge.devices import NOTHING, SERVER_HINT, page
+from firmware_bridge.errors import DeviceError
+from firmware_bridge.links import devices, gs_usb_devices
+from firmware_bridge.links.devices import Found, can_interfaces, serial_devices
+from firmware_bridge.links.gs_usb_devices import GsUsbDevice
+from firmware_bridge.links.ports import Port
+
+VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus", "USB-CAN Plus", "VScom")
+GRIPPER = Port("/dev/ttyUSB1", (0x0403, 0x6015), "GRIP1", "FT231X USB UART", "FT231X USB UART", "FTDI")
+BUILT_IN = Port("/dev/ttyS0", None, None, "n/a")
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def roots(tmp_path):
+    """An empty /sys and an empty /proc."""
+    (tmp_path / "sys").mkdir()
+    (tmp_path / "proc").mkdir()
+    return tmp_path / "sys", tmp_path / "proc"
+
+
+def test_serial_ports_and_what_to_write_for_them(roots):
+    vscom, gripper, built_in = serial_devices([VSCOM, GRIPPER, BUILT_IN], *roots, may_open=lambda path: True)
+    assert vscom == Found(
+        "serial",
+        "/dev/ttyUSB0",
+        "0403:6015",
+        "D30BL366",
+        "VScom USB-CAN Plus",
+        True,
+        "slcan:serial=D30BL366",
+        (),
+    )
+    assert (gripper.adapter, gripper.looks_like) == (False, "FT231X USB UART by FTDI: no known adapter")
+    assert (built_in.usb_id, built_in.source, built_in.looks_like) == (
+        None,
+        "slcan:/dev/ttyS0",
+        "n/a: no known adapter",
+    )
+
+
+def test_ports_that_share_a_serial_number_are_named_by_path(roots):
+    second = VSCOM._replace(path="/dev/ttyUSB1", interface="1.1")
+    found = serial_devices([VSCOM, second], *roots, may_open=lambda path: True)
+    assert [one.source for one in found] == ["slcan:/dev/ttyUSB0", "slcan:/dev/ttyUSB1"]
+
+
+def test_no_permission(roots):
+    (found,) = serial_devices([VSCOM], *roots, may_open=lambda path: False)
+    assert len(found.problems) == 1 and "no permission" in found.problems[0] and "dialout" in found.problems[0]
+
+
+def test_a_latency_timer_that_was_left_alone(roots):
+    for text, told in (("16\n", True), ("1\n", False), ("", False), ("x", False)):
+        write(roots[0] / "bus/usb-serial/devices/ttyUSB0/latency_timer", text)
+        (found,) = serial_devices([VSCOM], *roots, may_open=lambda path: True)
+        assert ("latency timer at 16 ms" in " ".join(found.problems)) == told
+
+
+def test_who_holds_a_port(roots):
+    """A real pseudo-terminal, open in this process, which /proc shows as two others and as itself."""
+    master, slave = os.openpty()
+    try:
+        port = BUILT_IN._replace(path=os.ttyname(slave))
+        for number, name in ((7, "slcand"), (12, None), (os.getpid(), "pytest")):
+            process = roots[1] / str(number)
+            (process / "fd").mkdir(parents=True)
+            (process / "fd/3").symlink_to(port.path)
+            (process / "fd/4").symlink_to("/dev/null")
+            if name:
+                write(process / "comm", name + "\n")
+        (roots[1] / "9").mkdir()  # of another user, or gone
+        write(roots[1] / "self", "")
+        (found,) = serial_devices([port], *roots)
+        assert found.problems == ("held by slcand (7), a process (12): end it first",)
+        (free,) = serial_devices([port._replace(path="/dev/null0")], *roots, may_open=lambda path: True)
+        assert free.problems == ()
+        # The real /proc says the same of another process that has it open.
+        with subprocess.Popen(["sleep", "60"], stdin=slave) as holder:
+            (found,) = serial_devices([port])
+            holder.kill()
+        assert f"sleep ({holder.pid})" in found.problems[0]
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def interface(sys_root: Path, name: str, *, kind: str = "280", up: bool, driver: str | None = None) -> None:
+    write(sys_root / f"class/net/{name}/type", kind + "\n")
+    write(sys_root / f"class/net/{name}/flags", f"{0x40080 | up:#x}\n")
+    if driver:
+        (sys_root / f"drivers/{driver}").mkdir(parents=True)
+        (sys_root / f"class/net/{name}/device").mkdir()
+        (sys_root / f"class/net/{name}/device/driver").symlink_to(sys_root / f"drivers/{driver}")
+
+
+def test_can_interfaces(roots):
+    sys_root, _ = roots
+    assert can_interfaces(sys_root) == []
+    interface(sys_root, "can0", up=False, driver="gs_usb")
+    interface(sys_root, "can1", up=True, driver="peak_usb")
+    interface(sys_root, "slcan0", up=False)
+    interface(sys_root, "eth0", up=True, kind="1")
+    rates = {"can0": 0, "can1": 500_000, "slcan0": None}
+    can0, can1, slcan0 = can_interfaces(sys_root, rates.__getitem__)
+    assert (can0.path, can0.source, can0.looks_like) == ("can0", "can:socketcan:can0", "CAN interface, driver gs_usb")
+    assert can0.problems == ("is down: sudo ip link set can0 up type can bitrate 1000000 restart-ms 100",)
+    assert can1.problems == ("runs at 500000 bit/s, the sensor at 1000000",)
+    assert slcan0.problems == ("is down: sudo ip link set slcan0 up",) and "slcand" in slcan0.looks_like
+    (right,) = [one for one in can_interfaces(sys_root, lambda name: 1_000_000) if one.path == "can1"]
+    assert right.problems == ()
+
+
+@pytest.mark.parametrize(
+    ("says", "bitrate"),
+    [
+        ('[{"linkinfo": {"info_kind": "can", "info_data": {"bittiming": {"bitrate": 500000}}}}]', 500_000),
+        ('[{"linkinfo": {"info_kind": "vcan"}}]', None),
+        ("[]", None),
+        ("Option is unknown", None),
+    ],
+)
+def test_the_bitrate_is_asked_of_ip(tmp_path, monkeypatch, says, bitrate):
+    program = write(tmp_path / "ip", f"#!/bin/sh\n[ \"$*\" = '-json -details link show can0' ] && echo '{says}'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert devices._bitrate_hz("can0") == bitrate
+    assert devices._bitrate_hz("can1") is None  # it fails
+    monkeypatch.setenv("PATH", "")
+    assert devices._bitrate_hz("can0") is None
+
+
+@pytest.fixture
+def plugged(monkeypatch):
+    """What is plugged in, to be filled."""
+    there: dict[str, list] = {"ports": [], "gs_usb": [], "can": []}
+    monkeypatch.setattr(devices, "serial_ports", lambda: there["ports"])
+    monkeypatch.setattr(devices, "can_interfaces", lambda: there["can"])
+    monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", lambda: there["gs_usb"])
+    monkeypatch.setenv("COLUMNS", "200")
+    return there
+
+
+def test_nothing_is_said_in_one_line(plugged, capsys):
+    plugged["ports"] = [BUILT_IN]
+    assert cli.main(["devices"]) == 3
+    out, err = capsys.readouterr()
+    assert err == f"edge-sr: {NOTHING}\n" and "both plugs" in NOTHING and "dmesg" in NOTHING and "dialout" in NOTHING
+    assert out.splitlines()[0] == "/dev/ttyS0" and out.splitlines()[-1] == SERVER_HINT
+
+
+def test_everything_is_listed_adapters_first(plugged, capsys):
+    plugged["ports"] = [BUILT_IN, VSCOM._replace(path="/dev/ttyUSB9")]
+    plugged["gs_usb"] = [
+        GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight"),
+        GsUsbDevice(1, 5, (0x1D50, 0x606F), None, None),
+    ]
+    assert cli.main(["devices"]) == 0
+    out, err = capsys.readouterr()
+    blocks = [line for line in out.splitlines() if not line.startswith(" ")]
+    assert blocks == [
+        "/dev/ttyUSB9  0403:6015  serial D30BL366",
+        "bus 1 device 4  1d50:606f  serial 004B",
+        "bus 1 device 5  1d50:606f",
+        "/dev/ttyS0",
+        SERVER_HINT,
+    ]
+    assert "  looks like VScom USB-CAN Plus\n  --source slcan:serial=D30BL366\n" in out
+    assert "  looks like candleLight\n  --source gs_usb:004B\n" in out
+    assert "  --source gs_usb\n  ! no permission: " in out and "udev" in out and err == ""
+
+
+def test_for_programs(plugged, capsys):
+    plugged["ports"] = [VSCOM]
+    assert cli.main(["devices", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["notes"] == [] and [one["source"] for one in told["devices"]] == ["slcan:serial=D30BL366"]
+    assert Found(**told["devices"][0])._replace(problems=()) == serial_devices([VSCOM])[0]._replace(problems=())
+    plugged["ports"] = []
+    assert cli.main(["devices", "--json"]) == 3
+    assert json.loads(capsys.readouterr().out) == {"devices": [], "notes": []}
+
+
+def test_usb_that_cannot_be_read_hides_no_port(plugged, capsys, monkeypatch):
+    def fail():
+        raise DeviceError("libusb cannot be loaded: pip install libusb-package")
+
+    monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", fail)
+    plugged["ports"] = [VSCOM]
+    assert cli.main(["devices"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "libusb cannot be loaded: pip install libusb-package",
+        SERVER_HINT,
+    ]
+
+
+def test_a_page_of_nothing():
+    assert page([], ["a note"], 200) == ["a note", SERVER_HINT]
+
+
+def test_the_page_fits_a_narrow_terminal(plugged, capsys, monkeypatch):
+    """All but what is to be typed, which is one line, and whole."""
+    by_path = "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0"
+    plugged["ports"] = [VSCOM._replace(path="/dev/ttyUSB9"), BUILT_IN._replace(path=by_path)]
+    plugged["gs_usb"] = [GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight")]
+    monkeypatch.setenv("COLUMNS", "40")
+    assert cli.main(["devices"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"  --source slcan:{by_path}" in lines and by_path in lines
+    assert [line for line in lines if len(line) > 40 and by_path not in line] == []
+    assert "  ! " in "".join(lines) and SERVER_HINT in " ".join(lines)

@@ -1,0 +1,282 @@
+"""Links that come back, and several as one, on a clock of their own."""
+
+import itertools
+import threading
+
+import pytest
+from edge_samples import FakeLink, make_scan
+
+from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.links.base import Link, Notice
+from firmware_bridge.links.lasting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
+from firmware_bridge.links.several import NamedLink, SeveralLinks
+
+S = 1_000_000_000
+
+
+class World:
+    """A clock, and a device that is there at some times, speaks at some, and gives a scan at every read."""
+
+    def __init__(self, *, away=(), mute=()):
+        self.now_ns = 0
+        self.away, self.mute = away, mute
+        self.opened_at_s: list[float] = []
+        self.tried_at_s: list[float] = []
+
+    def sleep(self, time_s):
+        self.now_ns += round(time_s * S)
+
+    def within(self, stretches):
+        return any(start <= self.now_ns / S < end for start, end in stretches)
+
+
+class WorldLink(Link):
+    def __init__(self, world):
+        self.name, self.kind, self.ended = "slcan:x", "device", False
+        self.world, self.is_open, self.woken, self.scans = world, False, True, 0
+
+    def __enter__(self):
+        assert not self.is_open, "opened twice"
+        self.world.tried_at_s.append(self.world.now_ns / S)
+        if self.world.within(self.world.away):
+            raise DeviceError("x: no such port")
+        self.is_open = True
+        self.world.opened_at_s.append(self.world.now_ns / S)
+        return self
+
+    def __exit__(self, *exc_info):
+        assert self.is_open, "closed twice"
+        self.is_open = False
+
+    def read(self, timeout_s):
+        assert self.is_open, "read while closed"
+        self.world.sleep(0.01)
+        if self.world.within(self.world.away):
+            raise LinkLostError("x: link lost")
+        if self.world.within(self.world.mute):
+            return []
+        self.scans += 1
+        return [make_scan(self.scans)]
+
+    def counters(self):
+        return {"scans": self.scans}
+
+
+def lasting(world, until_s, give_up_s=float("inf")):
+    """Read until a time; all notices, the link, and when scans came, in [s]."""
+    notices, heard_s = [], []
+    link = LastingLink(WorldLink(world), give_up_s, clock_ns=lambda: world.now_ns, sleep=world.sleep)
+    with link:
+        while world.now_ns < until_s * S:
+            scans = link.read(0.1)
+            notices += link.notices()
+            heard_s += [world.now_ns / S] * len(scans)
+    return notices, link, heard_s
+
+
+def kinds(notices):
+    return [notice.kind for notice in notices]
+
+
+def test_a_cable_that_is_put_back_is_used_within_a_second():
+    for back_s in (1.05, 1.3, 2.0, 3.7, 10.0, 30.0, 59.0):
+        world = World(away=[(1.0, back_s)])
+        notices, link, heard_s = lasting(world, back_s + 2)
+        assert kinds(notices) == ["lost", "back"]
+        assert notices[0].text == "x: link lost; trying again until it is back"
+        assert notices[1].text.startswith("slcan:x is back after ")
+        first_s = next(time_s for time_s in heard_s if time_s > back_s)
+        assert first_s - back_s <= SOON_RETRY_S + 0.02
+        assert link.counters()["outages"] == 1 and link.counters()["reopenings"] == 1
+
+
+def test_a_long_outage_is_asked_after_every_two_seconds():
+    world = World(away=[(1.0, 200.0)])
+    _, _, heard_s = lasting(world, 203.0)
+    late = [time_s for time_s in world.tried_at_s if time_s > 1.0 + SOON_S + LATE_RETRY_S]
+    steps = [after - before for before, after in itertools.pairwise(late)]
+    assert max(steps) == pytest.approx(LATE_RETRY_S, abs=0.01)
+    assert min(time_s for time_s in heard_s if time_s > 2) - 200.0 <= LATE_RETRY_S + 0.02
+
+
+def test_a_device_that_falls_silent_is_opened_anew_and_told_once():
+    """As an adapter that was reset: its port is there, its channel closed until it is opened."""
+    world = World(mute=[(1.0, 1.0 + SILENT_S + 0.015)])
+    notices, link, heard_s = lasting(world, 4.0)
+    assert kinds(notices) == ["silent", "back"]
+    assert len(world.opened_at_s) == 2 and min(time_s for time_s in heard_s if time_s > 1.1) < 2.0
+    assert link.counters()["outages"] == 1
+
+
+def test_a_device_that_stays_silent_is_opened_ever_more_seldom():
+    world = World(mute=[(1.0, 100.0)])
+    notices, _, _ = lasting(world, 60.0)
+    assert kinds(notices) == ["silent"]
+    assert 20 < len(world.opened_at_s) < 35
+
+
+def test_a_silence_that_turns_out_a_loss_is_one_outage():
+    world = World(mute=[(1.0, 1.0 + SILENT_S)], away=[(1.0 + SILENT_S, 5.0)])
+    notices, link, _ = lasting(world, 7.0)
+    assert kinds(notices) == ["silent", "lost", "back"]
+    assert link.counters()["outages"] == 1
+    assert notices[-1].text == "slcan:x is back after 4.4 s"
+
+
+def test_each_outage_is_met_with_the_same_haste():
+    world = World(away=[(1.0, 20.0), (30.0, 30.35)], mute=[(40.0, 60.0), (70.0, 70.0 + SILENT_S + 0.015)])
+    notices, _, heard_s = lasting(world, 75.0)
+    assert kinds(notices) == ["lost", "back", "lost", "back", "silent", "back", "silent", "back"]
+    for back_s in (30.35, 70.0 + SILENT_S + 0.015):
+        assert next(time_s for time_s in heard_s if time_s > back_s) - back_s < 0.4
+
+
+def test_the_silence_of_one_that_came_back_begins_with_its_opening():
+    """Who has to settle after it was plugged in is not opened over and over."""
+    world = World(away=[(1.0, 5.0)], mute=[(5.0, 5.0 + 0.9 * SILENT_S)])
+    lasting(world, 8.0)
+    assert len(world.opened_at_s) == 2
+
+
+def test_the_end_of_a_finite_source_is_no_silence():
+    world = World()
+    inner = FakeLink([[make_scan(0)]])
+    with LastingLink(inner, clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
+        link.read(0.1)
+        world.sleep(SILENT_S + 1)
+        assert link.read(0.1) == [] and link.ended
+        assert link.notices() == []
+
+
+def test_a_link_that_is_away_too_long_is_given_up():
+    world = World(away=[(1.0, 100.0)])
+    with pytest.raises(LinkLostError, match=r"slcan:x was away for 5 s: x: no such port"):
+        lasting(world, 60.0, give_up_s=5.0)
+    assert 6.0 <= world.now_ns / S < 6.6
+
+
+def test_a_link_that_is_there_and_stays_silent_is_given_up_too():
+    world = World(mute=[(1.0, 100.0)])
+    with pytest.raises(LinkLostError, match=r"slcan:x gave no scan for \d s: see to the sensor's power"):
+        lasting(world, 60.0, give_up_s=5.0)
+    assert 6.0 <= world.now_ns / S < 9.0
+
+
+def test_where_it_may_not_be_lost_it_is_told_as_the_link_tells_it_and_silence_is_left_alone():
+    with pytest.raises(LinkLostError, match=r"^x: link lost$"):
+        lasting(World(away=[(2.0, 9.0)], mute=[(0.5, 1.9)]), 60.0, give_up_s=0)
+    world = World(mute=[(0.5, 30.0)])
+    notices, _, _ = lasting(world, 31.0, give_up_s=0)
+    assert notices == [] and len(world.opened_at_s) == 1
+
+
+def test_after_a_long_silence_one_that_was_plugged_again_is_opened_anew_as_soon_as_ever():
+    world = World(away=[(600.0, 600.2)], mute=[(1.0, 600.0), (600.2, 601.6)])
+    lasting(world, 605.0)
+    assert len([time_s for time_s in world.opened_at_s if 600.2 < time_s < 602.5]) >= 2
+
+
+def test_the_first_opening_must_succeed():
+    with pytest.raises(DeviceError, match="no such port"):
+        lasting(World(away=[(0.0, 1.0)]), 1.0)
+
+
+def test_trouble_is_told_when_it_comes_and_when_it_goes():
+    world, notices = World(), []
+    inner = WorldLink(world)
+    with LastingLink(inner, clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
+        for trouble in (None, "bus-off", "bus-off", None):
+            inner.trouble = trouble
+            link.read(0.1)
+            assert link.trouble == trouble
+            notices += link.notices()
+    assert [(notice.kind, notice.text) for notice in notices] == [
+        ("trouble", "bus-off"),
+        ("well", "slcan:x reports no trouble"),
+    ]
+
+
+def test_trouble_of_one_of_several_is_trouble_of_all():
+    links = [FakeLink([[make_scan(0)]], endless=True) for _ in range(2)]
+    links[1].trouble = "bus-off"
+    with NamedLink("left", links[1]) as link:
+        link.read(0)
+        assert link.trouble == "bus-off"
+    with SeveralLinks(links) as several:
+        several.read(0.1)
+        assert several.trouble == "bus-off"
+
+
+def read_all(link):
+    """Every scan and notice in its order."""
+    heard = []
+    with link:
+        while not link.ended:
+            scans = link.read(0.05)
+            heard += [*link.notices(), *scans]
+    return heard
+
+
+def test_sensors_of_several_links_bear_their_names():
+    links = [NamedLink(name, FakeLink([[make_scan(n)] for n in range(50)])) for name in ("left", "right")]
+    heard = read_all(SeveralLinks(links))
+    for name in ("left", "right"):
+        assert [scan.number for scan in heard if scan.sensor == f"{name}/4"] == list(range(50))
+    assert SeveralLinks(links).counters() == {"scans": 100}
+
+
+def test_a_link_that_hangs_holds_up_no_other():
+    gate = threading.Event()
+    slow, fast = FakeLink([gate, [make_scan(0)]]), FakeLink([[make_scan(n)] for n in range(5)])
+    with SeveralLinks([NamedLink("slow", slow), NamedLink("fast", fast)]) as link:
+        heard = []
+        while len(heard) < 5:
+            heard += link.read(5)
+        assert {scan.sensor for scan in heard} == {"fast/4"}
+        gate.set()
+        while not link.ended:
+            heard += link.read(0.1)
+    assert [scan.sensor for scan in heard].count("slow/4") == 1
+
+
+class Telling(FakeLink):
+    def notices(self):
+        return [Notice(self.reads, "back", "fake", f"before read {self.reads}")]
+
+
+def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
+    heard = read_all(SeveralLinks([Telling([[make_scan(n)] for n in range(20)])]))
+    order = [heard.text if isinstance(heard, Notice) else heard.number for heard in heard]
+    assert order[:40] == [x for n in range(20) for x in (f"before read {n + 1}", n)]
+
+
+def test_what_is_told_is_about_the_sensors_of_its_link():
+    with NamedLink("left", Telling([[make_scan(0)]])) as link:
+        link.read(0)
+        assert [(notice.sensors, notice.text) for notice in link.notices()] == [("left/", "left: before read 1")]
+
+
+def test_one_that_gives_up_is_told_after_its_scans():
+    links = [FakeLink([[make_scan(0)]], error=LinkLostError("gone")), FakeLink([], endless=True)]
+    heard = []
+    with pytest.raises(LinkLostError, match="gone"), SeveralLinks(links) as link:
+        while True:
+            heard += link.read(0.05)
+    assert len(heard) == 1
+
+
+def test_the_kind_of_several_is_what_they_are_once_open():
+    class Late(FakeLink):
+        def __enter__(self):
+            self.kind = "emulated"
+            return self
+
+    with SeveralLinks([Late([]), NamedLink("b", Late([]))]) as link:
+        assert link.kind == "emulated"
+    with pytest.raises(SourceError, match="of several kinds"):
+        SeveralLinks([Late([]), FakeLink([])]).__enter__()
+
+
+def test_pretended_and_real_sources_are_not_mixed():
+    with pytest.raises(SourceError, match=r"\(fake is device, fake is emulated\), expected one"):
+        SeveralLinks([FakeLink([]), FakeLink([], kind="emulated")])

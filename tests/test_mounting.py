@@ -1,0 +1,140 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, make_scan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_bridge.baseline import deformation
+from firmware_bridge.links.placed import PlacedLink
+from firmware_bridge.links.source import open_source
+from firmware_bridge.mounting import AS_MAPPED, Mounting, placed_map
+from firmware_bridge.recording import CSV_HEADER
+from firmware_bridge.scan import ABSENT, VendorReading
+from firmware_bridge.xela import ID_MAPS, USPA44_MAP
+
+mountings = st.builds(
+    Mounting,
+    order=st.permutations(AS_MAPPED).map(tuple),
+    swap_xy=st.booleans(),
+    signs=st.tuples(*[st.sampled_from((1, -1))] * 3),
+    gains=st.lists(st.sampled_from((0.5, 1.0, 2.0)), min_size=48, max_size=48).map(tuple),
+)
+TURNED = Mounting(order=tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()))
+
+
+def seen(mounting, wire):
+    """Deformation as the pad has it of one as the wire has it, both (3, 4, 4)."""
+    placed = wire.reshape(3, 16)[:, list(mounting.order)].reshape(3, 4, 4)
+    return mounting.correct(placed)
+
+
+@settings(max_examples=50, deadline=None)
+@given(mountings, mountings, st.integers(0, 99))
+def test_one_mounting_after_another_is_one(known, found, seed):
+    wire = np.random.default_rng(seed).normal(0, 500, (3, 4, 4)).astype(np.float32)
+    assert np.allclose(seen(known.then(found), wire), seen(found, seen(known, wire)))
+
+
+@settings(max_examples=20, deadline=None)
+@given(mountings)
+def test_a_map_in_place_and_a_scan_put_in_place_agree(mounting):
+    scan = make_scan(3, absent=(5,), stale=(7,), noise=9)
+    moved = placed_map(USPA44_MAP, {"4": mounting})
+    put = mounting.place(scan)
+    for can_id, taxel in USPA44_MAP.wire_order("4"):
+        place = moved.taxels[can_id][1]
+        assert put.counts[:, place // 4, place % 4].tolist() == scan.counts[:, taxel // 4, taxel % 4].tolist()
+        assert put.fresh.flat[place] == scan.fresh.flat[taxel]
+        assert put.renewed.flat[place] == scan.renewed.flat[taxel]
+    others = {can_id: place for can_id, place in USPA44_MAP.taxels.items() if place[0] != "4"}
+    assert {can_id: moved.taxels[can_id] for can_id in others} == others
+    assert not put.counts.flags.writeable and put.time_ns == scan.time_ns
+
+
+@settings(max_examples=20, deadline=None)
+@given(mountings)
+def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
+    """Newtons as deformation does, but for gains, which are of counts."""
+    newtons = np.random.default_rng(1).normal(0, 1, (3, 4, 4)).astype(np.float32)
+    temperature_k, ups_hz = (np.arange(16, dtype=np.float32).reshape(4, 4) + base for base in (300, 80))
+    wire = replace(make_scan(absent=()), vendor=VendorReading(newtons, temperature_k, ups_hz))
+    put = mounting.place(wire)
+    assert put.vendor is not None and put.vendor.newtons is not None and put.vendor_force_n is not None
+    assert np.array_equal(put.vendor.newtons, seen(replace(mounting, gains=(1.0,) * 48), newtons))
+    force_n = np.array(wire.vendor_force_n)[[1, 0, 2] if mounting.swap_xy else [0, 1, 2]] * mounting.signs
+    assert put.vendor_force_n == pytest.approx(force_n, abs=1e-5)
+    for told, was in ((put.vendor.temperature_k, temperature_k), (put.vendor.ups_hz, ups_hz)):
+        assert told is not None and np.array_equal(told.ravel(), was.ravel()[list(mounting.order)])
+    nothing = mounting.place(replace(wire, vendor=VendorReading())).vendor
+    assert nothing == VendorReading() and mounting.place(replace(wire, vendor=None)).vendor is None
+
+
+@pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
+def test_forces_of_the_vendors_server_are_turned_wherever_its_sensor_is(mounting):
+    assert isinstance(open_source("xela-server:ws://robot", mountings={"1": mounting}), PlacedLink)
+    as_mapped = open_source("xela-server:ws://robot", mountings={"1": Mounting(gains=(2.0,) * 48)})
+    assert not isinstance(as_mapped, PlacedLink)
+
+
+def test_what_sits_as_mapped_costs_nothing():
+    assert placed_map(USPA44_MAP, {"4": Mounting(swap_xy=True)}) is USPA44_MAP
+    assert not Mounting().turns_axes and not Mounting().moves_taxels
+    assert Mounting(signs=(1, 1, -1)).turns_axes and TURNED.moves_taxels and not TURNED.turns_axes
+
+
+def test_a_quarter_turn_is_what_it_says():
+    """The wire's top right taxel, 3, lies top left: its id, 0x004, now means place 0."""
+    assert TURNED.order[0] == 3
+    assert placed_map(USPA44_MAP, {"4": TURNED}).taxels[0x004] == ("4", 0)
+
+
+def test_deformation_is_corrected_once_and_silent_taxels_stay_unknown():
+    scan = make_scan(press_counts=900, absent=(2,))
+    mounting = Mounting(signs=(1, 1, -1), gains=(1.0,) * 32 + (2.0,) * 16)
+    plain, corrected = deformation(scan.counts, BASELINE), deformation(scan.counts, BASELINE, mounting)
+    assert corrected[2, 1, 1] == -1800 and np.isnan(corrected[:, 0, 2]).all()
+    assert np.array_equal(corrected[:2], plain[:2], equal_nan=True)
+    assert plain[2, 1, 1] == 900
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({"order": (0,) * 16}, "each of 0..15 once"),
+        ({"order": tuple(range(15))}, "each of 0..15 once"),
+        ({"signs": (1, 0, 1)}, "three of 1 and -1"),
+        ({"signs": (1, 1)}, "three of 1 and -1"),
+        ({"gains": (0.0,) * 48}, "48 positive"),
+        ({"gains": (float("nan"),) * 48}, "48 positive"),
+        ({"gains": (1.0,) * 3}, "48 positive"),
+    ],
+)
+def test_a_mounting_that_cannot_be_is_refused(settings, word):
+    with pytest.raises(ValueError, match=word):
+        Mounting(**settings)
+
+
+def test_csv_of_the_vendors_server_is_put_in_place_and_what_edge_sr_recorded_is_not(tmp_path):
+    """A CSV is as the server wrote it; edge-sr writes what it has already put in place."""
+    scan = make_scan(absent=())
+    row = ",".join(str(count) for count in scan.counts.reshape(3, 16).T.ravel())
+    (tmp_path / "4.csv").write_text("\n".join([",".join(CSV_HEADER), row, row, ""]))
+    np.savez(
+        tmp_path / "4.npz",
+        format=np.array("tactile-recording"),
+        version=np.array(1),
+        sensor=np.array(["4"]),
+        scan=np.arange(1),
+        time_ns=np.arange(1),
+        counts=scan.counts[None],
+    )
+    for name, expected in (("4.csv", TURNED.place(scan).counts), ("4.npz", scan.counts)):
+        with open_source(f"replay:{tmp_path}/{name}", 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED}) as link:
+            assert isinstance(link, PlacedLink) == (name == "4.csv") and link.kind == "replay"
+            scans = []
+            while not link.ended:
+                scans += link.read(1.0)
+        assert np.array_equal(scans[0].counts, expected) and ABSENT not in scans[0].counts
+        assert link.counters()["scans"] == len(scans)
