@@ -1,14 +1,72 @@
-"""Commands as JSON lines on stdin, such as {"cmd": "reset"}; read between scans, without a thread."""
+"""What a user may ask of a run, and JSON lines on stdin that ask it, such as {"cmd": "reset"}.
+
+Read between scans, without a thread.
+"""
 
 import json
 import os
 import select
 import sys
-from typing import Final
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol
 
-KNOWN: Final = ("reset",)
 READ_BYTES: Final = 4096
 LONGEST_LINE_BYTES: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What a user asks for between two scans.
+
+    Attributes:
+        name: "reset" forgets earlier taps, "zero" zeroes again.
+        sensor: which one to zero; None for all.
+        force: zero it even if it is in contact.
+    """
+
+    name: Literal["reset", "zero"]
+    sensor: str | None = None
+    force: bool = False
+
+
+RESET: Final = Command("reset")
+ZERO: Final = Command("zero")
+
+
+class Commands(Protocol):
+    """Where a user's commands come from."""
+
+    @property
+    def refused(self) -> int:
+        """What came and was no command."""
+        ...
+
+    def poll(self) -> Sequence[Command]:
+        """What was asked for since the last call; never waits."""
+        ...
+
+
+class Obedient(Protocol):
+    """What does as it is told: a runtime."""
+
+    def reset(self) -> None:
+        """Forget earlier taps."""
+        ...
+
+    def zero(self, name: str | None = None, *, force: bool = False) -> None:
+        """Zero a sensor again, or all."""
+        ...
+
+
+def obey(commands: Commands, runtime: Obedient) -> None:
+    """Have done what was asked for since the last call."""
+    for command in commands.poll():
+        if command.name == "reset":
+            runtime.reset()
+        else:
+            runtime.zero(command.sensor, force=command.force)
 
 
 class LineCommands:
@@ -24,8 +82,8 @@ class LineCommands:
         self._open = True
         self._partial = b""
 
-    def poll(self) -> list[str]:
-        """Names of the commands that came since the last call."""
+    def poll(self) -> list[Command]:
+        """The commands that came since the last call."""
         if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
             return []
         try:
@@ -37,25 +95,71 @@ class LineCommands:
         self._partial = partial[: LONGEST_LINE_BYTES + 1]
         return [command for line in lines if (command := self._parse(line)) is not None]
 
-    def _parse(self, line: bytes) -> str | None:
+    def _parse(self, line: bytes) -> Command | None:
         if not line.strip():
             return None
         try:
-            command = json.loads(line) if len(line) <= LONGEST_LINE_BYTES else None
+            parsed = json.loads(line) if len(line) <= LONGEST_LINE_BYTES else None
         except (ValueError, RecursionError):
-            command = None
-        if isinstance(command, dict) and command.get("cmd") in KNOWN:
-            return command["cmd"]
-        self.refused += 1
+            parsed = None
+        command = _command(parsed) if isinstance(parsed, dict) else None
+        self.refused += command is None
+        return command
+
+
+def _command(parsed: dict[str, Any]) -> Command | None:
+    if parsed.get("cmd") == "reset":
+        return RESET
+    sensor, force = parsed.get("sensor"), parsed.get("force", False)
+    # A misspelt key must not turn "zero sensor 4" into "zero all": unlike a reset, a zeroing cannot be undone.
+    if parsed.get("cmd") != "zero" or parsed.keys() - {"cmd", "sensor", "force"}:
         return None
+    if not (sensor is None or isinstance(sensor, str)) or not isinstance(force, bool):
+        return None
+    return Command("zero", sensor, force)
+
+
+class AllCommands:
+    """Commands from several places."""
+
+    def __init__(self, places: Sequence[Commands]) -> None:
+        self._places = places
+
+    @property
+    def refused(self) -> int:
+        """What came and was no command."""
+        return sum(place.refused for place in self._places)
+
+    def poll(self) -> list[Command]:
+        """What was asked for since the last call, place by place."""
+        return [command for place in self._places for command in place.poll()]
+
+
+@contextmanager
+def user_commands() -> Iterator[Commands]:
+    """Commands from lines on stdin, or from keys where it is a terminal, and from SIGUSR1."""
+    from edge.keys import terminal_keys
+    from edge.signals import zero_on_signal
+
+    with ExitStack() as closing:
+        places: list[Commands] = [closing.enter_context(zero_on_signal())]
+        lines = stdin_commands()
+        if lines is not None:
+            places.append(lines)
+        keys = closing.enter_context(terminal_keys())
+        if keys is not None:
+            places.append(keys)
+        yield AllCommands(places)
 
 
 def stdin_commands() -> LineCommands | None:
     """Commands from stdin; None where there is none, or where it is a terminal.
 
-    A terminal is left alone: reading it in the background would stop the program. Elsewhere than on
-    POSIX a pipe cannot be asked whether it has something.
+    A terminal has keys (`edge.keys`). Elsewhere than on POSIX a pipe cannot be asked whether it has something.
     """
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
         return None
-    return LineCommands(sys.stdin.fileno())
+    try:
+        return LineCommands(sys.stdin.fileno())
+    except OSError:  # what stands in its place is no file of the system's
+        return None

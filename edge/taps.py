@@ -81,6 +81,11 @@ class TapTracker:
         self._last_contact_ns = 0
         self.reset()
 
+    @property
+    def contact(self) -> bool:
+        """A tap is going on."""
+        return self._contact
+
     def reset(self) -> None:
         """Forget every tap. A tap in progress goes on, as the first one, under a number of its own."""
         self._tap += self._contact

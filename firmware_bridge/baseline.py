@@ -2,20 +2,22 @@
 
 import hashlib
 import json
-import math
 import os
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal, NoReturn, Self, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.geometry import AXES
-from firmware_bridge.scan import ABSENT, Scan
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
@@ -28,9 +30,18 @@ CREEP_LIMIT_COUNTS: Final = 10.0
 # Between the 120 counts that warming up adds to a free pad and the 350 that 0.3 N on one taxel add.
 LOAD_LIMIT_COUNTS: Final = 200.0
 
+Origin = Literal["start-up", "demand", "file"]
+
 FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
+MOST_FILE_BYTES: Final = 1 << 20
+"""A sensor takes about 2 kB."""
+LAST_UNIX_S: Final = 1e11
+"""The year 5138: a larger number is no time, and one of hundreds of digits no float."""
 _FILE_REMEDY: Final = "zero again and save a new file"
+
+Orders = Mapping[str, Sequence[int]]
+_AS_WIRED: Final[Orders] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +50,11 @@ class Baseline:
 
     Attributes:
         sensor: name of the sensor.
-        counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent.
+        counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent. What is subtracted: `id`
+            stands for them as they were taken, `moved` adds what has drifted since.
         created_unix_s: when it was taken, in [s] since 1970.
         scans: how many scans it is the median of.
-        origin: taken at this start-up, or loaded from a file.
+        origin: taken at this start-up, or later on demand, or loaded from a file.
         id: short text that stands for sensor, counts and time.
     """
 
@@ -50,7 +62,7 @@ class Baseline:
     counts: NDArray[np.float32]
     created_unix_s: float
     scans: int
-    origin: Literal["start-up", "file"]
+    origin: Origin
     id: str
 
     @classmethod
@@ -77,7 +89,7 @@ class Baseline:
         counts: NDArray[np.floating],
         created_unix_s: float,
         scans: int,
-        origin: Literal["start-up", "file"],
+        origin: Origin,
     ) -> Self:
         """A baseline of known counts (3, rows, cols), with its id."""
         own = np.array(counts, dtype=np.float32)
@@ -89,13 +101,22 @@ class Baseline:
         """How old it is at `now_unix_s`, in [s]."""
         return now_unix_s - self.created_unix_s
 
+    def moved(self, drift_counts: NDArray[np.floating]) -> Self:
+        """The same baseline, under its id, for a pad that has drifted by (3, rows, cols) in [counts] since."""
+        counts = ((self.counts + drift_counts.astype(np.float64)) % COUNTS_ON_CIRCLE).astype(np.float32)
+        counts.setflags(write=False)
+        return replace(self, counts=counts)
 
-def deformation(scan_counts: NDArray[np.integer], baseline: Baseline) -> NDArray[np.float32]:
+
+def deformation(
+    scan_counts: NDArray[np.integer], baseline: Baseline, mounting: Mounting | None = None
+) -> NDArray[np.float32]:
     """How far a scan is from the free pad, the short way round the circle.
 
     Args:
         scan_counts: (3, rows, cols) raw counts.
         baseline: of the same sensor.
+        mounting: which way its axes point, and its gains; None where they are as wired.
 
     Returns:
         (3, rows, cols) signed counts in -32768..32768; NaN where a taxel is absent.
@@ -110,7 +131,7 @@ def deformation(scan_counts: NDArray[np.integer], baseline: Baseline) -> NDArray
         signed -= half
     if scan_counts.min() == ABSENT:
         signed[scan_counts == ABSENT] = np.nan
-    return signed
+    return signed if mounting is None else mounting.correct(signed)
 
 
 class BaselineEstimator:
@@ -185,8 +206,13 @@ class BaselineEstimator:
         return baseline
 
 
-def save_baselines(path: str | Path, baselines: Iterable[Baseline]) -> None:
+def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orders = _AS_WIRED) -> None:
     """Write baselines, one per sensor, as one JSON file. A file that is there is replaced whole or not at all.
+
+    Args:
+        path: of the file.
+        baselines: one per sensor.
+        orders: of each sensor whose taxels were put elsewhere than its id map says, in which order they lie.
 
     Raises:
         ValueError: two baselines of one sensor.
@@ -200,6 +226,7 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline]) -> None:
             "created_unix_s": baseline.created_unix_s,
             "scans": baseline.scans,
             "counts": baseline.counts.tolist(),
+            **({"order": list(orders[baseline.sensor])} if baseline.sensor in orders else {}),
         }
         for baseline in baselines
     ]
@@ -216,15 +243,20 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline]) -> None:
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def load_baselines(path: str | Path) -> dict[str, Baseline]:
+def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Baseline]:
     """Read baselines, by sensor.
 
+    Args:
+        path: of the file.
+        orders: in which order taxels lie now, as `save_baselines` has it.
+
     Raises:
-        RecordingError: the file cannot be read, or is no baseline file, or was changed by hand.
+        RecordingError: the file cannot be read, or is no baseline file, was changed by hand, or its taxels lay in
+            another order, so that each would get another one's rest.
     """
     path = Path(path)
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(read_bounded(path, MOST_FILE_BYTES).decode())
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
@@ -243,6 +275,11 @@ def load_baselines(path: str | Path) -> dict[str, Baseline]:
         baseline = _read_entry(path, entry)
         if baseline.sensor in baselines:
             _refuse_file(path, "sensor", baseline.sensor, "each sensor once")
+        now = orders.get(baseline.sensor)
+        if entry.get("order") != (None if now is None else list(now)):
+            raise RecordingError(
+                f"{path}: the taxels of sensor {baseline.sensor} lay in another order: zero again with the sensor file"
+            )
         baselines[baseline.sensor] = baseline
     return baselines
 
@@ -295,9 +332,9 @@ def _read_entry(path: Path, entry: Any) -> Baseline:
     if not isinstance(entry, dict):
         _refuse_file(path, "baselines", entry, "objects")
     sensor, created_unix_s, scans = entry.get("sensor"), entry.get("created_unix_s"), entry.get("scans")
-    if not isinstance(sensor, str) or not sensor:
-        _refuse_file(path, "sensor", sensor, "a name")
-    if not _is_number(created_unix_s) or created_unix_s <= 0:
+    if not isinstance(sensor, str) or not is_sensor_name(sensor):
+        _refuse_file(path, "sensor", sensor, f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    if not _is_number(created_unix_s) or not 0 < created_unix_s <= LAST_UNIX_S:
         _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970")
     if type(scans) is not int or scans < 1:
         _refuse_file(path, "scans", scans, "a whole number from 1")
@@ -324,7 +361,7 @@ def _read_counts(path: Path, counts: Any) -> NDArray[np.float64]:
 
 
 def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < math.inf
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _refuse_file(path: Path, key: str, got: object, expected: str) -> NoReturn:

@@ -1,9 +1,11 @@
 import os
+import signal
 
 import pytest
 
 from edge import commands
-from edge.commands import LONGEST_LINE_BYTES, LineCommands, stdin_commands
+from edge.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands, user_commands
+from edge.signals import zero_on_signal
 
 
 @pytest.fixture
@@ -23,9 +25,9 @@ def test_commands_come_as_lines_however_they_are_cut(pipe):
     for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"'):
         os.write(pipe[1], piece)
         got = lines.poll()
-    assert got == ["reset", "reset"]
+    assert got == [RESET, RESET]
     os.write(pipe[1], b':"reset"}\r\n')
-    assert lines.poll() == ["reset"]
+    assert lines.poll() == [RESET]
     assert lines.refused == 0
 
 
@@ -36,7 +38,7 @@ def test_commands_come_as_lines_however_they_are_cut(pipe):
 def test_other_lines_are_counted(pipe, line):
     lines = LineCommands(pipe[0])
     os.write(pipe[1], line + b'\n\n  \n{"cmd": "reset"}\n')
-    assert lines.poll() == ["reset"]
+    assert lines.poll() == [RESET]
     assert lines.refused == 1
 
 
@@ -47,7 +49,7 @@ def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
         assert lines.poll() == []
         assert len(lines._partial) <= LONGEST_LINE_BYTES + 1
     os.write(pipe[1], b'{"cmd": "reset"}\n{"cmd": "reset"}\n')
-    assert lines.poll() == ["reset"]
+    assert lines.poll() == [RESET]
     assert lines.refused == 1
 
 
@@ -64,7 +66,7 @@ def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
     os.write(pipe[1], b'{"cmd": "reset"}')
     assert lines.poll() == []
     os.close(pipe[1])
-    assert lines.poll() == ["reset"]
+    assert lines.poll() == [RESET]
     assert lines.poll() == []
     os.close(pipe[0])
     assert lines.poll() == [], "a pipe that has ended is not touched again"
@@ -87,4 +89,64 @@ def test_a_pipe_is_listened_to(monkeypatch, pipe):
         lines = stdin_commands()
         assert lines is not None
         os.write(pipe[1], b'{"cmd": "reset"}\n')
-        assert lines.poll() == ["reset"]
+        assert lines.poll() == [RESET]
+
+
+@pytest.mark.parametrize(
+    ("line", "command"),
+    [
+        (b'{"cmd": "zero"}', ZERO),
+        (b'{"cmd": "zero", "sensor": "4"}', Command("zero", "4")),
+        (b'{"cmd": "zero", "sensor": null, "force": true}', Command("zero", None, True)),
+        (b'{"force": false, "sensor": "6", "cmd": "zero"}', Command("zero", "6", False)),
+    ],
+)
+def test_zeroing_names_a_sensor_or_all_and_may_be_forced(pipe, line, command):
+    lines = LineCommands(pipe[0])
+    os.write(pipe[1], line + b"\n")
+    assert lines.poll() == [command] and lines.refused == 0
+
+
+@pytest.mark.parametrize("more", [b'"sensor": 4', b'"force": 1', b'"force": "no"', b'"sensors": "4"', b'"sensor": []'])
+def test_a_zeroing_that_is_not_understood_is_none(pipe, more):
+    """Least of all one of every sensor."""
+    lines = LineCommands(pipe[0])
+    os.write(pipe[1], b'{"cmd": "zero", ' + more + b"}\n")
+    assert lines.poll() == [] and lines.refused == 1
+
+
+class Told:
+    def __init__(self):
+        self.done = []
+
+    def reset(self):
+        self.done.append("reset")
+
+    def zero(self, name=None, *, force=False):
+        self.done.append((name, force))
+
+
+def test_a_signal_asks_once_for_zeroing_and_is_let_go_afterwards():
+    before = signal.getsignal(signal.SIGUSR1)
+    runtime = Told()
+    with zero_on_signal() as commands:
+        obey(commands, runtime)
+        assert runtime.done == []
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGUSR1)
+        obey(commands, runtime)
+        obey(commands, runtime)
+    assert runtime.done == [(None, False)]
+    assert signal.getsignal(signal.SIGUSR1) is before
+
+
+def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
+    with os.fdopen(os.dup(pipe[0])) as stdin:
+        monkeypatch.setattr(commands.sys, "stdin", stdin)
+        runtime = Told()
+        with user_commands() as everything:
+            os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')
+            os.kill(os.getpid(), signal.SIGUSR1)
+            obey(everything, runtime)
+            assert everything.refused == 1
+    assert runtime.done == [(None, False), "reset", ("4", True)]

@@ -24,6 +24,7 @@ EXPERIMENTS: Final = {
     "real": "a hidden taxel of real recordings",
     "robust": "error against the severity of nuisances",
     "dead": "dead taxels, found and unfound",
+    "zeroing": "drift followed, holds not eaten",
     "calibration": "how true the deviations are",
     "confidence": "expected error and early stop against what came out",
     "fig5": "alpha and beta against force",

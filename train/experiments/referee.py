@@ -89,7 +89,7 @@ def press_or_recall(
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         _keep(path, _work_out(surface, mesh, indentation_mm, pose, layer))
-    with np.load(path) as kept:
+    with np.load(path, allow_pickle=False) as kept:
         return Verdict(kept["patterns_mm"].astype(np.float32), *(kept[name] for name in _FIGURES))
 
 

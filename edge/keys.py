@@ -1,0 +1,140 @@
+"""Keys on a terminal as commands: z zeroes, Z even in contact, r forgets earlier taps.
+
+Keys come one by one only if the terminal does not wait for a line, and that setting outlives a program: it is taken
+back on every way out, also when the program is stopped by Ctrl-Z or killed by a second Ctrl-C. In the background a
+program may neither set a terminal nor read it, or it is stopped.
+"""
+
+import os
+import select
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from edge.commands import RESET, ZERO, Command
+
+KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
+READ_BYTES: Final = 64
+ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+
+
+class KeyCommands:
+    """Keys of a terminal, which is never waited for; other keys than KEYS are passed over.
+
+    Attributes:
+        refused: always 0.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        """Start with the terminal as it is.
+
+        Args:
+            descriptor: of a terminal.
+        """
+        self.refused = 0
+        self._descriptor = descriptor
+        self._before: list[Any] | None = None
+        self._gone = False
+
+    def poll(self) -> list[Command]:
+        """What was asked for since the last call."""
+        if self._gone or not self._foreground():
+            return []
+        if self._before is None:
+            self.take()  # in the foreground again
+        if not select.select([self._descriptor], [], [], 0)[0]:
+            return []
+        try:
+            keys = os.read(self._descriptor, READ_BYTES)
+        except OSError:  # the terminal was closed, which ends keys but not the run
+            keys = b""
+        self._gone = not keys
+        return [command for key in keys if (command := KEYS.get(bytes([key]))) is not None]
+
+    def take(self) -> None:
+        """Have keys come one by one, unseen; Ctrl-C and Ctrl-Z go on to be signals."""
+        import termios
+
+        if self._gone or self._before is not None or not self._foreground():
+            return
+        try:
+            before = termios.tcgetattr(self._descriptor)
+            mode = termios.tcgetattr(self._descriptor)
+            mode[3] &= ~(termios.ICANON | termios.ECHO)
+            mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, mode)
+        except termios.error:
+            self._gone = True
+        else:
+            self._before = before
+
+    def give_back(self, *, for_good: bool = False) -> None:
+        """Leave the terminal as it was found; in the background it is another program's by now."""
+        import termios
+
+        self._gone = self._gone or for_good
+        before, self._before = self._before, None
+        if before is not None and self._foreground():
+            try:
+                termios.tcsetattr(self._descriptor, termios.TCSANOW, before)
+            except termios.error:
+                self._gone = True
+
+    def _foreground(self) -> bool:
+        try:
+            return os.tcgetpgrp(self._descriptor) == os.getpgrp()
+        except OSError:  # not the terminal of this session, or gone
+            return False
+
+
+@contextmanager
+def terminal_keys() -> Iterator[KeyCommands | None]:
+    """Keys of the terminal that stdin is; None where it is none."""
+    if os.name != "posix" or sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
+        yield None
+        return
+    keys = KeyCommands(sys.stdin.fileno())
+    with _given_back_on_signals(keys):
+        keys.take()
+        try:
+            yield keys
+        finally:
+            keys.give_back()
+
+
+@contextmanager
+def _given_back_on_signals(keys: KeyCommands) -> Iterator[None]:
+    """Have the terminal given back before a signal that ends or stops the program does what it did before."""
+    before: dict[int, Any] = {}
+
+    def end(number: int, frame: object) -> None:
+        keys.give_back(for_good=True)
+        earlier = before[number]
+        # From now on as without us: the first signal may have set what the second does.
+        signal.signal(number, earlier)
+        if callable(earlier):
+            earlier(number, frame)
+        elif earlier == signal.SIG_DFL:
+            os.kill(os.getpid(), number)
+
+    def stop(number: int, frame: object) -> None:
+        keys.give_back()
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTSTP)  # here it stops
+        signal.signal(signal.SIGTSTP, stop)
+        keys.take()
+
+    ours: dict[int, Any] = {getattr(signal, name): end for name in ENDING if hasattr(signal, name)}
+    ours[signal.SIGTSTP] = stop
+    for number, handler in ours.items():
+        before[number] = signal.getsignal(number)
+        if before[number] != signal.SIG_IGN:  # as under nohup, or in a shell without jobs
+            signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, handler in ours.items():
+            if signal.getsignal(number) is handler:
+                signal.signal(number, before[number])

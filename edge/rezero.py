@@ -1,0 +1,69 @@
+"""Zeroing again while a sensor runs; the old baseline stays in use until there is a new one."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
+from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.scan import Scan
+
+GIVE_UP_NS: Final = 15_000_000_000
+"""Of scan time: ten tries at 100 Hz, and four at 30."""
+
+
+class Rezeroing:
+    """Takes one new baseline of one sensor, or gives up.
+
+    Attributes:
+        note: how it stands.
+    """
+
+    def __init__(self, sensor: str, old: Baseline, *, force: bool) -> None:
+        """Start with the next scan.
+
+        Args:
+            sensor: name of the sensor.
+            old: the baseline so far; against it a load is seen.
+            force: zero away a contact or a load.
+        """
+        self.note = "zeroing: keep the pad still and free"
+        self._sensor = sensor
+        self._old = old
+        self._force = force
+        self._end_ns: int | None = None
+        self._why = f"fewer than {FEWEST_SCANS} whole scans"
+        self._estimator = self._new_estimator()
+
+    def push(self, scan: Scan, contact: bool, silent: NDArray[np.bool_] | None) -> Baseline | None:
+        """Take one more scan; the new baseline once there are enough.
+
+        Args:
+            scan: the sensor's next one.
+            contact: a tap is going on; unless forced it starts the zeroing over.
+            silent: taxels (rows, cols) to zero without, as in `BaselineEstimator.push`.
+
+        Raises:
+            BaselineRefusedError: it has tried for long enough, and the old baseline stays.
+        """
+        if self._end_ns is None:
+            self._end_ns = scan.time_ns + GIVE_UP_NS
+        if scan.time_ns >= self._end_ns:
+            name = f"sensor {self._sensor}: zeroing given up after {GIVE_UP_NS / 1e9:.0f} s, the old baseline stays"
+            raise BaselineRefusedError(f"{name}: {self._why}")
+        try:
+            if contact and not self._force:
+                if self._estimator.scans:
+                    self._estimator = self._new_estimator()
+                raise BaselineRefusedError("the pad is in contact: free it")
+            taken = self._estimator.push(scan, silent)
+        except BaselineRefusedError as refusal:
+            self._why = str(refusal)
+            self.note = f"zeroing started over: {refusal}"
+            return None
+        return None if taken is None else replace(taken, origin="demand")
+
+    def _new_estimator(self) -> BaselineEstimator:
+        return BaselineEstimator(reference=None if self._force else self._old)
