@@ -7,6 +7,11 @@ from typing import Final
 REMEMBERED_INTERVALS: Final = 31
 FEWEST_INTERVALS: Final = 5
 """Before so many, nobody knows the period."""
+BURST_SHARE: Final = 8
+"""Of a period: scans nearer to each other than an eighth were held up. Bursts of all sixteen frames, 16 ms apart, are
+further apart."""
+LONGEST_BURST: Final = 500
+"""Five seconds of a sensor at 100 Hz; after that it is its pace."""
 NS_PER_S: Final = 1_000_000_000
 
 
@@ -23,6 +28,7 @@ class Deadline:
         self._intervals: deque[int] = deque()
         self._sorted: list[int] = []
         self._last_ns: int | None = None
+        self._hurried = 0
 
     @property
     def period_ns(self) -> int | None:
@@ -38,10 +44,23 @@ class Deadline:
         last_ns, self._last_ns = self._last_ns, scan_time_ns
         if last_ns is None or scan_time_ns <= last_ns:
             return
+        interval_ns = scan_time_ns - last_ns
+        if self._is_of_a_burst(interval_ns):
+            return
         if len(self._intervals) == REMEMBERED_INTERVALS:
             del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
-        self._intervals.append(scan_time_ns - last_ns)
-        insort(self._sorted, scan_time_ns - last_ns)
+        self._intervals.append(interval_ns)
+        insort(self._sorted, interval_ns)
+
+    def _is_of_a_burst(self, interval_ns: int) -> bool:
+        """Whether the scan was held up somewhere and came right behind the one before; not if all of late did."""
+        period_ns = self.period_ns
+        hurried = period_ns is not None and interval_ns * BURST_SHARE < period_ns
+        self._hurried = self._hurried + 1 if hurried else 0
+        if self._hurried > LONGEST_BURST:
+            self._intervals.clear()
+            self._sorted.clear()
+        return hurried and self._hurried <= LONGEST_BURST
 
     def check(self, scan_time_ns: int, done_ns: int) -> bool:
         """Whether a pattern missed its deadline; without a period none does.

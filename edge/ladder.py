@@ -1,6 +1,5 @@
 """`--budget-us`: the models that may take turns, loaded and calibrated, and who changes them while it runs."""
 
-import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -12,6 +11,7 @@ from edge.budget import Candidate, Choice, choose
 from edge.bundle import alternatives, bundled_models
 from edge.calibration import ROUND_TICKS, ROUNDS, RunTime, calibrate
 from edge.calibration_cache import CalibrationCache
+from edge.confidence import is_number
 from edge.errors import ModelError
 from edge.governor import Governor
 from edge.result import Result, age_text
@@ -185,7 +185,7 @@ def _psnr_db(session: ModelSession) -> float:
     """On the frozen test set with all taps given, in [dB]."""
     taps, errors = session.contract.taps, session.contract.test_error
     psnr_db = errors.get(str(taps), {}).get("psnr_db")
-    if not isinstance(psnr_db, (int, float)) or not math.isfinite(psnr_db):
-        got = f"model '{session.name}': contract key 'test_error' is {errors!r}"
+    if not is_number(psnr_db):
+        got = f"model '{session.name}': contract key 'test_error' is {repr(errors)[:200]}"
         raise ModelError(f"{got}, expected a psnr_db for {taps} taps, which --budget-us chooses by: export it again")
     return psnr_db

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.baseline import Baseline
+from firmware_bridge.drift import Drift
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scan import Scan
 
@@ -40,7 +41,7 @@ class Result:
         deviation: (H, W) float32, standard deviation of each pixel of the pattern, in `pattern_unit`; None without a
             pattern, or where the model gives none.
         force_counts: summed z over the baseline, or None while it cannot be known.
-        force_n: the same in [N], only if a calibration was given.
+        force_n: the same in [N], if a calibration was given; else the vendor's z force, where the scan has one.
         area_mm2: touched area of the pattern, in [mm2].
         centroid_mm: x, y of the touched area's centroid from the sensor's centre, x to the right
             and y down, in [mm].
@@ -55,14 +56,16 @@ class Result:
         latency_us: from the read that gave the scan's last byte to the pattern being ready, in [us]; what the adapter
             and the kernel took before that read is not in it. None without a pattern.
         baseline: subtracted from the scan, or None.
-        baseline_age_s: how long ago the baseline was taken, in [s].
+        baseline_age_s: how long ago the baseline was taken, in [s]; None also where a clock was wrong then.
+        drift: what of the baseline was followed since it was taken, and which step in rest level was not.
         dead: taxels that are not believed, row-major from the top left, and why: "silent", "saturated", "stuck", "far"
             (reads what no contact makes) or "unzeroed"; empty where all are. A pattern made meanwhile is made without
             them.
         filled: what stood for the dead ones: "rest", which networks are trained to make up for, or an estimate from
             their "neighbours"; None where none is dead, or no pattern can be made.
         note: what the user should know, such as why zeroing started over.
-        event: why there is another model from this scan on; None where it is that of the scan before.
+        event: what happened before this scan: why there is another model, what came of zeroing on demand, a step in
+            rest level; else None.
     """
 
     scan: Scan
@@ -86,6 +89,7 @@ class Result:
     latency_us: float | None = None
     baseline: Baseline | None = None
     baseline_age_s: float | None = None
+    drift: Drift | None = None
     dead: Mapping[int, str] = field(default_factory=dict)
     filled: Filled | None = None
     note: str | None = None
@@ -93,8 +97,10 @@ class Result:
 
     def baseline_text(self) -> str:
         """Which baseline, how old."""
-        if self.baseline is None or self.baseline_age_s is None:
+        if self.baseline is None:
             return "no baseline"
+        if self.baseline_age_s is None:
+            return f"baseline {self.baseline.id} of unknown age"
         return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)} old"
 
 

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,11 @@ from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan import Scan
+
+OLD_NS: Final = 50_000_000
+"""Later by the device's own time stamps than its fastest reading of late: three times what a slow adapter keeps."""
 
 
 class Model(Protocol):
@@ -52,15 +56,18 @@ class Runtime:
         geometry: of the sensors; refused if the model was not trained for it.
         baselines: stored baselines by sensor name; a sensor without one is zeroed from its first
             scans, during which its pad must be still and free.
-        counts_per_newton: summed z per [N]; without it there is no force in newtons.
+        counts_per_newton: summed z per [N], of all sensors or by name; without it a force in newtons is the vendor's,
+            where the scan has one.
+        mountings: which way a sensor's axes point, and its gains, by name; as wired without.
         on_counts: summed z at which a tap begins.
         off_counts: summed z at which it ends.
         idle_timeout_s: time without contact after which earlier taps are forgotten.
         reuse: give the pattern before where nothing has changed beyond noise.
         every_tap: use all taps there are, also those that are not expected to help.
+        follow_drift: let the rest level follow what a free pad reads.
         most_taps: taps to remember for a model that may take over; the model's own if it takes more.
         clock_ns: measures run time.
-        unix_time_s: tells a baseline's age.
+        unix_time_s: tells how old a stored baseline is when its sensor is first heard; ages go on by scan time.
 
     Raises:
         ModelError: the model is for another sensor.
@@ -75,12 +82,14 @@ class Runtime:
         estimator: TaxelEstimator | None = None,
         geometry: SensorGeometry = USPA44,
         baselines: Mapping[str, Baseline] | None = None,
-        counts_per_newton: float | None = None,
+        counts_per_newton: float | Mapping[str, float] | None = None,
+        mountings: Mapping[str, Mounting] | None = None,
         on_counts: float = ON_COUNTS,
         off_counts: float = OFF_COUNTS,
         idle_timeout_s: float = IDLE_TIMEOUT_S,
         reuse: bool = True,
         every_tap: bool = False,
+        follow_drift: bool = True,
         most_taps: int = 1,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
@@ -98,9 +107,12 @@ class Runtime:
         self._geometry = geometry
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
+        self._mounted = frozenset(mountings or ())
+        self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._thresholds = (on_counts, off_counts, idle_timeout_s)
         self._reuse = reuse
         self._every_tap = every_tap
+        self._follow_drift = follow_drift
         self._clock_ns = clock_ns
         self._unix_time_s = unix_time_s
         self._sensors: dict[str, Sensor] = {}
@@ -110,6 +122,34 @@ class Runtime:
         """Forget the taps of every sensor, as when the robot moves to another object; zeroing stays."""
         for sensor in self._sensors.values():
             sensor.taps.reset()
+
+    def zero(self, name: str | None = None, *, force: bool = False) -> None:
+        """Zero again from the next scans; the old baselines stay in use until then, and an event tells what came of it.
+
+        Args:
+            name: of the sensor; None for all.
+            force: also in contact.
+        """
+        if not self._sensors:
+            self._tell("zeroing refused: no sensor was heard yet")
+        elif name is not None and name not in self._sensors:
+            known = ", ".join(sorted(self._sensors)) or "none yet"
+            self._tell(f"zeroing refused: no sensor {name}, there are {known}")
+        for sensor in self._sensors.values() if name is None else filter(None, [self._sensors.get(name)]):
+            sensor.zero_again(force=force)
+
+    def lose_touch(self, sensors: str = "") -> None:
+        """Forget what readings and taps there were: the link broke, and nobody saw what happened; zeroing stays.
+
+        Args:
+            sensors: how the names of those begin that it is about.
+        """
+        for name, sensor in self._sensors.items():
+            if name.startswith(sensors):
+                sensor.lose_touch()
+
+    def _tell(self, event: str) -> None:
+        self._event = event if self._event is None else f"{self._event}; {event}"
 
     def change_model(self, model: Model, why: str) -> None:
         """Let another model take over from the next scan on, whose result tells why; taps and zeroing stay.
@@ -121,7 +161,7 @@ class Runtime:
         if model.contract.taps > self._most_taps:
             raise ModelError(f"contract key 'taps' is {model.contract.taps}, but {self._most_taps} are remembered")
         self._model = model
-        self._event = why
+        self._tell(why)
 
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan; see `push_together`."""
@@ -159,29 +199,38 @@ class Runtime:
         """The result without a pattern, and what a pattern is to be made from."""
         if scan.counts.shape != self._geometry.scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._geometry.scan_shape}")
-        sensor = self._sensors.get(scan.sensor) or self._meet(scan.sensor)
+        sensor = self._sensors.get(scan.sensor) or self._meet(scan)
         zeroed = sensor.hear(scan)
         readings = None if zeroed is None else sensor.fill(zeroed)
         filled = None if readings is None else readings.filled
-        note = "; ".join(text for text in (sensor.watch.note(filled), sensor.note) if text) or None
+        notes = (sensor.watch.note(filled), sensor.note, sensor.drift_note, _age_note(scan))
+        note = "; ".join(text for text in notes if text) or None
 
         unit, dead = self._model.contract.output_unit, sensor.watch.reasons
+        if sensor.events:
+            self._tell("; ".join(sensor.events))
+            sensor.events.clear()
         known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "note": note, "event": self._event}
         self._event = None
         if sensor.baseline is None or zeroed is None:
             return Result(scan, self._source, self._model.name, "zeroing", **known), None
-        age_s = sensor.baseline.age_s(self._unix_time_s())
-        known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "filled": filled}
+        age_s = sensor.age_s(scan.time_ns)
+        known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "drift": sensor.drift, "filled": filled}
         if sensor.watch.waiting or (dead and readings is None):
             return Result(scan, self._source, self._model.name, "incomplete", **known), None
 
         force_counts = float(np.add.reduce(zeroed[2], axis=None)) if readings is None else readings.z_counts
         tap = sensor.taps.push(zeroed if readings is None else readings.counts, scan.time_ns, force_counts)
+        if self._follow_drift:
+            sensor.follow_drift(scan, tap.contact)
         taps_used = sensor.taps_that_matter.of(tap)
         if self._every_tap:
             taps_used = tap.taps_used
         taps_used = min(taps_used, self._model.contract.taps)
-        force_n = None if self._counts_per_newton is None else force_counts / self._counts_per_newton
+        if sensor.counts_per_newton is not None:
+            force_n = force_counts / sensor.counts_per_newton
+        else:
+            force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
         result = Result(
             scan,
             self._source,
@@ -252,17 +301,39 @@ class Runtime:
             run_time_us=run_time_us,
         )
 
-    def _meet(self, name: str) -> Sensor:
+    def _meet(self, scan: Scan) -> Sensor:
+        name = scan.sensor
         baseline = self._baselines.get(name)
         note = None
         if baseline is None and self._baselines:
             note = f"no stored baseline for sensor {name}, only for {', '.join(sorted(self._baselines))}: zeroing"
-        self._sensors[name] = sensor = Sensor(self._geometry, self._new_tracker(), self._estimator, baseline, note)
+        if self._mounted and name not in self._mounted:
+            known = ", ".join(sorted(self._mounted))
+            note = f"the sensor file knows no sensor {name}, only {known}: taken as wired" + (
+                f"; {note}" if note else ""
+            )
+        mounting = self._mountings.get(name)
+        self._sensors[name] = sensor = Sensor(
+            name, self._geometry, self._new_tracker(), self._estimator, note, mounting
+        )
+        per_newton = self._counts_per_newton
+        sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton
+        if baseline is not None:
+            age_s = baseline.age_s(self._unix_time_s())
+            # Taken in the future it cannot have been: one of the two clocks was wrong.
+            sensor.use(baseline, age_s if age_s >= 0 else None, scan.time_ns)
         return sensor
 
     def _new_tracker(self) -> TapTracker:
         grid_shape = (self._geometry.rows, self._geometry.cols)
         return TapTracker(self._most_taps, *self._thresholds, grid_shape=grid_shape)
+
+
+def _age_note(scan: Scan) -> str | None:
+    """What to tell of readings that lay about before they came."""
+    if scan.device_ns is None or scan.time_ns - scan.device_ns <= OLD_NS:
+        return None
+    return f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it came"
 
 
 class _Due(NamedTuple):

@@ -1,42 +1,88 @@
 """What is remembered of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
 
 from collections.abc import Hashable
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.estimate import Filler, Readings, TaxelEstimator
 from edge.result import Result
+from edge.rezero import Rezeroing
 from edge.scene import LastReading, TapsThatMatter
 from edge.taps import TapTracker
 from edge.taxels import TaxelWatch
 from firmware_bridge.baseline import Baseline, BaselineEstimator, deformation
+from firmware_bridge.drift import Drift, DriftTracker
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan import Scan
+
+LONGEST_GAP_NS: Final = 1_000_000_000
+"""Between two scans of one sensor: a tap is over within, and the slowest sensor on record gives four."""
+HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
 
 
 class Sensor:
-    """What is remembered of one sensor."""
+    """What is remembered of one sensor.
+
+    Attributes:
+        baseline: subtracted from the scans, drift and all; None before there is one.
+        drift: what has become of the rest level since it was zeroed; None without a baseline.
+        note: why there is no baseline yet, or how a zeroing on demand stands.
+        drift_note: what the user should know of the rest level.
+        events: what has happened to the zeroing since the last scan; whoever tells them clears them.
+    """
 
     def __init__(
         self,
+        name: str,
         geometry: SensorGeometry,
         taps: TapTracker,
         estimator: TaxelEstimator | None,
-        baseline: Baseline | None,
         note: str | None,
+        mounting: Mounting | None = None,
     ) -> None:
         self.taps = taps
         self.taps_that_matter = TapsThatMatter()
         self.last_reading = LastReading(geometry.scan_shape)
         self.last: Result | None = None
-        self.baseline = baseline
+        # Plain attributes: a property of each would cost a scan at rest a twentieth.
+        self.baseline: Baseline | None = None
+        self.drift: Drift | None = None
         self.note = note
-        self.watch = TaxelWatch((geometry.rows, geometry.cols))
+        self.drift_note: str | None = None
+        self.events: list[str] = []
+        self.counts_per_newton: float | None = None
+        self.watch = TaxelWatch((geometry.rows, geometry.cols), mounting)
+        self._mounting = mounting
+        self._name = name
         self._filler: Filler | None = None
+        self._heard_ns: int | None = None
         self._estimator = estimator
         self._zeroing = BaselineEstimator()
+        self._rezeroing: Rezeroing | None = None
+        self._taken: Baseline | None = None
+        self._taken_ns: int | None = None
+        self._tracker: DriftTracker | None = None
+
+    def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
+        """Subtract this from now on.
+
+        Args:
+            baseline: of this sensor.
+            age_s: how old it was at `time_ns`, in [s]; None where that is not known.
+            time_ns: on the clock of the scans, in [ns]; ages go by it, since a wall clock may be set.
+        """
+        self.baseline = self._taken = baseline
+        self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
+        self._tracker = DriftTracker(baseline)
+        self.drift, self.drift_note = self._tracker.summary, None
+
+    def age_s(self, time_ns: int) -> float | None:
+        """How old the baseline is, in [s]; None where that is not known."""
+        return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
 
     def keep(self, made: Result, newest: NDArray[np.float32], made_by: Hashable) -> None:
         """Remember the last pattern, the reading (3, rows, cols) that it was made from, and what made it."""
@@ -44,20 +90,69 @@ class Sensor:
         self.last_reading.keep(newest, made_by)
         self.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
 
+    def lose_touch(self) -> None:
+        """Readings and taps from before are worth nothing: the sensor was not heard for a time.
+
+        Drift is followed again once the pad has been at rest, and its rest level compared with the one before.
+        """
+        self.taps.reset()
+        self.last = None
+        self.watch.forget()
+        self._zeroing = BaselineEstimator()
+        if self._tracker is not None:
+            self._tracker.forget()
+        if self._rezeroing is not None:
+            self._rezeroing = self.note = None
+            self.events.append(f"zeroing given up: sensor {self._name} was away, the old baseline stays; ask again")
+
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
         """The newest reading of every taxel over the baseline (3, rows, cols); None without a baseline."""
+        if self._heard_ns is not None and scan.time_ns - self._heard_ns > LONGEST_GAP_NS:
+            self.lose_touch()
+        self._heard_ns = scan.time_ns
         before = self.watch.dead
         zeroed = self.watch.push(scan, self.baseline)
         if self.watch.dead is not before:
             self._bury()
         if self.baseline is None:
-            self.zero(scan)
-            zeroed = None if self.baseline is None else deformation(self.watch.held, self.baseline)
-        return zeroed
+            self._zero(scan)
+        elif self._rezeroing is None or not self._rezero(scan, self._rezeroing):
+            return zeroed
+        return None if self.baseline is None else deformation(self.watch.held, self.baseline, self._mounting)
 
     def fill(self, zeroed: NDArray[np.float32]) -> Readings | None:
         """Readings with something for the dead taxels; None where none is dead, or too many are."""
         return self._filler(zeroed) if self._filler is not None and self.watch.may_be_estimated else None
+
+    def follow_drift(self, scan: Scan, contact: bool) -> None:
+        """Let the rest level follow what a free pad reads; the next scan is the first to know."""
+        tracker, taken = self._tracker, self._taken
+        if tracker is None or taken is None or not tracker.push(scan, contact, self.watch.dead):
+            return
+        self.baseline = taken.moved(tracker.counts)
+        self.drift, self.drift_note = tracker.summary, tracker.note
+        event = tracker.take_event()
+        if event is not None:
+            self.events.append(f"sensor {self._name}: {event}")
+
+    def zero_again(self, *, force: bool) -> None:
+        """Take a new baseline from the next scans; the old one stays in use until then. An event tells what came of it.
+
+        Args:
+            force: also in contact.
+        """
+        if self.baseline is None:
+            self.events.append(f"sensor {self._name}: no baseline yet, zeroing since the start")
+        elif self._touched and not force:
+            remedy = f"free the pad, or force it ({HOW_TO_FORCE})"
+            self.events.append(f"zeroing refused: sensor {self._name} is in contact: {remedy}")
+        else:
+            self._rezeroing = Rezeroing(self._name, self.baseline, force=force)
+            self.note = self._rezeroing.note
+
+    @property
+    def _touched(self) -> bool:
+        return self.taps.contact and not (self._tracker is not None and self._tracker.doubted)
 
     def _bury(self) -> None:
         """Get ready to fill in for other dead taxels than before."""
@@ -68,14 +163,35 @@ class Sensor:
         if 0 < 2 * dead <= self.watch.dead.size and self._estimator is not None:
             self._filler = self._estimator.filler(self.watch.dead)
 
-    def zero(self, scan: Scan) -> None:
+    def _zero(self, scan: Scan) -> None:
         """Use the scan for the baseline; a refusal becomes the note, and zeroing starts over."""
         try:
-            silent = self.watch.silent_long
-            few = 2 * np.count_nonzero(silent) < silent.size
-            self.baseline = self._zeroing.push(scan, silent if few else None)
+            baseline = self._zeroing.push(scan, self._silent())
         except BaselineRefusedError as refusal:
             self.note = f"zeroing started over: {refusal}"
-        else:
-            if self.baseline is not None:
-                self.note = None
+            return
+        if baseline is not None:
+            self.use(baseline, 0.0, scan.time_ns)
+            self.note = None
+
+    def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> bool:
+        """Whether there is a new baseline."""
+        try:
+            baseline = rezeroing.push(scan, self._touched, self._silent())
+        except BaselineRefusedError as refusal:
+            self._rezeroing = self.note = None
+            self.events.append(str(refusal))
+            return False
+        self.note = rezeroing.note
+        if baseline is None:
+            return False
+        old = "" if self._taken is None else f" instead of {self._taken.id}"
+        self.events.append(f"sensor {self._name} zeroed on demand: baseline {baseline.id}{old}")
+        self._rezeroing = self.note = None
+        self.use(baseline, 0.0, scan.time_ns)
+        self.taps.reset()  # earlier taps were read over another rest level
+        return True
+
+    def _silent(self) -> NDArray[np.bool_] | None:
+        silent = self.watch.silent_long
+        return silent if 2 * np.count_nonzero(silent) < silent.size else None

@@ -5,7 +5,9 @@ from bisect import bisect_left
 from itertools import accumulate
 from typing import Final
 
+from edge.event import Event
 from edge.result import Result
+from firmware_bridge.drift import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32
 """Of the run-time histogram: a quantile is at most 2.2 % too high."""
@@ -46,6 +48,9 @@ class Statistics:
         dropped: in contact, but overtaken by a newer scan before the inference.
         late: patterns that were ready later than one period after their scan.
         overruns: scans thrown away unseen because nobody took them in time.
+        missed: scans that never came, as far as gaps show.
+        unwritten: records left out for readers that were too slow.
+        events: how often what happened, by its kind.
         torn_wire: scans with taxels missing.
         torn_source: complete scans that were only partly renewed.
         repeated: complete scans with nothing renewed.
@@ -63,6 +68,9 @@ class Statistics:
         self.dropped = 0
         self.late = 0
         self.overruns = 0
+        self.missed = 0
+        self.unwritten = 0
+        self.events: dict[str, int] = {}
         self.torn_wire = 0
         self.torn_source = 0
         self.repeated = 0
@@ -103,6 +111,10 @@ class Statistics:
             span = self._spans[scan.sensor] = _Span(scan.time_ns)
         span.add(scan.time_ns)
 
+    def tell(self, event: Event) -> None:
+        """Count one event."""
+        self.events[event.kind] = self.events.get(event.kind, 0) + 1
+
     def rate_hz(self) -> dict[str, float]:
         """Scans a second of each sensor over the whole run, where there were two or more."""
         return {name: rate_hz for name, span in self._spans.items() if (rate_hz := span.rate_hz()) is not None}
@@ -116,7 +128,7 @@ class Statistics:
         """
         lines = [
             f"{source}: {self.scans} scans, {self.patterns} patterns ({self.reused} reused), {self.dropped} dropped, "
-            f"{self.overruns} overrun",
+            f"{self.overruns} overrun, {self.missed} missed",
             f"torn: {self.torn_wire} on the wire, {self.torn_source} renewed in part; {self.repeated} repeated",
         ]
         late = f", {self.late} later than a period" if self.late else ""
@@ -132,13 +144,25 @@ class Statistics:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
         lines += [
-            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}"
+            f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}{_drift_text(result.drift)}"
             for name, result in sorted(self._zeroed.items())
             if result.baseline is not None
         ]
+        if self.unwritten:
+            lines.append(f"records left out for slow readers: {self.unwritten}")
+        if self.events:
+            counts = ", ".join(f"{kind} {count}" for kind, count in self.events.items())
+            lines.append(f"events: {counts}")
         if self.commands_refused:
             lines.append(f"stdin: {self.commands_refused} lines were no command")
         return "\n".join(lines)
+
+
+def _drift_text(drift: Drift | None) -> str:
+    if drift is None or round(max(map(abs, drift.common_counts))) == 0:
+        return ""
+    x, y, z = drift.common_counts
+    return f"; drifted since by x {x:.0f}, y {y:.0f}, z {z:.0f} counts"
 
 
 class _Span:

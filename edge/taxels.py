@@ -6,10 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.baseline import Baseline, deformation
+from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan import Scan
 
 HOLD_SCANS: Final = 5
 """A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
+HOLD_NS: Final = 100_000_000
+"""And no longer than this, however few scans came meanwhile: what was pressed half a second ago is another press."""
 SILENT_SCANS: Final = 50
 """A taxel not heard for so long is not lost for a moment: the user is told, and zeroing goes on without it."""
 STUCK_SCANS: Final = 20
@@ -56,8 +59,9 @@ class TaxelWatch:
     could be, is not found: a small sphere on one taxel looks to its neighbours like a fault.
     """
 
-    def __init__(self, grid_shape: tuple[int, int]) -> None:
-        """Start with no reading of a grid (rows, cols)."""
+    def __init__(self, grid_shape: tuple[int, int], mounting: Mounting | None = None) -> None:
+        """Start with no reading of a grid (rows, cols); without a mounting its axes are as wired."""
+        self._mounting = mounting
         self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)
         self.dead: NDArray[np.bool_] = np.zeros(grid_shape, dtype=bool)
         self._code = np.zeros(grid_shape, dtype=np.int8)
@@ -65,6 +69,8 @@ class TaxelWatch:
         self._saturated = np.zeros(grid_shape, dtype=bool)
         self._unzeroed = np.zeros(grid_shape, dtype=bool)
         self._age = np.zeros(grid_shape, dtype=np.int64)
+        self._read_ns = np.zeros(grid_shape, dtype=np.int64)
+        self._whole_ns = 0
         self._still = np.zeros(grid_shape, dtype=np.int64)
         self._far = np.zeros(grid_shape, dtype=np.int64)
         self._well = np.zeros(grid_shape, dtype=np.int64)
@@ -95,6 +101,11 @@ class TaxelWatch:
         silent = sum(reason == "silent" for reason in self._reasons.values())
         return len(self._reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
 
+    def forget(self) -> None:
+        """No reading from before is held any longer; dead taxels stay dead until they prove themselves."""
+        self._heard[:] = False
+        self._sound = False
+
     def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
         """Follow one scan.
 
@@ -106,11 +117,14 @@ class TaxelWatch:
             The newest readings over the baseline, (3, rows, cols) in counts, NaN where not zeroed; None without one.
         """
         if baseline is not self._baseline and baseline is not None:
-            self._unzeroed = np.isnan(baseline.counts).any(axis=0)
-            self._sound = False
+            unzeroed = np.isnan(baseline.counts).any(axis=0)
+            if self._baseline is None or (unzeroed != self._unzeroed).any():  # not where it has drifted alone
+                self._unzeroed, self._sound = unzeroed, False
         self._baseline = baseline
         if self._sound and baseline is not None and scan.whole:
             zeroed = np.subtract(scan.counts, baseline.counts, dtype=np.float32)
+            if self._mounting is not None:
+                zeroed = self._mounting.correct(zeroed)
             np.abs(zeroed, out=self._size)
             largest = float(self._size.max())
             # Where nothing touches: near its rest no taxel is far, or at an end that is not its rest. Where something
@@ -120,12 +134,14 @@ class TaxelWatch:
                 and not self._may_be_far(zeroed, largest)
             ):
                 np.copyto(self.held, scan.counts)
+                self._whole_ns = scan.time_ns
                 return zeroed
         ends = self._find_saturated(scan, baseline)
         zeroed = None
         if not ends and self._sound and scan.whole:
             np.copyto(self.held, scan.counts)
-            zeroed = None if baseline is None else deformation(scan.counts, baseline)
+            self._whole_ns = scan.time_ns
+            zeroed = None if baseline is None else deformation(scan.counts, baseline, self._mounting)
             if zeroed is None:
                 return zeroed
             np.abs(zeroed, out=self._size)
@@ -135,7 +151,7 @@ class TaxelWatch:
         self._heard |= read
         np.copyto(self.held, scan.counts, where=read)
         if baseline is not None:
-            zeroed = deformation(self.held, baseline)
+            zeroed = deformation(self.held, baseline, self._mounting)
         self._judge(scan, read, zeroed)
         return zeroed
 
@@ -199,6 +215,7 @@ class TaxelWatch:
     def _judge(self, scan: Scan, read: NDArray[np.bool_], zeroed: NDArray[np.float32] | None) -> None:
         self._age += 1
         self._age[read] = 0
+        self._read_ns[read] = scan.time_ns
         # A scan in which few are new says nothing about one that is not: the adapter repeats itself.
         if 4 * np.count_nonzero(scan.renewed) >= np.count_nonzero(~self.dead) > 0:
             self._still += scan.fresh & ~scan.renewed
@@ -211,7 +228,8 @@ class TaxelWatch:
         fault[self._unzeroed] = UNZEROED
         fault[self._far >= FAR_SCANS] = FAR
         fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS)] = STUCK
-        gone = self._age > HOLD_SCANS
+        held_ns = scan.time_ns - np.maximum(self._read_ns, self._whole_ns)
+        gone = (self._age > HOLD_SCANS) | (self._heard & (self._age > 0) & (held_ns > HOLD_NS))
         fault[gone] = SILENT
         fault[gone & self._saturated] = SATURATED
 

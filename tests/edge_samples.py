@@ -9,7 +9,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
+from edge.sinks.base import Sink
 from firmware_bridge.baseline import Baseline
+from firmware_bridge.links.base import Link
 from firmware_bridge.scan import ABSENT, Scan
 
 ROOT = Path(__file__).parent.parent
@@ -162,7 +164,7 @@ class FakeModel:
         return np.stack(patterns)
 
 
-class FakeLink:
+class FakeLink(Link):
     """Gives one batch of scans at each read, waiting where a batch is an event; then ends, or fails."""
 
     def __init__(self, batches, *, error: Exception | None = None, kind="device", endless: bool = False) -> None:
@@ -204,12 +206,13 @@ class FakeLink:
         return {"scans": self._given}
 
 
-class ListSink:
+class ListSink(Sink):
     """Keeps what it gets."""
 
     def __init__(self, on_write=lambda result: None) -> None:
         self.results = []
         self.counters = []
+        self.events = []
         self.waits = 0
         self.closed = False
         self._on_write = on_write
@@ -218,6 +221,9 @@ class ListSink:
         self.results.append(result)
         self.counters.append(dict(counters))
         self._on_write(result)
+
+    def tell(self, event, counters) -> None:
+        self.events.append(event)
 
     def wait(self) -> None:
         self.waits += 1

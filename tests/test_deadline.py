@@ -7,7 +7,7 @@ import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from test_pump import run, scans
 
-from edge.deadline import FEWEST_INTERVALS, Deadline
+from edge.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
 from edge.runtime import Runtime
 from edge.statistics import Statistics
 
@@ -27,6 +27,14 @@ def test_the_period_is_the_median_of_what_came():
     assert followed([10] * FEWEST_INTERVALS).period_ns == 10 * MS
     assert followed([9, 11, 10, 10, 900, 10, 1, 9, 11]).period_ns == 10 * MS
     assert followed([20] * 40 + [5] * 31).period_ns == 5 * MS
+
+
+def test_scans_that_were_held_up_and_come_in_a_burst_change_no_period():
+    assert followed([10] * 40 + [400] + [0.3] * 39 + [10] * 5).period_ns == 10 * MS
+
+
+def test_a_sensor_that_has_become_much_faster_is_believed_in_the_end():
+    assert followed([10] * 40 + [0.5] * (LONGEST_BURST + 40)).period_ns == MS // 2
 
 
 def test_scans_of_one_read_are_no_interval():

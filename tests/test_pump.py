@@ -1,15 +1,19 @@
 import itertools
 import threading
+import time
 
 import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
 
+from edge.commands import RESET
 from edge.errors import SinkClosedError
-from edge.pump import ScanReader, pump
+from edge.pump import pump
+from edge.reader import ScanReader
 from edge.runtime import Runtime
 from edge.statistics import Statistics
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import LinkLostError
+from firmware_bridge.links.base import Notice
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
 
@@ -165,7 +169,7 @@ class Script:
         self._polls = itertools.count()
 
     def poll(self):
-        return ["reset"] if next(self._polls) in self._at else []
+        return [RESET] if next(self._polls) in self._at else []
 
 
 def test_a_reset_command_resets_the_runtime():
@@ -198,3 +202,40 @@ def test_a_scan_wakes_who_waits_for_it():
 def test_reader_gives_nothing_after_the_timeout():
     with ScanReader(FakeLink([], endless=True)) as reader:
         assert reader.take(0.01) == []
+
+
+class Telling(FakeLink):
+    """Has one notice to tell, at a given read."""
+
+    def __init__(self, batches, at, kind):
+        super().__init__(batches)
+        self._at, self._kind = at, kind
+
+    def notices(self):
+        return [Notice(0, self._kind, "fake", "told")] if self.reads == self._at else []
+
+
+@pytest.mark.parametrize("kind", ["lost", "silent", "back", "trouble", "well"])
+def test_what_a_link_tells_reaches_runtime_and_sinks_in_its_place(kind):
+    batches = [[scan] for scan in scans(range(10))]
+    order = []
+    runtime = Runtime(FakeModel(), source="device", baselines=BASELINES)
+    runtime.lose_touch = lambda sensors: order.append("lost touch")
+    sink = ListSink(on_write=lambda result: order.append(result.scan.number))
+    sink.tell = lambda event, counters: order.append((event.kind, event.text))
+    statistics = run(Telling(batches, 5, kind), sink, runtime=runtime)
+    touch = ["lost touch"] if kind in ("lost", "silent", "back") else []
+    assert order == [0, 1, 2, 3, *touch, (kind, "told"), *range(4, 10)]
+    assert statistics.events == {kind: 1}
+
+
+def test_a_notice_is_not_thrown_away_with_scans_that_nobody_took():
+    link = Telling([[scan] for scan in scans(range(9))], 1, "lost")
+    with ScanReader(link, capacity_scans=4) as reader:
+        while not link.ended:
+            time.sleep(0.001)
+        taken = []
+        while (some := reader.take(10)) is not None:
+            taken += some
+    assert [heard.kind for heard in taken if isinstance(heard, Notice)] == ["lost"]
+    assert reader.overruns + len(taken) - 1 == 9

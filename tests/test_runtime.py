@@ -14,6 +14,7 @@ from edge.session import ModelSession
 from edge.taxels import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
+from firmware_bridge.mounting import Mounting
 
 PRESS = 3000
 
@@ -424,3 +425,58 @@ def test_two_scans_of_one_sensor_in_one_call_get_patterns_of_their_own():
         [(make_scan(0, press_counts=3000), True), (make_scan(1, press_counts=6000), True)]
     )
     assert second.pattern.max() == pytest.approx(2 * first.pattern.max())
+
+
+class TestLoseTouch:
+    def pressed(self, *, then):
+        """A tap, whatever happens then, and a torn scan."""
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        for number in range(10):
+            runtime.push(make_scan(number, press_counts=3000))
+        later_ns = then(runtime)
+        torn = make_scan(10, press_counts=3000, absent=(0, 5))
+        return runtime.push(dataclasses.replace(torn, time_ns=torn.time_ns + later_ns))
+
+    def test_a_taxel_that_is_missing_now_and_then_is_held(self):
+        assert self.pressed(then=lambda runtime: 0).state == "contact"
+
+    def test_after_the_link_broke_no_reading_from_before_is_used(self):
+        result = self.pressed(then=lambda runtime: runtime.lose_touch() or 0)
+        assert (result.state, result.pattern) == ("incomplete", None)
+
+    def test_after_a_second_without_a_scan_neither(self):
+        assert self.pressed(then=lambda runtime: 1_100_000_000).state == "incomplete"
+
+    def test_only_of_the_link_that_broke(self):
+        assert self.pressed(then=lambda runtime: runtime.lose_touch("left/") or 0).state == "contact"
+
+    def test_taps_from_before_are_forgotten(self):
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        for number, press in enumerate([3000, 3000, 0, 0, 3000]):
+            before = runtime.push(make_scan(number, press_counts=press))
+        assert before.taps_used == 2
+        runtime.lose_touch()
+        assert runtime.push(make_scan(5, press_counts=3000)).taps_used == 1
+
+
+def test_a_reading_that_lay_about_is_told():
+    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+    notes = []
+    for number, delay_ns in enumerate([0, 50_000_000, 50_000_001, 0]):
+        scan = make_scan(number, press_counts=3000)
+        notes.append(runtime.push(dataclasses.replace(scan, device_ns=scan.time_ns - delay_ns)).note)
+    assert notes == [None, None, "this reading was 0.05 s old when it came", None]
+
+
+def test_a_sensor_that_the_sensor_file_does_not_know_is_told():
+    mountings = {"4": Mounting(), "6": Mounting()}
+    runtime = Runtime(FakeModel(), source="device", baselines={"left/4": BASELINE}, mountings=mountings)
+    result = runtime.push(make_scan(0, sensor="left/4"))
+    assert result.note == "the sensor file knows no sensor left/4, only 4, 6: taken as wired"
+    assert "sensor file" not in (runtime.push(make_scan(0)).note or "")
+
+
+def test_zeroing_before_any_sensor_was_heard_is_refused_and_said():
+    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+    runtime.zero()
+    assert runtime.push(make_scan(0)).event == "zeroing refused: no sensor was heard yet"

@@ -1,4 +1,5 @@
 import contextlib
+import fcntl
 import io
 import json
 import os
@@ -6,25 +7,31 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, ROOT, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, PERIOD_NS, ROOT, FakeModel, ListSink, make_contract, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import SinkClosedError, SinkError, UsageError
+from edge.event import Event
 from edge.runtime import Runtime
 from edge.sinks import npz
+from edge.sinks.fan import Fan
 from edge.sinks.forms import FORMS, open_sink
 from edge.sinks.jsonl import JsonLinesSink, record_line
+from edge.sinks.messages import MessageSink
 from edge.sinks.npz import NpzSink, gather, parts_dir
+from edge.sinks.room import has_room
 from edge.sinks.status import StatusSink
+from firmware_bridge.errors import LinkLostError
 from firmware_bridge.recording import load_recording
-from firmware_bridge.scan import ABSENT
+from firmware_bridge.scan import ABSENT, VendorReading
 
 SHAPES = ((3, 4, 4), (40, 40))
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
@@ -85,7 +92,8 @@ class TestJsonLines:
         for result in results:
             sink.write(result, RUN)
         sink.close()
-        assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, RUN) for result in results)
+        counters = RUN | {"unwritten": 0}
+        assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, counters) for result in results)
 
     def test_a_record_says_all_of_a_contact(self):
         ticks = iter([0, 123_456])
@@ -107,6 +115,7 @@ class TestJsonLines:
         assert record.pop("deviation") is None
         assert record == {
             "time_ns": 8 * PERIOD_NS,
+            "device_time_ns": None,
             "sensor": "4",
             "scan": 7,
             "source": "emulated",
@@ -127,6 +136,7 @@ class TestJsonLines:
             "baseline": BASELINE.id,
             "baseline_origin": "file",
             "baseline_age_s": 12.3,
+            "drift_counts": {"common": [0.0, 0.0, 0.0], "own": 0.0, "step": 0.0},
             "model": "fake",
             "dead": {},
             "filled": None,
@@ -142,7 +152,13 @@ class TestJsonLines:
         absent = "contact force_counts force_n area_mm2 centroid_mm interval_mm run_time_us pattern deviation"
         for name in absent.split():
             assert record[name] is None
-        assert record["baseline"] is record["baseline_age_s"] is record["baseline_origin"] is None
+        assert (
+            record["baseline"]
+            is record["baseline_age_s"]
+            is record["baseline_origin"]
+            is record["drift_counts"]
+            is None
+        )
         assert record["state"] == "zeroing" and record["fresh"] == 0xFFFF - 4
         assert [axis[0][2] for axis in record["counts"]] == [None] * 3
         assert ABSENT not in np.array(record["counts"]).ravel().tolist()
@@ -155,6 +171,19 @@ class TestJsonLines:
         assert record["pattern"] != record["deviation"]
         assert record["interval_mm"] == pytest.approx(1.6 * 0.04, abs=1e-3)
         assert record["interval_mm"] == round(result.interval_mm, 5)
+
+    def test_what_the_vendor_says_is_told_where_it_does(self):
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        newtons = np.full((3, 4, 4), 0.125, dtype=np.float32)
+        vendor = VendorReading(newtons, np.array([[300.0, np.nan] * 2] * 4, dtype=np.float32))
+        record = json.loads(record_line(runtime.push(replace(make_scan(), vendor=vendor)), {}))
+        assert (record["vendor_force_n"], record["temperature_k"], record["force_n"]) == ([2.0, 2.0, 2.0], 300.0, 2.0)
+        record = json.loads(record_line(runtime.push(replace(make_scan(1, absent=(2,)), vendor=vendor)), {}))
+        assert "vendor_force_n" not in record and record["force_n"] is None
+        record = json.loads(record_line(runtime.push(make_scan(2)), {}))
+        assert not {"vendor_force_n", "temperature_k"} & set(record)
+        calibrated = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, counts_per_newton=100.0)
+        assert calibrated.push(replace(make_scan(press_counts=50), vendor=vendor)).force_n == 0.5  # the user's own wins
 
     @settings(max_examples=50, deadline=None)
     @given(st.lists(st.floats(-(2.0**99), 2.0**99, width=32, allow_subnormal=False), min_size=4, max_size=4))
@@ -199,6 +228,163 @@ class TestJsonLines:
         with pytest.raises(SinkClosedError, match="has gone"):
             sink.write(make_results(1)[0], {})
         sink.close()
+
+    def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"))
+        sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
+        sink.close()
+        assert json.loads((tmp_path / "out.jsonl").read_text()) == {
+            "time_ns": 5,
+            "sensor": None,
+            "state": "event",
+            "event": "lost",
+            "note": "the cable is out",
+            "counters": {"scans": 3, "unwritten": 0},
+        }
+
+    def test_a_slow_reader_holds_up_nothing_and_what_it_missed_is_counted(self, tmp_path):
+        """Every record is written or counted, and each that is written is whole."""
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+        sink = JsonLinesSink(str(fifo), patient=False)
+        result, written = make_results(3)[4], 300
+        for _ in range(written):
+            sink.write(result, {})  # would wait for ever
+        os.set_blocking(reader, False)
+        lines = b"".join(iter(lambda: _read(reader), b"")).splitlines()
+        assert 10 < len(lines) < written and all(json.loads(line)["scan"] == result.scan.number for line in lines)
+        assert sink.unwritten == written - len(lines)
+        sink.write(result, {"unwritten": 10**6})  # of other readers
+        assert json.loads(os.read(reader, 1 << 20))["counters"]["unwritten"] == written - len(lines)
+        sink.close()
+        os.close(reader)
+
+    def test_a_pipe_that_is_smaller_than_a_record_still_takes_it_from_a_reader_that_keeps_up(self, tmp_path):
+        read_end, write_end = os.pipe()
+        fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
+        assert has_room(write_end, 25_000)
+        os.write(write_end, b"1")
+        assert not has_room(write_end, 25_000)
+        os.close(read_end)
+        os.close(write_end)
+
+    def test_a_fifo_that_nobody_reads_is_refused_rather_than_waited_for(self, tmp_path):
+        os.mkfifo(tmp_path / "fifo")
+        with pytest.raises(SinkError, match=r"nobody reads \S+/fifo: start its reader first"):
+            JsonLinesSink(str(tmp_path / "fifo"))
+
+    def test_a_recording_is_waited_for(self, tmp_path):
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+        sink, result = JsonLinesSink(str(fifo)), make_results(3)[4]
+        got, lines = [], 300
+
+        def read():
+            os.set_blocking(reader, True)
+            while data := os.read(reader, 1 << 16):
+                got.append(data)
+
+        thread = threading.Thread(target=read)
+        thread.start()
+        for _ in range(lines):
+            sink.write(result, {})
+        sink.close()
+        thread.join()
+        os.close(reader)
+        assert b"".join(got).count(b"\n") == lines
+
+
+def _read(descriptor):
+    try:
+        return os.read(descriptor, 1 << 20)
+    except BlockingIOError:
+        return b""
+
+
+class TestFan:
+    class Failing(ListSink):
+        def __init__(self, error):
+            super().__init__(on_write=self.fail)
+            self.error = error
+
+        def fail(self, result):
+            if self.error is not None:
+                raise self.error
+
+    def test_a_sink_that_fails_is_given_up_with_a_message_and_the_others_go_on(self):
+        told = []
+        fan, good, bad = Fan(told.append, lambda: 7), ListSink(), self.Failing(SinkError("disk full"))
+        for sink in (bad, good):
+            fan.add(sink)
+        results = make_results(2)
+        for result in results:
+            fan.write(result, RUN)
+        assert good.results == results and len(bad.results) == 1 and bad.closed
+        assert told == good.events == [Event(7, "sink", None, "disk full; the other sinks go on")]
+        with pytest.raises(SinkError, match="disk full"):
+            fan.close()
+        assert good.closed
+
+    def test_two_that_fail_together_leave_the_third(self):
+        for acts in (
+            lambda fan: fan.write(make_results(1)[0], RUN),
+            lambda fan: fan.tell(Event(0, "lost", None, ""), RUN),
+        ):
+            fan, good = Fan(lambda event: None), ListSink()
+            full = [JsonLinesSink("/dev/full") for _ in range(2)]
+            for sink in (*full, good):
+                fan.add(sink)
+            acts(fan)
+            fan.write(make_results(1)[0], RUN)
+            assert len(good.results) >= 1 and len(fan.failures) == 2
+
+    def test_what_ended_the_run_is_told_rather_than_a_sink_that_failed_before(self):
+        fan = Fan(lambda event: None)
+        for sink in (self.Failing(SinkError("disk full")), ListSink()):
+            fan.add(sink)
+        fan.write(make_results(1)[0], RUN)
+        with pytest.raises(LinkLostError, match="gone"), contextlib.ExitStack() as closing:
+            closing.callback(fan.close)
+            raise LinkLostError("gone")
+
+    def test_the_last_to_fail_ends_it(self):
+        fan = Fan(lambda event: None)
+        fan.add(self.Failing(SinkError("disk full")))
+        with pytest.raises(SinkError, match="disk full"):
+            fan.write(make_results(1)[0], RUN)
+
+    def test_readers_that_go_are_an_ordinary_end_of_the_last_sink_alone(self):
+        fan = Fan(lambda event: None)
+        first, second = (self.Failing(SinkClosedError(name)) for name in "ab")
+        second.error = None
+        fan.add(first)
+        fan.add(second)
+        fan.write(make_results(1)[0], RUN)
+        second.error = SinkClosedError("b")
+        with pytest.raises(SinkClosedError, match="b"):
+            fan.write(make_results(1)[0], RUN)
+        fan.close()
+
+    def test_one_that_cannot_be_finished_hinders_no_other(self):
+        class Unfinished(ListSink):
+            def close(self):
+                raise SinkError("no room")
+
+        fan, good = Fan(lambda event: None), ListSink()
+        for sink in (Unfinished(), good):
+            fan.add(sink)
+        with pytest.raises(SinkError, match="no room"):
+            fan.close()
+        assert good.closed
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_events_are_lines_on_stderr(terminal):
+    stream = Terminal() if terminal else io.StringIO()
+    MessageSink(stream).tell(Event(0, "lost", None, "the cable is out"), {})
+    assert stream.getvalue() == ("\r\x1b[K" if terminal else "") + "edge-sr: the cable is out\n"
 
 
 class TestNpz:
@@ -270,29 +456,28 @@ class TestNpz:
         NpzSink(path, *SHAPES).close()
         assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
-    def test_memory_stays_flat(self, tmp_path):
-        """No row is kept: the sink's own arrays are all there is, and the rest lies on disk."""
+    def test_every_row_is_on_disk_as_soon_as_written_and_none_is_kept(self, tmp_path):
         sink = NpzSink(tmp_path / "out.npz", *SHAPES)
         result = make_results(3)[4]
-        for _ in range(npz.FLUSH_SCANS):
+        for count in range(1, 4):
             sink.write(result, {})
-        size = (parts_dir(tmp_path / "out.npz") / "pattern").stat().st_size
-        assert size == npz.FLUSH_SCANS * 40 * 40 * 4
+            size = (parts_dir(tmp_path / "out.npz") / npz.ROWS).stat().st_size
+            assert size % count == 0 and 40 * 40 * 4 < size // count < 40 * 40 * 4 + 2000
         sink.close()
 
-    def test_after_a_crash_the_parts_make_the_npz(self, tmp_path):
+    def test_kill_9_costs_no_whole_scan(self, tmp_path):
         path = tmp_path / "out.npz"
         results = make_results()
         script = (
             "import os, sys; sys.path.insert(0, 'tests'); from test_sinks import *\n"
             "sink = NpzSink(Path(sys.argv[1]), *SHAPES)\n"
             "for result in make_results(): sink.write(result, {})\n"
-            "sink._flush(); sink.write(make_results(1)[0], {}); os.kill(os.getpid(), 9)"
+            "os.kill(os.getpid(), 9)"
         )
         done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=ROOT, timeout=60)
         assert done.returncode == -signal.SIGKILL and not path.exists()
-        with (parts_dir(path) / "scan").open("ab") as part:
-            part.write(b"\1" * 13)  # a row and a half that the other parts do not have
+        with (parts_dir(path) / npz.ROWS).open("ab") as rows:
+            rows.write(b"\1" * 1300)  # of one more, half
         with pytest.raises(SinkError, match=r"not finished: `python -m edge.sinks.npz .*out.npz` makes the .npz"):
             NpzSink(path, *SHAPES)
         done = subprocess.run(
@@ -304,10 +489,32 @@ class TestNpz:
         assert len(zipfile.ZipFile(path).read("scan.npy")) == 128 + 8 * len(results), "nothing hangs on behind"
         assert not parts_dir(path).exists()
 
+    def test_a_row_of_which_the_disk_takes_a_part_is_gone_on_with(self, tmp_path):
+        """Else what is written once there is room again would lie between the rows."""
+        sink = NpzSink(tmp_path / "out.npz", *SHAPES)
+        rows, sizes = sink._rows, []
+
+        class Stubborn:
+            close = rows.close
+
+            def write(self, data):
+                sizes.append(len(data))
+                return rows.write(data[: len(data) // 2 + 1])
+
+        sink._rows = Stubborn()
+        results = make_results(2)
+        for result in results:
+            sink.write(result, {})
+        sink.close()
+        assert len(sizes) > 2 * len(results)
+        counts = np.stack([result.scan.counts for result in results])
+        np.testing.assert_array_equal(np.load(tmp_path / "out.npz")["counts"], counts)
+
     def test_gathering_what_is_not_there_is_told(self, tmp_path, capsys):
         assert npz.main([str(tmp_path / "none.npz")]) == 1
         assert "none.npz.parts: No such file" in capsys.readouterr().err
-        assert npz.main([]) == 2
+        with pytest.raises(SystemExit):
+            npz.main([])
         NpzSink(tmp_path / "empty.npz", *SHAPES)
         with pytest.raises(SinkError, match=r"^\S+/empty.npz.parts holds no scan: delete it$"):
             gather(tmp_path / "empty.npz")
@@ -339,11 +546,12 @@ class TestNpz:
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         try:
             if when == "writing":
-                resource.setrlimit(resource.RLIMIT_FSIZE, (20 * 6400, limits[1]))
+                sink.write(result, {})
+                row_bytes = (parts_dir(path) / npz.ROWS).stat().st_size
+                resource.setrlimit(resource.RLIMIT_FSIZE, (20 * row_bytes + 100, limits[1]))
             with pytest.raises(SinkError, match=r"File too large.*python -m edge.sinks.npz"):
                 for _ in range(50):
                     sink.write(result, {})
-                    sink._flush()
                 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
                 sink.close()
             sink.close() if when == "writing" else None
@@ -353,18 +561,6 @@ class TestNpz:
         assert gather(path) == (20 if when == "writing" else 50)
         assert zipfile.ZipFile(path).testzip() is None
 
-    def test_rows_reach_the_disk_in_time_and_what_fails_fails_once(self, tmp_path):
-        sink = NpzSink(tmp_path / "out.npz", *SHAPES)
-        sink._files["scan"].close()
-        sink._files["scan"] = io.BufferedWriter(io.FileIO("/dev/full", "w"))
-        result = make_results(1)[0]
-        for _ in range(npz.FLUSH_SCANS - 1):
-            sink.write(result, {})
-        with pytest.raises(SinkError, match="No space left"):
-            sink.write(result, {})
-        sink.close()
-        assert parts_dir(tmp_path / "out.npz").exists()
-
 
 class Terminal(io.StringIO):
     def isatty(self):
@@ -372,6 +568,15 @@ class Terminal(io.StringIO):
 
 
 class TestStatus:
+    def test_a_finger_that_is_silent_does_not_stand_there_as_if_it_were_not(self):
+        now_s = [0.0]
+        sink = StatusSink(Terminal(), clock_s=lambda: now_s[0], columns=lambda: 200)
+        for result in make_results(1):
+            sink.write(result, {})
+        now_s[0] = 2.0
+        sink.write(make_results(2)[2], {})
+        assert "6 no scan for 2 s" in sink.line() and "4 no scan" not in sink.line()
+
     def make(self, columns=200, **settings):
         self.now_s = 0.0
         self.stream = Terminal()

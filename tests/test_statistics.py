@@ -4,6 +4,7 @@ from edge_samples import BASELINE, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.event import Event
 from edge.result import Result
 from edge.statistics import Histogram, Statistics
 
@@ -76,20 +77,23 @@ def test_summary_tells_all_of_it():
     statistics.add(zeroed)
     statistics.overruns = 7
     statistics.commands_refused = 2
+    for kind in ("lost", "back", "lost"):
+        statistics.tell(Event(0, kind, None, ""))
     text = statistics.summary(source="EMULATED demo", wanted_rate_hz=100)
     assert text.splitlines() == [
-        "EMULATED demo: 4 scans, 3 patterns (0 reused), 0 dropped, 7 overrun",
+        "EMULATED demo: 4 scans, 3 patterns (0 reused), 0 dropped, 7 overrun, 0 missed",
         "torn: 3 on the wire, 0 renewed in part; 0 repeated",
         "run time: p50 200 us, p99 200 us, max 200 us",
         "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
         f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
+        "events: lost 2, back 1",
         "stdin: 2 lines were no command",
     ]
 
 
 def test_summary_of_nothing():
     assert Statistics().summary(source="x").splitlines() == [
-        "x: 0 scans, 0 patterns (0 reused), 0 dropped, 0 overrun",
+        "x: 0 scans, 0 patterns (0 reused), 0 dropped, 0 overrun, 0 missed",
         "torn: 0 on the wire, 0 renewed in part; 0 repeated",
     ]
 

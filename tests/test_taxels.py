@@ -12,6 +12,7 @@ from edge.taxels import (
     BACK_SCANS,
     FAR_SCANS,
     FROZEN_SCANS,
+    HOLD_NS,
     HOLD_SCANS,
     LONE_COUNTS,
     REST_COUNTS,
@@ -244,3 +245,22 @@ def test_one_at_its_end_among_others_that_are_pressed_is_held_from_the_first_sca
     pad.read(1, press, at_the_end)
     assert pad.watch.held[2, 1, 1] == before
     assert "its last reading is held, taxel 5 at the end of its range" in (pad.watch.note(None) or "")
+
+
+@pytest.mark.parametrize(("pause_ns", "held"), [(HOLD_NS, True), (HOLD_NS + 1, False)])
+@pytest.mark.parametrize("torn_before", [False, True])
+def test_a_reading_from_before_a_pause_is_not_held(pause_ns, held, torn_before):
+    """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: what was pressed before is another press."""
+    watch, series = TaxelWatch((4, 4)), ScanSeries("4", USPA44)
+    missing = REST.copy()
+    missing[:, 1, 3] = ABSENT
+
+    def push(number, counts, time_ns):
+        watch.push(series.close((counts + number * (counts != ABSENT)).astype(np.int32), time_ns), BASELINE)
+
+    for number in range(3):
+        other = REST.copy()
+        other[:, 0, 0] = ABSENT if torn_before and number == 1 else REST[:, 0, 0]
+        push(number, other, number * PERIOD_NS)
+    push(3, missing, 2 * PERIOD_NS + pause_ns)
+    assert watch.reasons == ({} if held else {7: "silent"})

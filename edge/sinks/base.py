@@ -3,11 +3,20 @@
 from collections.abc import Mapping
 from typing import Protocol
 
+from edge.event import Event
 from edge.result import Result
 
 
 class Sink(Protocol):
-    """Where results go. Inherit it to get what is optional."""
+    """Where results go. Inherit it to get what is optional.
+
+    Attributes:
+        unwritten: records left out so far, because whoever reads them is too slow.
+    """
+
+    @property
+    def unwritten(self) -> int:  # noqa: D102 - above
+        return 0
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Take one result, and what was received, dropped and lost up to it.
@@ -17,6 +26,14 @@ class Sink(Protocol):
             SinkClosedError: its reader has gone.
         """
         ...
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Take what happened beside scans, and the counters up to then.
+
+        Raises:
+            SinkError: it cannot be written.
+            SinkClosedError: its reader has gone.
+        """
 
     def wait(self) -> None:
         """Called several times a second while no scan comes."""

@@ -10,8 +10,13 @@ from edge.sinks.base import Sink
 FORMS: Final = ("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz")
 
 
-def open_sink(text: str, contract: Contract) -> Sink:
-    """Open the sink that `text` names; `contract` says which maps will come, and their shapes.
+def open_sink(text: str, contract: Contract, *, patient: bool = True) -> Sink:
+    """Open the sink that `text` names.
+
+    Args:
+        text: one of FORMS.
+        contract: says which maps will come, and their shapes.
+        patient: wait for slow readers, rather than leave records out.
 
     Raises:
         UsageError: no such form; the forms are listed.
@@ -26,7 +31,7 @@ def open_sink(text: str, contract: Contract) -> Sink:
     if form == "jsonl" and target:
         from edge.sinks.jsonl import JsonLinesSink
 
-        return JsonLinesSink(target)
+        return JsonLinesSink(target, patient=patient)
     if form == "npz" and target.endswith(".npz"):
         from edge.sinks.npz import NpzSink
 

@@ -1,5 +1,6 @@
 """One JSON record a line, flushed as it is written, since a robot reads it live."""
 
+import errno
 import os
 import sys
 from collections.abc import Mapping
@@ -12,8 +13,11 @@ import orjson
 from numpy.typing import NDArray
 
 from edge.errors import SinkClosedError, SinkError
+from edge.event import Event
 from edge.result import Result, mask_bits
 from edge.sinks.base import Sink
+from edge.sinks.room import has_room, widen
+from firmware_bridge.drift import Drift
 from firmware_bridge.scan import Scan
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
@@ -22,24 +26,53 @@ _DECIMALS: Final = 7
 
 
 class JsonLinesSink(Sink):
-    """Writes records into a file, or with "-" to stdout."""
+    """Writes records into a file, or with "-" to stdout.
 
-    def __init__(self, target: str) -> None:
+    Where a robot waits, a reader that is too slow for a pipe must hold up nothing: its records are left out, counted,
+    and told in the first it takes again.
+    """
+
+    def __init__(self, target: str, *, patient: bool = True) -> None:
         """Open the target; a file that exists is replaced.
+
+        Args:
+            target: path, or "-".
+            patient: wait for a slow reader, rather than leave records out.
 
         Raises:
             SinkError: it cannot be opened.
         """
         self._target = "stdout" if target == "-" else target
+        self._patient = patient
+        self._unwritten = 0
         try:
             self._file = _open(target)
         except OSError as error:
+            if error.errno == errno.ENXIO:
+                raise SinkError(f"nobody reads {self._target}: start its reader first") from error
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
+        if not patient:
+            widen(self._file.fileno())
+
+    @property
+    def unwritten(self) -> int:
+        """Records left out so far."""
+        return self._unwritten
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Write one record."""
+        """Write one record; of what sinks left out it tells its own reader's."""
+        self._write(record_line(result, {**counters, "unwritten": self._unwritten}))
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Write a record of an event."""
+        self._write(event_line(event, {**counters, "unwritten": self._unwritten}))
+
+    def _write(self, line: bytes) -> None:
+        if not self._patient and not has_room(self._file.fileno(), len(line)):
+            self._unwritten += 1
+            return
         try:
-            self._file.write(record_line(result, counters))
+            self._file.write(line)
             self._file.flush()
         except BrokenPipeError as error:
             raise SinkClosedError(f"the reader of {self._target} has gone") from error
@@ -60,6 +93,7 @@ def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
     scan, baseline = result.scan, result.baseline
     record: dict[str, Any] = {
         "time_ns": scan.time_ns,
+        "device_time_ns": scan.device_ns,
         "sensor": scan.sensor,
         "scan": scan.number,
         "source": result.source,
@@ -81,6 +115,7 @@ def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
         "baseline": None if baseline is None else baseline.id,
         "baseline_origin": None if baseline is None else baseline.origin,
         "baseline_age_s": _rounded(result.baseline_age_s, 1),
+        "drift_counts": _drift(result.drift),
         "model": result.model,
         "dead": {str(taxel): reason for taxel, reason in result.dead.items()},
         "filled": result.filled,
@@ -90,8 +125,23 @@ def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
         "counts": _readings(scan),
         "pattern_unit": result.pattern_unit,
     }
+    if scan.vendor is not None:
+        record |= _vendor(scan)
     record["pattern"], record["deviation"] = _map(result.pattern), _map(result.deviation)
     return orjson.dumps(record, option=_OPTIONS)
+
+
+def event_line(event: Event, counters: Mapping[str, int]) -> bytes:
+    """An event as one line of JSON, told apart from results by its state."""
+    record = {
+        "time_ns": event.time_ns,
+        "sensor": event.sensor,
+        "state": "event",
+        "event": event.kind,
+        "note": event.text,
+        "counters": dict(counters),
+    }
+    return orjson.dumps(record, option=orjson.OPT_APPEND_NEWLINE)
 
 
 def _readings(scan: Scan) -> NDArray[np.int32] | list[list[list[int | None]]]:
@@ -100,6 +150,26 @@ def _readings(scan: Scan) -> NDArray[np.int32] | list[list[list[int | None]]]:
     readings = scan.counts.astype(object)
     readings[:, ~scan.fresh] = None
     return readings.tolist()
+
+
+def _vendor(scan: Scan) -> dict[str, list[float] | float]:
+    """What the vendor's software says, as far as it does: force x, y, z on the pad, and its mean temperature."""
+    said: dict[str, list[float] | float] = {}
+    if scan.vendor_force_n is not None:
+        said["vendor_force_n"] = [round(force, 4) for force in scan.vendor_force_n]
+    if scan.vendor is not None and scan.vendor.temperature_k is not None:
+        said["temperature_k"] = round(float(np.nanmean(scan.vendor.temperature_k)), 2)
+    return said
+
+
+def _drift(drift: Drift | None) -> dict[str, Any] | None:
+    if drift is None:
+        return None
+    return {
+        "common": [round(counts, 2) for counts in drift.common_counts],
+        "own": round(drift.own_counts, 2),
+        "step": round(drift.step_counts, 1),
+    }
 
 
 def _rounded(value: float | None, decimals: int) -> float | None:
@@ -111,9 +181,14 @@ def _map(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
 
 
 def _open(target: str) -> BufferedWriter:
-    if target != "-":
-        return Path(target).open("wb")
-    if sys.stdout is None:
-        raise OSError(0, "it is closed")
-    # A writer of our own: what is left in sys.stdout after an error would be tried again at exit.
-    return os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    if target == "-":
+        if sys.stdout is None:
+            raise OSError(0, "it is closed")
+        # A writer of our own: what is left in sys.stdout after an error would be tried again at exit.
+        return os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    path = Path(target)
+    if not path.is_fifo():
+        return path.open("wb")
+    descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # else it would wait for a reader, however long
+    os.set_blocking(descriptor, True)
+    return os.fdopen(descriptor, "wb")

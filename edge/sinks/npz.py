@@ -1,18 +1,18 @@
 """Scans and patterns in one .npz, which `--source replay:` plays again.
 
-A zip archive cannot be written side by side, so while the run lasts each array grows in a file of
-its own in `FILE.npz.parts`; closing gathers them. Memory stays flat however long the run is, and
-after a crash the parts are still there: `python -m edge.sinks.npz FILE.npz` gathers them then.
+A zip archive cannot be written side by side, so while the run lasts a row a scan grows in `FILE.npz.parts`; closing
+turns rows into arrays. Memory stays flat however long the run is. Each row is written at once, so that a crash, or
+kill -9, costs no scan that was recorded: `python -m edge.sinks.npz FILE.npz` makes the .npz then.
 """
 
-import contextlib
+import argparse
 import json
 import shutil
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 import numpy as np
 from numpy.lib import format as npy
@@ -24,8 +24,8 @@ from edge.sinks.base import Sink
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 
 LAYOUT: Final = "layout.json"
-FLUSH_SCANS: Final = 100
-CHUNK_BYTES: Final = 1 << 20
+ROWS: Final = "rows"
+CHUNK_SCANS: Final = 256
 MODEL_CHARACTERS: Final = 32
 """Of a model's name: files may have longer ones, and a record must not fail for that."""
 
@@ -33,13 +33,13 @@ MODEL_CHARACTERS: Final = 32
 class NpzSink(Sink):
     """Records into `path`, by way of parts beside it.
 
-    Arrays, one row a scan: sensor, scan, time_ns, counts (3, rows, cols; -1 absent), source, state,
-    model, contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros
-    where there is none), deviation (the same, only if the model gives it), interval_mm, expected_rmse_mm
-    and run_time_us (NaN where there is none), another_tap and reused_from (-1 where there is none),
-    dead (bit i: taxel i is not believed), filled (what stood for them, or empty), baseline (its id, or
-    empty), baseline_age_s (NaN without) and baseline_counts (3, rows, cols; NaN without, and where a
-    taxel was not zeroed).
+    Arrays, one row a scan: sensor, scan, time_ns, device_time_ns (-1 unknown), counts (3, rows, cols; -1
+    absent), source, state, model, contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern,
+    pattern (H, W; zeros where there is none), deviation (the same, only if the model gives it), interval_mm,
+    expected_rmse_mm and run_time_us (NaN where there is none), another_tap and reused_from (-1 where there is
+    none), dead (bit i: taxel i is not believed), filled (what stood for them, or empty), baseline (its id, or
+    empty), baseline_age_s (NaN without) and baseline_counts (3, rows, cols, what was subtracted, drift and all;
+    NaN without, and where a taxel was not zeroed).
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class NpzSink(Sink):
             "sensor": ("<U64", ()),
             "scan": ("<i8", ()),
             "time_ns": ("<i8", ()),
+            "device_time_ns": ("<i8", ()),
             "counts": ("<i4", scan_shape),
             "source": ("<U8", ()),
             "state": ("<U10", ()),
@@ -92,7 +93,7 @@ class NpzSink(Sink):
         try:
             parts.mkdir()
             (parts / LAYOUT).write_text(json.dumps(self._layout))
-            self._files: dict[str, IO[bytes]] = {name: (parts / name).open("wb") for name in self._layout}
+            self._rows = (parts / ROWS).open("wb", buffering=0)
         except FileExistsError as error:
             raise SinkError(
                 f"{parts} holds a recording that was not finished: {_remedy(path)}, or delete it"
@@ -107,6 +108,7 @@ class NpzSink(Sink):
             "sensor": scan.sensor,
             "scan": scan.number,
             "time_ns": scan.time_ns,
+            "device_time_ns": -1 if scan.device_ns is None else scan.device_ns,
             "counts": scan.counts,
             "source": result.source,
             "state": result.state,
@@ -128,36 +130,23 @@ class NpzSink(Sink):
             "baseline_age_s": np.nan if result.baseline_age_s is None else result.baseline_age_s,
             "baseline_counts": self._no_baseline if baseline is None else baseline.counts,
         }
-        self._scans += 1
+        data = b"".join(_row_bytes(name, row[name], kind, shape) for name, (kind, shape) in self._layout.items())
         try:
-            for name, (kind, shape) in self._layout.items():
-                self._files[name].write(_row_bytes(name, row[name], kind, shape))
-            if self._scans % FLUSH_SCANS == 0:
-                self._flush()
+            while data:  # a disk that fills takes a part of it, and refuses the rest
+                data = data[self._rows.write(data) :]
         except OSError as error:
             raise self._failure(error) from error
+        self._scans += 1
 
     def close(self) -> None:
-        """Gather the parts. Without a single scan nothing is written."""
-        try:
-            if not self._failed:
-                self._flush()
-        except OSError as error:
-            raise self._failure(error) from error
-        finally:
-            for file in self._files.values():
-                with contextlib.suppress(OSError):  # flushed above, or told as a failure before
-                    file.close()
+        """Make arrays of the rows. Without a single scan nothing is written."""
+        self._rows.close()
         if self._failed:
             return
         if self._scans:
             gather(self._path)
         else:
-            shutil.rmtree(parts_dir(self._path))
-
-    def _flush(self) -> None:
-        for file in self._files.values():
-            file.flush()
+            shutil.rmtree(parts_dir(self._path), ignore_errors=True)
 
     def _failure(self, error: OSError) -> SinkError:
         self._failed = True
@@ -166,37 +155,36 @@ class NpzSink(Sink):
 
 
 def parts_dir(path: Path) -> Path:
-    """Where the arrays of `path` grow."""
+    """Where the rows of `path` grow."""
     return path.with_name(path.name + ".parts")
 
 
 def gather(path: Path) -> int:
-    """Make the .npz of its parts, delete them, and return the number of scans.
+    """Make the .npz of its rows, delete them, and return the number of scans.
 
-    A last row that a crash left in some of the parts only is left out.
+    A last row that a crash left incomplete is left out.
 
     Raises:
-        SinkError: there are no parts, no scans in them, or no room.
+        SinkError: there are no rows, or no room.
     """
     parts, draft = parts_dir(path), path.with_name(path.name + ".draft")
     try:
-        layout = {name: (np.dtype(kind), tuple(shape)) for name, (kind, shape) in _read_layout(parts).items()}
-        row_bytes = {name: dtype.itemsize * int(np.prod(shape)) for name, (dtype, shape) in layout.items()}
-        scans = min((parts / name).stat().st_size // row_bytes[name] for name in layout)
+        row = np.dtype([(name, kind, tuple(shape)) for name, (kind, shape) in _read_layout(parts).items()])
+        scans = (parts / ROWS).stat().st_size // row.itemsize
         if scans == 0:
             raise SinkError(f"{parts} holds no scan: delete it")
+        rows = np.memmap(parts / ROWS, dtype=row, mode="r", shape=scans)
         with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION)):
                 with archive.open(f"{name}.npy", "w") as entry:
                     npy.write_array(entry, np.asarray(value))
-            for name, (dtype, shape) in layout.items():
-                header = {"descr": dtype.str, "fortran_order": False, "shape": (scans, *shape)}
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry, (parts / name).open("rb") as part:
+            for name in row.names or ():
+                column = rows[name]
+                header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     npy.write_array_header_1_0(entry, header)
-                    left = scans * row_bytes[name]
-                    while chunk := part.read(min(left, CHUNK_BYTES)):
-                        entry.write(chunk)
-                        left -= len(chunk)
+                    for start in range(0, scans, CHUNK_SCANS):
+                        entry.write(column[start : start + CHUNK_SCANS].tobytes())
         draft.replace(path)
         shutil.rmtree(parts)
     except OSError as error:
@@ -228,19 +216,19 @@ def _remedy(path: Path) -> str:
     return f"`python -m edge.sinks.npz {path}` makes the .npz of it"
 
 
-def main(arguments: list[str]) -> int:
-    """Gather the parts that a crash left behind; returns an exit code."""
-    if len(arguments) != 1:
-        sys.stderr.write("usage: python -m edge.sinks.npz FILE.npz\n")
-        return 2
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the .npz of what a crash left behind; returns an exit code."""
+    parser = argparse.ArgumentParser(prog="python -m edge.sinks.npz", description=main.__doc__)
+    parser.add_argument("file", type=Path, metavar="FILE.npz", help="what was recorded into")
+    path: Path = parser.parse_args(arguments).file
     try:
-        scans = gather(Path(arguments[0]))
+        scans = gather(path)
     except SinkError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    sys.stdout.write(f"{arguments[0]}: {scans} scans\n")
+    sys.stdout.write(f"{path}: {scans} scans\n")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -33,6 +33,7 @@ class StatusSink(Sink):
         self._rates: dict[str, _Rate] = {}
         self._counters: Mapping[str, int] = {}
         self._last_scan_s = clock_s()
+        self._heard_s: dict[str, float] = {}
         self._last_shown_s: float | None = None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -40,7 +41,7 @@ class StatusSink(Sink):
         self._latest[result.scan.sensor] = result
         self._rates.setdefault(result.scan.sensor, _Rate()).add(result.scan.time_ns)
         self._counters = counters
-        self._last_scan_s = self._clock_s()
+        self._last_scan_s = self._heard_s[result.scan.sensor] = self._clock_s()
         self._refresh()
 
     def wait(self) -> None:
@@ -81,6 +82,7 @@ class StatusSink(Sink):
             "overrun": count("overruns", 0),
             # Of those torn at the source, noise makes one scan in forty of a healthy sensor: not an alarm.
             "torn": count("torn_wire", 0),
+            "unwritten": count("unwritten", 0),
         }
         parts += [f"{number} {name}" for name, number in losses.items() if number]
         zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
@@ -89,11 +91,16 @@ class StatusSink(Sink):
 
     def _sensor_text(self, name: str) -> str:
         result = self._latest[name]
+        silence_s = self._clock_s() - self._heard_s[name]
+        if silence_s >= SILENCE_S and len(self._latest) > 1:
+            return f"{name} no scan for {silence_s:.0f} s"
         words = [name, result.state]
         if result.state in ("zeroing", "incomplete") and result.note is not None:
             return f"{name} {result.note}"
         if result.dead:
             words.append(f"without taxel {','.join(map(str, result.dead))}")
+        if result.drift is not None and result.drift.step_counts:
+            words.append(f"rest off by {result.drift.step_counts:.0f}")
         if result.contact:
             words.append(f"tap {result.taps_used}")
         if result.force_n is not None:

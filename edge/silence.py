@@ -1,0 +1,91 @@
+"""Sensors that fall silent while others go on, and scans that left no trace. No I/O, no clock."""
+
+from collections.abc import Iterable
+from typing import Final
+
+from edge.event import Event
+from firmware_bridge.scan import Scan
+
+SILENT_NS: Final = 500_000_000
+"""Twice the period of the slowest sensor on record."""
+GAP_PERIODS: Final = 1.5
+"""Between two scans; jitter, and the 16 ms for which some adapters hold scans back, make less of 10 ms."""
+
+
+class Silence:
+    """Follows when each sensor was heard.
+
+    The wire numbers no scans: how many are missing between two is told by the sensor's own period, and exact only as
+    far as that is.
+
+    Attributes:
+        missed: scans that did not come, as far as gaps show.
+    """
+
+    def __init__(self, expected: Iterable[str] = ()) -> None:
+        """Begin without a scan; `expected` are names of sensors that there should be."""
+        self.missed = 0
+        self._expected = set(expected)
+        self._first_ns: int | None = None
+        self._last: dict[str, Scan] = {}
+        self._before_gap: dict[str, Scan] = {}
+        self._silent: set[str] = set()
+        self._since_ns: dict[str, int] = {}
+
+    def begin_anew(self, time_ns: int, sensors: str = "") -> None:
+        """A link was away until `time_ns` [ns]: none of its sensors, whose names begin so, was silent before."""
+        self._since_ns[sensors] = time_ns
+
+    def follow(self, scan: Scan, period_ns: int | None) -> Event | None:
+        """Take the next scan of a sensor, whose period is known or not; tells if the sensor is heard again."""
+        before, self._last[scan.sensor] = self._last.get(scan.sensor), scan
+        if before is None:
+            self._expected.discard(scan.sensor)
+            self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
+            return None
+        if period_ns:
+            self._follow_gap(before, scan, period_ns)
+        if scan.sensor in self._silent:
+            self._silent.remove(scan.sensor)
+            away_s = (scan.time_ns - before.time_ns) / 1e9
+            return Event(scan.time_ns, "back", scan.sensor, f"sensor {scan.sensor} is back after {away_s:.1f} s")
+        return None
+
+    def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
+        """Count what is missing behind a gap, once scans come at their pace again: what was late comes in a burst."""
+        gap_ns = _on_bus_ns(scan) - _on_bus_ns(before)
+        start = self._before_gap.get(scan.sensor)
+        if start is not None and period_ns / 2 <= gap_ns <= GAP_PERIODS * period_ns:
+            periods = round((_on_bus_ns(scan) - _on_bus_ns(start)) / period_ns)
+            self.missed += max(periods - (scan.number - start.number), 0)
+            del self._before_gap[scan.sensor]
+        elif start is None and gap_ns > GAP_PERIODS * period_ns:
+            self._before_gap[scan.sensor] = before
+
+    def look(self) -> list[Event]:
+        """Sensors found silent since the last call, while another was heard; of all of them, the link tells."""
+        if len(self._last) + len(self._expected) < 2 or self._first_ns is None:
+            return []
+        newest_ns = max(scan.time_ns for scan in self._last.values())
+        events: list[Event] = []
+        for sensor, scan in self._last.items():
+            if newest_ns - self._heard_ns(sensor, scan.time_ns) > SILENT_NS and sensor not in self._silent:
+                self._silent.add(sensor)
+                events.append(_silent(sensor, newest_ns, newest_ns - scan.time_ns))
+        if self._expected and newest_ns - self._first_ns > SILENT_NS:
+            missing, self._expected = sorted(self._expected), set()
+            events += [_silent(sensor, newest_ns, newest_ns - self._first_ns) for sensor in missing]
+        return events
+
+    def _heard_ns(self, sensor: str, time_ns: int) -> int:
+        since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
+        return max([time_ns, *since_ns])
+
+
+def _silent(sensor: str, now_ns: int, for_ns: int) -> Event:
+    why = "see to its cable and its controller, since others go on"
+    return Event(now_ns, "silent", sensor, f"no scan from sensor {sensor} for {for_ns / 1e9:.1f} s: {why}")
+
+
+def _on_bus_ns(scan: Scan) -> int:
+    return scan.time_ns if scan.device_ns is None else scan.device_ns

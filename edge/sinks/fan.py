@@ -1,0 +1,97 @@
+"""The sinks a user asked for, as one; a sink that fails is given up while the others go on."""
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+
+from edge.errors import SinkClosedError, SinkError
+from edge.event import Event
+from edge.result import Result
+from edge.sinks.base import Sink
+
+
+class Fan(Sink):
+    """Hands everything on to its sinks.
+
+    Attributes:
+        failures: of sinks given up, in their order.
+    """
+
+    def __init__(self, tell: Callable[[Event], object], clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        """Begin without a sink.
+
+        Args:
+            tell: is told of a sink that is given up, before the others.
+            clock_ns: monotonic, in [ns].
+        """
+        self.failures: list[SinkError] = []
+        self._sinks: list[Sink] = []
+        self._given_up_unwritten = 0
+        self._tell = tell
+        self._clock_ns = clock_ns
+
+    def add(self, sink: Sink) -> None:
+        """Take one more sink, which is open; the last to fail ends the run."""
+        self._sinks.append(sink)
+
+    @property
+    def unwritten(self) -> int:
+        """Records left out, of all sinks."""
+        return self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Hand on one result.
+
+        Raises:
+            SinkError: no sink is left; SinkClosedError if none failed and their readers have gone.
+        """
+        self._each(lambda sink: sink.write(result, counters), counters)
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Hand on one event; raises as `write` does."""
+        self._each(lambda sink: sink.tell(event, counters), counters)
+
+    def wait(self) -> None:
+        """Hand on that nothing comes."""
+        for sink in self._sinks:
+            sink.wait()
+
+    def close(self) -> None:
+        """Close what is left, each whatever becomes of the others.
+
+        Raises:
+            SinkError: of the first sink that failed, now or before, unless another error ends the run.
+        """
+        for sink in self._sinks:
+            try:
+                sink.close()
+            except SinkError as error:
+                self.failures.append(error)
+        self._sinks = []
+        if self.failures and sys.exception() is None:  # else what ended the run is what is to be told
+            raise self.failures[0]
+
+    def _each(self, act: Callable[[Sink], None], counters: Mapping[str, int]) -> None:
+        for sink in tuple(self._sinks):
+            if sink not in self._sinks:  # given up meanwhile, when it was told that another was
+                continue
+            try:
+                act(sink)
+            except SinkError as error:
+                self._give_up(sink, error, counters)
+
+    def _give_up(self, sink: Sink, error: SinkError, counters: Mapping[str, int]) -> None:
+        self._sinks.remove(sink)
+        self._given_up_unwritten += sink.unwritten
+        closed = isinstance(error, SinkClosedError)
+        if not closed:
+            self.failures.append(error)
+        try:
+            sink.close()
+        except SinkError as another:
+            self.failures.append(another)
+        if not self._sinks:
+            raise self.failures[0] if self.failures else error
+        event = Event(self._clock_ns(), "sink", None, f"{error}; the other sinks go on")
+        self._tell(event)
+        self.tell(event, counters)

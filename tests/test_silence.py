@@ -1,0 +1,127 @@
+"""Sensors that fall silent, and scans that left no trace."""
+
+from dataclasses import replace
+
+from edge_samples import make_scan
+
+from edge.deadline import Deadline
+from edge.silence import SILENT_NS, Silence
+
+MS = 1_000_000
+PERIOD_NS = 10 * MS
+
+
+def scan(number, time_ms, sensor="4", device_ms=None):
+    device_ns = None if device_ms is None else device_ms * MS
+    return replace(make_scan(number, sensor=sensor), time_ns=time_ms * MS, device_ns=device_ns)
+
+
+def missed(*scans):
+    """Of these and two more at their pace: only behind a gap is it known what was late and what never came."""
+    silence, last = Silence(), scans[-1]
+    after = [
+        replace(
+            last,
+            number=last.number + n,
+            time_ns=last.time_ns + n * PERIOD_NS,
+            device_ns=None if last.device_ns is None else last.device_ns + n * PERIOD_NS,
+        )
+        for n in (1, 2)
+    ]
+    for one in (*scans, *after):
+        silence.follow(one, PERIOD_NS)
+    return silence.missed
+
+
+def test_what_never_came_is_counted_by_the_gap():
+    assert missed(*(scan(n, 10 * n) for n in range(9))) == 0
+    assert missed(scan(0, 0), scan(1, 30)) == 2
+    assert missed(scan(0, 0), scan(1, 3_000)) == 299
+    assert missed(scan(0, 0), scan(1, 30), scan(2, 60)) == 4
+
+
+def test_jitter_is_no_loss():
+    assert missed(scan(0, 0), scan(1, 15), scan(2, 20), scan(3, 35)) == 0
+    assert missed(scan(0, 0), scan(1, 17), scan(2, 20), scan(3, 37), scan(4, 40)) == 0
+
+
+def test_scans_that_were_thrown_away_unseen_are_not_missed_as_well():
+    assert missed(scan(0, 0), scan(8, 100)) == 2
+    assert missed(scan(0, 0), scan(10, 100)) == 0
+
+
+def test_what_was_held_up_and_comes_in_a_burst_was_late_and_not_missed():
+    """Forty scans are held up, two are lost."""
+    silence, deadline = Silence(), Deadline()
+    times_us = [10_000 * n for n in range(100)]
+    times_us += [1_400_000 + 300 * n for n in range(40)]
+    times_us += [10_000 * n for n in range(142, 200)]
+    for number, time_us in enumerate(times_us):
+        deadline.follow(1000 * time_us)
+        silence.follow(replace(scan(number, 0), time_ns=1000 * time_us), deadline.period_ns)
+    assert silence.missed == 2
+
+
+def test_the_device_s_own_time_tells_bursts_from_losses():
+    assert missed(scan(0, 0, device_ms=0), scan(1, 16, device_ms=10)) == 0
+    assert missed(scan(0, 16, device_ms=0), scan(1, 16, device_ms=20)) == 1
+
+
+def test_without_a_period_nobody_knows():
+    silence = Silence()
+    silence.follow(scan(0, 0), None)
+    silence.follow(scan(1, 500), None)
+    assert silence.missed == 0
+
+
+def test_a_finger_that_falls_silent_while_the_other_goes_on_is_told_once_and_told_back():
+    silence, events = Silence(), []
+    for n in range(200):
+        for sensor in ("4", "6"):
+            if sensor == "4" or not 20 <= n < 120:
+                back = silence.follow(scan(n, 10 * n, sensor), PERIOD_NS)
+                events += [] if back is None else [back]
+        events += silence.look()
+    assert [(event.kind, event.sensor, event.time_ns // MS) for event in events] == [
+        ("silent", "6", 190 + SILENT_NS // MS + 10),
+        ("back", "6", 1200),
+    ]
+    assert events[0].text.startswith("no scan from sensor 6 for 0.5 s")
+    assert events[1].text == "sensor 6 is back after 1.0 s"
+
+
+def test_after_the_link_was_away_no_finger_is_silent_for_coming_second():
+    silence = Silence()
+    for sensor in ("4", "6"):
+        silence.follow(scan(0, 0, sensor), PERIOD_NS)
+    silence.begin_anew(5_000 * MS)
+    silence.follow(scan(1, 5_000), PERIOD_NS)
+    assert silence.look() == []
+    silence.follow(scan(2, 5_000 + SILENT_NS // MS + 1), PERIOD_NS)
+    assert [event.sensor for event in silence.look()] == ["6"]
+
+
+def test_one_link_that_was_away_excuses_its_own_sensors_alone():
+    silence = Silence()
+    for sensor in ("left/4", "right/4", "right/6"):
+        silence.follow(scan(0, 0, sensor), PERIOD_NS)
+    silence.begin_anew(5_000 * MS, "left/")
+    silence.follow(scan(1, 5_000, "right/4"), PERIOD_NS)
+    assert [event.sensor for event in silence.look()] == ["right/6"]
+
+
+def test_a_sensor_that_there_should_be_and_is_never_heard_is_told_once():
+    silence = Silence(["4", "6"])
+    assert silence.look() == []
+    events = []
+    for n in range(100):
+        silence.follow(scan(n, 10 * n), PERIOD_NS)
+        events += silence.look()
+    assert [(event.kind, event.sensor) for event in events] == [("silent", "6")]
+
+
+def test_when_all_are_silent_it_is_not_a_finger():
+    silence = Silence()
+    for sensor in ("4", "6"):
+        silence.follow(scan(0, 0, sensor), PERIOD_NS)
+    assert silence.look() == []
