@@ -1,18 +1,20 @@
 """`edge-sr`: taxel scans in, super-resolved patterns out."""
 
 import argparse
+import math
 import os
 import shlex
 import sys
 from collections.abc import Sequence
 from typing import Final
 
+from edge.arguments import EXIT_USAGE
 from edge.bundle import bundled_models, demo_recording
+from edge.commissioned import use_sensor_file
 from edge.errors import EdgeError, ModelError, SinkError, UsageError
-from edge.options import EXIT_USAGE, baseline_parser, bench_parser, models_parser, run_parser
+from edge.options import baseline_parser, devices_parser, models_parser, run_parser
 from firmware_bridge.errors import BaselineRefusedError, BridgeError, DeviceError
 from firmware_bridge.links.base import Link
-from firmware_bridge.xela import ID_MAPS
 
 STDOUT: Final = 1
 EXIT_DEVICE: Final = 3
@@ -50,12 +52,13 @@ def _exit_code(error: BridgeError | EdgeError) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     options = run_parser().parse_args(arguments)
+    use_sensor_file(options)
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate measures for --budget-us, which is not there: add it, or leave both")
     # Here and not above, so that --help does not wait for onnxruntime.
     from edge.run import run
 
-    run(options, _open_source(options))
+    run(options, _open_sources(options, math.inf if options.give_up_s is None else options.give_up_s))
     return 0
 
 
@@ -82,14 +85,15 @@ def _models(arguments: Sequence[str]) -> int:
 
 def _baseline(arguments: Sequence[str]) -> int:
     options = baseline_parser().parse_args(arguments)
+    use_sensor_file(options)
     from edge.signals import stop_on_signals
     from edge.zeroing import take_baselines
     from firmware_bridge.baseline import save_baselines
 
-    with stop_on_signals() as stop, _open_source(options) as link:
+    with stop_on_signals() as stop, _open_sources(options, give_up_s=None) as link:
         kind = link.kind
         baselines = take_baselines(link, scans=options.scans, skip=options.skip, stop=stop)
-    save_baselines(options.out, baselines.values())
+    save_baselines(options.out, baselines.values(), options.orders)
     for name, baseline in sorted(baselines.items()):
         emulated = "" if kind == "device" else f" ({kind.upper()})"
         print(f"sensor {name}: baseline {baseline.id} of {baseline.scans} scans{emulated} -> {options.out}")
@@ -97,6 +101,8 @@ def _baseline(arguments: Sequence[str]) -> int:
 
 
 def _bench(arguments: Sequence[str]) -> int:
+    from edge.bench.options import bench_parser
+
     options = bench_parser().parse_args(arguments)
     if options.soak is not None and not options.system:
         raise UsageError("--soak is a part of --system: add it")
@@ -120,14 +126,36 @@ def _bench(arguments: Sequence[str]) -> int:
     return run(settings, sys.stdout, sys.stderr)
 
 
-COMMANDS: Final = {"models": _models, "baseline": _baseline, "bench": _bench}
+def _devices(arguments: Sequence[str]) -> int:
+    options = devices_parser().parse_args(arguments)
+    from edge.devices import run
+
+    return run(as_json=options.json, stdout=sys.stdout)
 
 
-def _open_source(options: argparse.Namespace) -> Link:
-    from firmware_bridge.links.source import open_source
+def _doctor(arguments: Sequence[str]) -> int:
+    from edge.doctor.options import doctor_parser
 
-    recording = demo_recording() if options.source == "demo" else None
-    return open_source(options.source, options.rate_hz, recording, ID_MAPS[options.id_map])
+    options = doctor_parser().parse_args(arguments)
+    if len(options.source) > 1:
+        raise UsageError(f"{len(options.source)} sources, expected one: examine them one after the other")
+    use_sensor_file(options)
+    from edge.doctor.command import run
+
+    return run(options, lambda asked: _open_sources(asked, give_up_s=None), sys.stdout, sys.stderr)
+
+
+COMMANDS: Final = {"models": _models, "baseline": _baseline, "bench": _bench, "devices": _devices, "doctor": _doctor}
+
+
+def _open_sources(options: argparse.Namespace, give_up_s: float | None) -> Link:
+    from firmware_bridge.links.source import open_sources
+
+    demo = any(text.rpartition("=")[2] == "demo" for text in options.source)
+    recording = demo_recording() if demo else None
+    return open_sources(
+        options.source, options.rate_hz, recording, options.model_map, give_up_s, mountings=options.mountings
+    )
 
 
 if __name__ == "__main__":

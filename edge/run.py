@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, TAXELS, demo_recording, find_model
-from edge.commands import stdin_commands
+from edge.commands import user_commands
 from edge.errors import SinkClosedError
 from edge.estimate import load_estimator
 from edge.pump import pump
@@ -22,9 +22,10 @@ from edge.runtime import Runtime
 from edge.session import ModelSession
 from edge.signals import stop_on_signals
 from edge.sinks.base import Sink
+from edge.sinks.fan import Fan
 from edge.sinks.forms import open_sink
+from edge.sinks.messages import MessageSink
 from edge.statistics import Statistics
-from firmware_bridge.baseline import load_baselines
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import Link
 
@@ -46,15 +47,16 @@ def run(options: argparse.Namespace, link: Link) -> None:
         BridgeError: of the source.
     """
     stdout_taken = "jsonl:-" in options.sink
-    with stop_on_signals() as stop:
-        baselines = load_baselines(options.baseline) if options.baseline else None
-        default = DEMO_MODEL if options.source == "demo" else DEFAULT_MODEL
+    # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
+    with stop_on_signals() as stop, user_commands() as commands:
+        demo = options.source == ["demo"]
+        default = DEMO_MODEL if demo else DEFAULT_MODEL
         path = find_model(options.model or default)
         ladder = None if options.budget_us is None else _open_ladder(options, path, stop)
         if stop.is_set():
             return
         model = ModelSession(path) if ladder is None else ladder.model
-        score = _open_score(model.contract) if options.source == "demo" else None
+        score = _open_score(model.contract) if demo else None
         statistics = Statistics()
         if score is not None:
             print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
@@ -67,7 +69,8 @@ def run(options: argparse.Namespace, link: Link) -> None:
                 model,
                 source=link.kind,  # known once the link is open
                 estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)),
-                baselines=baselines,
+                baselines=options.baselines,
+                mountings=options.mountings,
                 counts_per_newton=options.counts_per_newton,
                 on_counts=options.contact_on_counts,
                 off_counts=options.contact_off_counts,
@@ -82,9 +85,19 @@ def run(options: argparse.Namespace, link: Link) -> None:
                 from edge.ladder import ModelSteps
 
                 sinks.append(ModelSteps(ladder, runtime))
+            messages = MessageSink()
+            fan = Fan(messages.say)
+            closing.callback(fan.close)
+            sinks.append(messages)
             for text in with_status(options.sink):
-                sinks.append(open_sink(text, model.contract))
-                closing.callback(sinks[-1].close)
+                sink = open_sink(text, model.contract, patient=link.kind == "replay")
+                if text != "status":
+                    fan.add(sink)
+                    continue
+                closing.callback(sink.close)
+                sinks.append(sink)
+            if set(options.sink) - {"status"}:
+                sinks.append(fan)
             pump(
                 link,
                 runtime,
@@ -92,8 +105,9 @@ def run(options: argparse.Namespace, link: Link) -> None:
                 statistics,
                 stop=stop,
                 duration_s=options.duration_s,
-                commands=stdin_commands(),
+                commands=commands,
                 rate_hz=options.rate_hz,
+                expected=options.baselines or (),
             )
         if score is not None:
             _print_score(score, sys.stderr if stdout_taken else sys.stdout)
@@ -131,6 +145,8 @@ def _summary(statistics: Statistics, link: Link, rate_hz: float | None) -> Itera
             source = link.name if link.kind == "device" else f"{link.kind.upper()} {link.name}"
             with contextlib.suppress(OSError):  # the terminal may have gone, which must not spoil a clean end
                 print(statistics.summary(source=source, wanted_rate_hz=rate_hz), file=sys.stderr)
+                received = ", ".join(f"{name} {count}" for name, count in link.counters().items() if count)
+                print(f"received: {received or 'nothing'}", file=sys.stderr)
 
 
 def _tell(line: str) -> None:

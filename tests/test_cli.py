@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import termios
+import time
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,10 @@ from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 from edge import bundle, cli
 from edge.run import with_status
 from firmware_bridge.baseline import load_baselines, save_baselines
-from firmware_bridge.emulator import Emulator
 from firmware_bridge.links import source
 from firmware_bridge.links.ports import Port
 from firmware_bridge.recording import load_recording
+from firmware_bridge.slcan_emulator import Emulator
 
 EDGE_SR = [sys.executable, "-m", "edge.cli"]
 TIMEOUT_S = 60
@@ -75,6 +76,13 @@ def records(text):
     return [json.loads(line) for line in text.splitlines()]
 
 
+def wait_for(condition):
+    end_s = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0.05)
+
+
 def assert_refused(done, code, *words):
     assert done.returncode == code, done.stderr
     assert done.stdout == ""
@@ -93,7 +101,7 @@ def test_one_tap_is_what_a_sensor_gets_unless_asked_and_the_demo_gets_four(tmp_p
 
 
 class TestHelp:
-    @pytest.mark.parametrize("command", [[], ["models"], ["baseline"], ["bench"]])
+    @pytest.mark.parametrize("command", [[], ["models"], ["baseline"], ["bench"], ["doctor"]])
     def test_help_fits_40_columns(self, command):
         done = run(*command, "--help", env=os.environ | {"COLUMNS": "40"})
         assert done.returncode == 0 and done.stderr == ""
@@ -267,6 +275,13 @@ class TestReplay:
         assert (tmp_path / "copy.jsonl").read_text() == done.stdout
         assert [len(track.counts) for track in load_recording(tmp_path / "out.npz").tracks] == [40, 10]
 
+    def test_two_sources_are_named_in_the_records(self, files, tmp_path):
+        sources = ["--source", f"left=replay:{files / 'taps.npz'}", "--source", f"replay:{files / 'rest.npz'}"]
+        done = run("--model", files / "tiny.onnx", *sources, "--rate-hz", 500, "--sink", "jsonl:-")
+        assert done.returncode == 0, done.stderr
+        assert {record["sensor"] for record in records(done.stdout)} == {"left/4", "2/4"}
+        assert len(records(done.stdout)) == 160
+
     def test_duration_ends_it(self, files, tmp_path):
         slow = write_recording(tmp_path / "slow.npz", [0] * 3, period_ns=10**11)
         done = run(*base_options(files), "--source", f"replay:{slow}", "--duration-s", "0.3", "--sink", "jsonl:-")
@@ -332,7 +347,7 @@ class TestEnds:
         assert errors.startswith("EMULATED ") and "Traceback" not in errors and "Exception" not in errors
 
     def test_the_cable_out_keeps_the_records_and_is_3(self, emulator, files, tmp_path):
-        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz")
+        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz", "--give-up-s", "0")
         emulator.hang_up()
         rest, errors = self.rest(process)
         assert process.returncode == 3
@@ -341,6 +356,33 @@ class TestEnds:
         *summary, last = errors.splitlines()
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
+
+    def test_the_cable_back_under_another_name_goes_on_and_records_tell_of_it(self, files, tmp_path):
+        """A link named by its adapter, as udev does, that leads to a new port each time."""
+        port, out = tmp_path / "by-id", tmp_path / "out.jsonl"
+        process = None
+        for _ in range(2):
+            with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
+                port.unlink(missing_ok=True)
+                port.symlink_to(emulator.port)
+                if process is None:
+                    process = start(*base_options(files), "--source", f"slcan:{port}", "--sink", f"jsonl:{out}")
+                    wait_for(lambda: out.exists() and out.read_text().count("\n") > 10)
+                else:
+                    wait_for(lambda: '"back"' in out.read_text().rpartition("lost")[2])
+                    wait_for(lambda: out.read_text().rpartition('"back"')[2].count("\n") > 10)
+        process.send_signal(signal.SIGINT)
+        _, errors = self.rest(process)
+        assert process.returncode == 0
+        got = records(out.read_text())
+        kinds = [record.get("event") for record in got if record["state"] == "event"]
+        assert kinds[:2] == ["lost", "back"]
+        assert "trying again until it is back" in errors and "is back after" in errors
+        back = got.index(next(record for record in got if record.get("event") == "back"))
+        scans = [record for record in got if record["state"] != "event"]
+        assert [record["scan"] for record in scans] == list(range(len(scans)))
+        assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
+        assert scans[-1]["counters"]["missed"] > 0
 
     def test_models_into_a_closed_pipe_stay_quiet(self, files):
         script = f"import sys; from edge import bundle, cli; bundle.BUNDLE_DIR = bundle.Path({str(files)!r})\n"

@@ -42,9 +42,15 @@ UNUSED_IN_A_REPLAY = {
     "edge.draw",
     "edge.realtime",
     "firmware_bridge.emulator",
+    "firmware_bridge.slcan_emulator",
     "firmware_bridge.links.demo",
     "firmware_bridge.links.slcan_serial",
+    "firmware_bridge.links.xela_server",
+    "websockets",
+    "firmware_bridge.links.gs_usb_link",
+    "firmware_bridge.links.can_bus",
     "usb",
+    "can",
     "subprocess",
 }
 RUN = """

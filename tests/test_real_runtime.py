@@ -12,8 +12,8 @@ import pytest
 from edge_samples import ROOT, write_model
 
 from firmware_bridge.baseline import Baseline, save_baselines
-from firmware_bridge.emulator import Emulator
 from firmware_bridge.recording import load_recording
+from firmware_bridge.slcan_emulator import Emulator
 
 RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
 TRIALS = sorted(path.name for path in RECORDINGS.glob("data_sample_*")) if RECORDINGS.is_dir() else []
@@ -39,6 +39,7 @@ def play(trial, folder):
     tracks = [load_recording(RECORDINGS / trial / f"xela_sensor{n}.csv") for n in (1, 2)]
     with Emulator(tracks, controllers=[4, 6]) as emulator:
         options = ["--model", folder / "tiny.onnx", "--baseline", folder / f"{trial}.json", "--sink", "jsonl:-"]
+        options += ["--give-up-s", "0"]
         done = subprocess.run(
             [sys.executable, "-m", "edge.cli", "--source", f"slcan:{emulator.port}", *map(str, options)],
             cwd=ROOT,

@@ -1,0 +1,75 @@
+"""What the options of all commands have in common: one line for wrong usage, kinds of numbers, what names a source."""
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+from firmware_bridge.xela import ID_MAPS, USPA44_MAP
+
+EXIT_USAGE: Final = 2
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports wrong usage in one line."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **settings)
+
+    def error(self, message: str) -> NoReturn:
+        """End with the message and where there is more."""
+        self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help tells more)\n")
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """Options of every command that reads a sensor."""
+    parser.add_argument(
+        "--source",
+        metavar="SRC",
+        action="append",
+        default=[],
+        help="where scans come from (default: looks for an adapter); repeated, with names, NAME=SRC, for two fingers",
+    )
+    parser.add_argument(
+        "--id-map",
+        metavar="MAP",
+        choices=ID_MAPS,
+        help=f"which CAN id is which taxel: {', '.join(ID_MAPS)}; A and B are boards before 2021 "
+        f"(default {USPA44_MAP.name})",
+    )
+    sensor_help = "what edge-sr doctor wrote: id map, order, axes, gains, force, baseline; other options go before it"
+    parser.add_argument("--sensor", metavar="FILE", type=Path, help=sensor_help)
+    parser.add_argument(
+        "--rate-hz",
+        metavar="R",
+        type=positive,
+        help="play a recording at this rate; for a device, the rate to hold it against",
+    )
+
+
+def positive(text: str) -> float:
+    """A number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """A number above 0, or 0."""
+    return 0.0 if text == "0" else positive(text)
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """Whole numbers from `least`."""
+
+    def whole_number(text: str) -> int:
+        if not (text.isascii() and text.isdigit()) or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
+        return int(text)
+
+    return whole_number

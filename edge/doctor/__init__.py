@@ -1,0 +1,1 @@
+"""Commissioning: is this sensor well, how does it sit, and what is to be done."""

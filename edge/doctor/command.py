@@ -1,0 +1,118 @@
+"""`edge-sr doctor`: watches a link, asks for presses, prints what is wrong, and keeps what it found."""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Final, TextIO
+
+from edge.doctor.examine import examine
+from edge.doctor.findings import Finding, page, summary, worst
+from edge.doctor.heard import HeardIds
+from edge.doctor.keep import check_writable, keep
+from edge.doctor.visit import Visit
+from edge.signals import stop_on_signals
+from edge.wrapping import columns, wrapped
+from firmware_bridge.errors import LinkLostError, SensorFileError
+from firmware_bridge.links.base import Link
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.sensor_file import SensorFile
+
+EXIT_WRONG: Final = 1
+EXIT_STOPPED: Final = 130
+
+
+def run(
+    options: argparse.Namespace,
+    open_link: Callable[[argparse.Namespace], Link],
+    out: TextIO,
+    err: TextIO,
+    *,
+    clock_s: Callable[[], float] = time.monotonic,
+    unix_time_s: Callable[[], float] = time.time,
+) -> int:
+    """Do what `edge-sr doctor` is asked for; returns the exit code.
+
+    Args:
+        options: of edge.doctor.options.doctor_parser, through edge.commissioned.use_sensor_file.
+        open_link: the link that options ask for, not yet entered.
+        out: for the findings.
+        err: for what is asked of a person; no press is asked for where it is no terminal.
+        clock_s: the clock of the scans, monotonic, in [s].
+        unix_time_s: dates the baselines, in [s] since 1970.
+
+    Raises:
+        LinkLostError: after what was found until then was told.
+        BridgeError: of the source.
+        SensorFileError: the sensor file cannot be written; if that turns out at the end, after what was found was told.
+    """
+    if options.out is not None:
+        check_writable(options.out)
+    heard = HeardIds(options.model_map.taxels)
+    options.model_map = heard.listening(options.model_map)
+    with stop_on_signals() as stop:
+        link = open_link(options)
+        visit = Visit(options, err, stop, clock_s)
+        start_s = clock_s()
+        lost = None
+        with link:
+            try:
+                watched = visit.watch(link, heard)
+            except LinkLostError as error:
+                lost = error
+                watched = visit.watched(link, heard)
+            examined = examine(watched, unix_time_s())
+            mountings: dict[str, Mounting] = {}
+            if lost is None and not stop.is_set():
+                try:
+                    mountings = visit.press(link, examined)
+                except LinkLostError as error:
+                    lost = error
+        if lost is not None:
+            examined.findings.append(Finding("link", "wrong", f"lost: {lost}", "", "see to plug and cable"))
+        kept = unwritten = None
+        if options.out is not None and lost is None and not stop.is_set():
+            try:
+                kept = keep(options.out, options.sensor_file, visit.port, examined.baselines, mountings, visit.newtons)
+            except SensorFileError as error:
+                unwritten = error
+        stopped_s = clock_s() - start_s if stop.is_set() else None
+        _tell(options, link, visit.duration_s, stopped_s, examined.findings, kept, out)
+        if lost is not None:
+            raise lost
+        if unwritten is not None:
+            raise unwritten
+        if stop.is_set():
+            return EXIT_STOPPED
+    return EXIT_WRONG if worst(examined.findings) == "wrong" else 0
+
+
+def _tell(
+    options: argparse.Namespace,
+    link: Link,
+    duration_s: float,
+    stopped_s: float | None,
+    findings: list[Finding],
+    kept: SensorFile | None,
+    out: TextIO,
+) -> None:
+    if options.json:
+        document = {
+            "source": link.name,
+            "kind": link.kind,
+            "id_map": options.model_map.name,
+            "duration_s": round(duration_s, 3),
+            "stopped": stopped_s is not None,
+            "verdict": worst(findings),
+            "findings": [finding.document() for finding in findings],
+            "sensor_file": None if kept is None else str(options.out),
+        }
+        print(json.dumps(document, indent=1), file=out)
+        return
+    emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
+    print(f"{link.name}{emulated}", file=out)
+    print(page(findings, columns()), file=out)
+    if kept is not None:
+        print(f"kept in {options.out}", file=out)
+    early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
+    print(*wrapped(early + summary(findings), columns()), sep="\n", file=out)

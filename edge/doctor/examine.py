@@ -1,0 +1,184 @@
+"""Everything that was watched to all findings, and which of them only follow from others. No I/O, no clock."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.doctor.findings import Finding
+from edge.doctor.heard import check_id_map
+from edge.doctor.line_checks import LineFacts, check_baud, check_latency, check_link
+from edge.doctor.samples import FEWEST_SCANS, Samples
+from edge.doctor.taxel_checks import check_drift, check_noise, check_rest, check_silent, check_stuck
+from edge.doctor.time_checks import check_lost, check_rate, check_torn
+from firmware_bridge.baseline import (
+    COUNTS_ON_CIRCLE,
+    LOAD_LIMIT_COUNTS,
+    SPREAD_LIMIT_COUNTS,
+    Baseline,
+    BaselineEstimator,
+    deformation,
+)
+from firmware_bridge.baseline import (
+    FEWEST_SCANS as BASELINE_SCANS,
+)
+from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.scan import Scan
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.xela import USPA44_MAP, ModelMap
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What came in while the pads were free.
+
+    Attributes:
+        scans: of each sensor, in their order.
+        counters: of the link.
+        duration_s: for which it was watched, in [s].
+        facts: of the line.
+        ids: how often each CAN id came; empty where the link has none.
+        model: the id map that was asked for.
+        rate_hz: that a user expects of each sensor, in [Hz].
+        references: what the free pads read before, by sensor.
+        until_ns: when the watching ended, on the clock of the scans in [ns]; None stands for the newest scan.
+        mountings: of the sensors, as far as they are known.
+    """
+
+    scans: Mapping[str, Sequence[Scan]]
+    counters: Mapping[str, int]
+    duration_s: float
+    facts: LineFacts = field(default_factory=LineFacts)
+    ids: Mapping[int, int] = field(default_factory=dict)
+    model: ModelMap = USPA44_MAP
+    rate_hz: float | None = None
+    references: Mapping[str, Baseline] = field(default_factory=dict)
+    until_ns: int | None = None
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Examined:
+    """The findings, and the baselines of the pads that may be zeroed, by sensor."""
+
+    findings: list[Finding]
+    baselines: dict[str, Baseline]
+
+
+def examine(watched: Watched, unix_time_s: float) -> Examined:
+    """All findings of what was watched; `unix_time_s` dates the baselines, in [s] since 1970."""
+    samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
+    enough = {name: one for name, one in samples.items() if one.enough}
+    half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
+    baud = check_baud(watched.facts, watched.counters, watched.duration_s, len(enough), watched.rate_hz)
+    id_map = check_id_map(watched.ids, watched.model, bool(half_silent))
+    line_full = baud is not None and baud.verdict == "wrong"
+    of_link = [check_link(watched.counters, watched.duration_s), baud]
+    if watched.facts.port is not None and enough:
+        held_back_ms = max(one.held_back_ms() for one in enough.values())
+        of_link.append(check_latency(watched.facts, held_back_ms, line_full))
+    of_link.append(id_map)
+    findings = [finding for finding in of_link if finding is not None]
+    if not enough:
+        findings.append(_nothing(samples, findings))
+    wrong_map = id_map is not None and id_map.verdict == "wrong"
+    last_ns = (scans[-1].time_ns for scans in watched.scans.values() if scans)
+    newest_ns = watched.until_ns if watched.until_ns is not None else max(last_ns, default=0)
+    baselines: dict[str, Baseline] = {}
+    for name, one in enough.items():
+        drift, noise = check_drift(one), check_noise(one)
+        spoiled = next((check.name for check in (noise, drift) if check.verdict != "ok"), None)
+        baseline, quality = check_baseline(watched.scans[name][1:], one.living, spoiled, unix_time_s)
+        of_sensor = [
+            check_rate(one, watched.rate_hz, line_full),
+            check_torn(one),
+            check_lost(one, (newest_ns - watched.scans[name][-1].time_ns) / NS_PER_S),
+            check_silent(one, wrong_map and name in half_silent),
+            check_stuck(one),
+            noise,
+            check_rest(one),
+            drift,
+            quality,
+            check_load(one.rest_counts(), watched.references.get(name), watched.mountings.get(name)),
+        ]
+        if baseline is not None:
+            baselines[name] = baseline
+        findings += [_of(name, finding) for finding in of_sensor]
+    return Examined(findings, baselines)
+
+
+def check_baseline(
+    scans: Sequence[Scan], living: NDArray[np.bool_], spoiled: str | None, unix_time_s: float
+) -> tuple[Baseline | None, Finding]:
+    """Can this pad be zeroed? The baseline of its last scans, and what there is to say of it.
+
+    Args:
+        scans: of one sensor.
+        living: (taxels,), the baseline is for these; there is one only where all are.
+        spoiled: name of another finding that a refusal would follow from.
+        unix_time_s: when the last scan came, in [s] since 1970.
+    """
+    norm = f"{BASELINE_SCANS} scans that span at most {' / '.join(f'{limit:.0f}' for limit in SPREAD_LIMIT_COUNTS)}"
+    if not living.any():
+        return None, Finding("baseline", "not known", "no taxel is heard", norm)
+    silent = ~living.reshape(scans[0].fresh.shape)
+    usable = [scan for scan in scans if (scan.fresh | silent).all() and scan.renewed.any()][-BASELINE_SCANS:]
+    if len(usable) < BASELINE_SCANS:
+        measured = f"only {len(usable)} complete scans"
+        return None, Finding("baseline", "not known", measured, norm, "watch for longer: --drift-s 60")
+    estimator = BaselineEstimator(BASELINE_SCANS, clock=lambda: unix_time_s)
+    baseline = None
+    try:
+        for scan in usable:
+            baseline = estimator.push(scan, silent if silent.any() else None)
+    except BaselineRefusedError as refusal:
+        if spoiled is not None:
+            return None, Finding("baseline", "not known", "the pad is not still", norm, f"see {spoiled}")
+        measured, _, remedy = str(refusal).partition(": ")
+        return None, Finding("baseline", "wrong", measured, norm, remedy)
+    whole = baseline is not None and not silent.any()
+    measured = f"{BASELINE_SCANS} scans agree" + ("" if whole else f" but for {np.count_nonzero(silent)} silent taxels")
+    return baseline if whole else None, Finding("baseline", "ok", measured, norm)
+
+
+def check_load(
+    rest_counts: NDArray[np.float64], reference: Baseline | None, mounting: Mounting | None = None
+) -> Finding:
+    """Does something lie on the pad? Only an earlier baseline can tell.
+
+    Args:
+        rest_counts: (3, taxels) now; NaN where silent.
+        reference: of the free pad.
+        mounting: tells which way z points, and with it a load now from one then; None where it is as wired.
+    """
+    norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
+    if reference is None:
+        remedy = "a pad that something has lain on from the start looks free; give an earlier --baseline or --sensor"
+        return Finding("load", "not known", "no earlier baseline to compare with", norm, remedy)
+    known = np.nan_to_num(rest_counts).reshape(reference.counts.shape)
+    z = deformation(np.rint(known).astype(np.int32) % COUNTS_ON_CIRCLE, reference, mounting)[2].ravel()
+    z[np.isnan(rest_counts[2])] = 0
+    z = np.nan_to_num(z)
+    taxel = int(np.abs(z).argmax())
+    measured = f"z {z[taxel]:+.0f} counts on taxel {taxel} against baseline {reference.id}"
+    if abs(z[taxel]) <= LOAD_LIMIT_COUNTS:
+        return Finding("load", "ok", measured, norm)
+    remedy = (
+        "something presses: free the pad; if it is free, the baseline is too old: zero again"
+        if z[taxel] > 0
+        else "the baseline was taken of a loaded pad, or is too old: zero again"
+    )
+    return Finding("load", "wrong", measured, norm, remedy)
+
+
+def _nothing(samples: Mapping[str, Samples], of_link: Sequence[Finding]) -> Finding:
+    scans = sum(one.scans for one in samples.values())
+    told = any(finding.verdict == "wrong" for finding in of_link)
+    remedy = "see above" if told else "is the sensor powered, and is nothing else reading it?"
+    return Finding("scans", "wrong", f"{scans} scans", f"at least {FEWEST_SCANS} of a sensor", remedy)
+
+
+def _of(sensor: str, finding: Finding) -> Finding:
+    return Finding(finding.name, finding.verdict, finding.measured, finding.norm, finding.remedy, sensor)

@@ -1,0 +1,72 @@
+"""What the doctor found, line by line: a verdict, what was measured, and the remedy."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from edge.wrapping import wrapped
+
+Verdict = Literal["ok", "look", "wrong", "not known"]
+
+_MARKS: Final[dict[Verdict, str]] = {"ok": "ok", "look": "LOOK", "wrong": "WRONG", "not known": "?"}
+_MARK_WIDTH: Final = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing examined.
+
+    Attributes:
+        name: what was examined.
+        verdict: "ok"; "look", for what works but may not for long; "wrong"; "not known", where it could not be told.
+        measured: what was found, with its unit.
+        norm: what is to be expected; empty where that goes without saying.
+        remedy: what to do, in plain words; empty where nothing is to be done.
+        sensor: of which sensor; None for the link.
+    """
+
+    name: str
+    verdict: Verdict
+    measured: str
+    norm: str = ""
+    remedy: str = ""
+    sensor: str | None = None
+
+    def document(self) -> dict[str, Any]:
+        """For JSON."""
+        return {name: getattr(self, name) for name in ("sensor", "name", "verdict", "measured", "norm", "remedy")}
+
+
+def worst(findings: Iterable[Finding]) -> Verdict:
+    """The gravest verdict; what is not known counts as ok."""
+    verdicts = {finding.verdict for finding in findings}
+    return "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
+
+
+def summary(findings: Iterable[Finding]) -> str:
+    """How many are not ok, in a few words; what is not known is no more well than wrong."""
+    count = Counter(finding.verdict for finding in findings)
+    unknown = [f"{count['not known']} not known"] if count["not known"] else []
+    if count["wrong"] or count["look"]:
+        return ", ".join([f"{count['wrong']} wrong", f"{count['look']} to look at", *unknown])
+    return ", ".join(["nothing wrong", *unknown]) if unknown else "all well"
+
+
+def page(findings: Sequence[Finding], columns: int) -> str:
+    """All findings as text, those of the link first, in lines of `columns` at most but for words that are wider."""
+    lines: list[str] = []
+    for sensor in dict.fromkeys(finding.sensor for finding in findings):
+        lines.append("link" if sensor is None else f"sensor {sensor}")
+        for finding in findings:
+            if finding.sensor == sensor:
+                lines += _lines(finding, columns)
+    return "\n".join(lines)
+
+
+def _lines(finding: Finding, columns: int) -> list[str]:
+    norm = f" (norm: {finding.norm})" if finding.norm else ""
+    indent = " " * (_MARK_WIDTH + 2)
+    text = f"{finding.name}: {finding.measured}{norm}"
+    lines = wrapped(text, columns, f"  {_MARKS[finding.verdict]:{_MARK_WIDTH}}", indent)
+    return lines + (wrapped(finding.remedy, columns, f"{indent}-> ", f"{indent}   ") if finding.remedy else [])

@@ -1,0 +1,79 @@
+"""Which CAN ids are really on the bus, and whose they are."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+from edge.doctor.findings import Finding
+from firmware_bridge.xela import ID_MAPS, ModelMap
+
+_SHOWN = 8
+
+
+class HeardIds(Mapping[int, tuple[str, int]]):
+    """A model's taxels by CAN id, which notes what ids are looked up with `get`: those that came over the bus.
+
+    Attributes:
+        ids: how often each was asked for; a scan whose frames come as a scan before is asked for once.
+    """
+
+    def __init__(self, taxels: Mapping[int, tuple[str, int]]) -> None:
+        self.ids: Counter[int] = Counter()
+        self._taxels = taxels
+
+    def get(self, key: int, default: Any = None) -> Any:
+        """Sensor and taxel of a CAN id that came; noted, whether it is one of the map's or not."""
+        self.ids[key] += 1
+        return self._taxels.get(key, default)
+
+    def __getitem__(self, key: int) -> tuple[str, int]:
+        return self._taxels[key]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._taxels)
+
+    def __len__(self) -> int:
+        return len(self._taxels)
+
+    def listening(self, model: ModelMap) -> ModelMap:
+        """A model that sorts by these taxels."""
+        return replace(model, taxels=self)
+
+
+def check_id_map(ids: Mapping[int, int], model: ModelMap, half_silent: bool) -> Finding | None:
+    """Does the id map that was asked for know the sensors that speak? None where no CAN ids are seen at all.
+
+    Args:
+        ids: how often each CAN id came.
+        model: asked for.
+        half_silent: of some sensor half of the taxels or more are silent.
+    """
+    if not ids:
+        return None
+    norm = "every taxel of a sensor by its id"
+    whole = _whole_sensors(ids, model)
+    others = {
+        name: sensors
+        for name, other in ID_MAPS.items()
+        if name != model.name and other.geometry == model.geometry and (sensors := _whole_sensors(ids, other))
+    }
+    if whole and not half_silent:
+        return Finding("id map", "ok", f"{model.name}, all ids of sensor {', '.join(whole)} heard", norm)
+    if others:
+        told = " or ".join(f"{name} (sensor {', '.join(sensors)})" for name, sensors in others.items())
+        tries = " or ".join(f"--id-map {name}" for name in others)
+        return Finding("id map", "wrong", f"the ids heard are not {model.name}'s but those of {told}", norm, f"{tries}")
+    known = [can_id for can_id in ids if can_id in model.taxels]
+    shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:_SHOWN]) + ", ..." * (len(ids) > _SHOWN)
+    measured = f"{len(ids)} ids heard, {len(known)} of them {model.name}'s: {shown}"
+    if half_silent or not known:
+        remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
+        return Finding("id map", "wrong", measured, norm, remedy)
+    return Finding("id map", "ok", measured, norm)
+
+
+def _whole_sensors(ids: Mapping[int, int], model: ModelMap) -> list[str]:
+    """Sensors of a model whose every id was heard."""
+    taxels: Counter[str] = Counter(sensor for can_id, (sensor, _) in model.taxels.items() if can_id in ids)
+    return [sensor for sensor, count in taxels.items() if count == model.geometry.taxel_count]

@@ -1,0 +1,164 @@
+"""Is the way from the adapter to here well: counters, line speed and latency. Pure but for one file that it reads."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from edge.doctor.findings import Finding, Verdict
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.links.base import Link
+
+LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
+LATENCY_LIMIT_MS: Final = 2
+HELD_BACK_LIMIT_MS: Final = 5.0
+"""A timer at 16 ms makes it 10 to 12; half of a period is not to be lost before the reading."""
+LINE_BYTES: Final = 22
+STAMPED_LINE_BYTES: Final = 26
+"""An slcan line of a taxel, without and with a time stamp."""
+BITS_PER_BYTE: Final = 10
+"""On a serial line: a start bit and a stop bit beside eight."""
+ANSWERS_BYTES: Final = 64
+"""Fewer are an adapter's answers to commands; noise of another line speed is more."""
+USUAL_RATE_HZ: Final = 100.0
+FULL_SHARE: Final = 0.9
+OVERFULL_SHARE: Final = 1.05
+_BAD_LIMITS: Final = (1e-4, 1e-2)
+_TROUBLE: Final = ("overrun", "overflow", "error", "lost")
+
+
+@dataclass(frozen=True, slots=True)
+class LineFacts:
+    """What is known of the way to a sensor.
+
+    Attributes:
+        port: of a serial adapter; None for other links.
+        baud: that its line was opened with, in bit/s.
+        latency_ms: for which the adapter's driver says it holds bytes back; None where it does not say.
+    """
+
+    port: str | None = None
+    baud: int | None = None
+    latency_ms: int | None = None
+
+
+def line_facts(link: Link, root: Path = LATENCY_ROOT) -> LineFacts:
+    """Of an open link; `root` is where the kernel shows USB serial ports."""
+    link = getattr(link, "wrapped", link)
+    port, baud = getattr(link, "port", None), getattr(link, "baudrate", None)
+    return LineFacts() if port is None else LineFacts(port, baud, latency_timer_ms(port, root))
+
+
+def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
+    """How long the driver of a port lets bytes wait, in [ms]; None where it does not say.
+
+    Source: Linux, drivers/usb/serial/ftdi_sio.c, latency_timer_show; 1 is shown while low latency was asked for.
+    """
+    try:
+        text = (root / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return None
+    return int(text) if text.isdigit() else None
+
+
+def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None:
+    """What the link's counters say of it; None where they count neither bytes nor frames."""
+    received, frames = counters.get("received_bytes"), counters.get("frames")
+    refusals = counters.get("refusals", 0)
+    if received is None or frames is None:
+        return _trouble(counters)
+    measured = f"{received} bytes, {frames} frames in {duration_s:.0f} s"
+    refused = f", {refusals} refusals" if refusals else ""
+    off = (
+        "is the sensor powered? The VScom needs both USB plugs, power first; the bus runs at 1 Mbit/s; a controller "
+        "from before 2021 speaks only with --id-map A or B"
+    )
+    if not received:
+        return Finding("link", "wrong", measured, "", off)
+    bad = counters.get("bad_lines", 0) + counters.get("non_ascii_lines", 0)
+    if not frames and received >= ANSWERS_BYTES:
+        remedy = "no slcan, or another line speed than the adapter's: try --source slcan:PORT@BAUD (VScom 3000000)"
+        return Finding("link", "wrong", measured, "", remedy)
+    if not frames:
+        remedy = (
+            "the adapter does not obey: its channel is held open or its bitrate is not 1 Mbit/s; end slcand, "
+            "xela_server and whatever else holds it, pull its plug and put it in again"
+        )
+        return Finding("link", "wrong", measured + (refused or ", answers only"), "", remedy if refusals else off)
+    share = bad / (bad + frames)
+    measured += f", {bad} bad lines{refused}"
+    verdict: Verdict = "ok" if bad <= 1 or share <= _BAD_LIMITS[0] else "look" if share <= _BAD_LIMITS[1] else "wrong"
+    if verdict != "ok":
+        remedy = "bytes are lost or garbled: a poor cable or hub, another line speed, or no RTS/CTS at the adapter"
+        return Finding("link", verdict, measured, f"under {100 * _BAD_LIMITS[0]:.2f} % bad lines", remedy)
+    return _trouble(counters) or Finding("link", "ok", measured)
+
+
+def check_baud(
+    facts: LineFacts, counters: Mapping[str, int], duration_s: float, sensors: int, rate_hz: float | None
+) -> Finding | None:
+    """Does the serial line carry what the sensors send? None for what is no serial line.
+
+    Args:
+        facts: of the line.
+        counters: of the link.
+        duration_s: for which it was watched, in [s].
+        sensors: on the bus.
+        rate_hz: of each, where a user expects one, in [Hz].
+    """
+    frames, received = counters.get("frames", 0), counters.get("received_bytes", 0)
+    if facts.baud is None or not frames or not sensors or duration_s <= 0:
+        return None
+    line_bytes = STAMPED_LINE_BYTES if received / frames > (LINE_BYTES + STAMPED_LINE_BYTES) / 2 else LINE_BYTES
+    carries_hz = capacity_hz(facts.baud, line_bytes, sensors)
+    used = received * BITS_PER_BYTE / duration_s / facts.baud
+    pads = f"{sensors} sensors" if sensors > 1 else "a sensor"
+    measured = f"{facts.baud} baud carry {carries_hz:.0f} scans a second of {pads}, {100 * used:.0f} % are used"
+    norm = f"under {100 * FULL_SHARE:.0f} % used"
+    remedy = "open a faster line: --source slcan:PORT@3000000, and set the adapter to the same (slcand -S 3000000)"
+    if used > OVERFULL_SHARE:
+        return Finding("baud rate", "ok", f"{measured}: this adapter goes by USB and ignores it", norm)
+    if used > FULL_SHARE:
+        return Finding("baud rate", "wrong", measured, norm, remedy)
+    if carries_hz < (USUAL_RATE_HZ if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or ""):
+        return Finding("baud rate", "look", measured, norm, remedy)
+    return Finding("baud rate", "ok", measured, norm)
+
+
+def capacity_hz(baud: int, line_bytes: int, sensors: int = 1) -> float:
+    """Scans a second of each sensor that a serial line carries, in [Hz]."""
+    return baud / BITS_PER_BYTE / (line_bytes * USPA44.taxel_count * sensors)
+
+
+def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Finding:
+    """Are bytes handed on as they come?
+
+    Args:
+        facts: of the line.
+        held_back_ms: by how much a quarter of the scans came late, in [ms].
+        line_full: the serial line carries no more, so that everything is late.
+    """
+    timer = "" if facts.latency_ms is None else f"timer at {facts.latency_ms} ms, "
+    measured = f"{timer}a quarter of the scans {held_back_ms:.1f} ms late or more"
+    norm = f"timer up to {LATENCY_LIMIT_MS} ms, {HELD_BACK_LIMIT_MS:.0f} ms late"
+    port = Path(facts.port or "").resolve().name
+    shown = f"{LATENCY_ROOT}/{port if port.startswith('ttyUSB') else 'ttyUSBn'}/latency_timer"
+    if facts.latency_ms is not None and facts.latency_ms > LATENCY_LIMIT_MS:
+        remedy = f"echo 1 | sudo tee {shown}, and a udev rule that does so at each plug-in"
+        return Finding("latency timer", "wrong", measured, norm, remedy)
+    if line_full:
+        return Finding("latency timer", "not known", measured, norm, "the line is full: see baud rate")
+    if held_back_ms > HELD_BACK_LIMIT_MS:
+        busy = "this machine is too busy to read in time: end what else runs, or ask for --realtime"
+        remedy = f"the adapter holds bytes back: of an FTDI chip, echo 1 | sudo tee {shown}; or {busy}"
+        return Finding("latency timer", "wrong", measured, norm, remedy if facts.latency_ms is None else busy)
+    return Finding("latency timer", "ok", measured, norm)
+
+
+def _trouble(counters: Mapping[str, int]) -> Finding | None:
+    """What other counters of an adapter say, whatever they are called."""
+    found = [f"{name} {n}" for name, n in counters.items() if n > 0 and any(word in name for word in _TROUBLE)]
+    if not found:
+        return None
+    remedy = "the adapter loses frames: check the termination of the bus, and end what else loads this machine"
+    return Finding("link", "look", ", ".join(found), "none", remedy)

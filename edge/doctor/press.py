@@ -1,0 +1,173 @@
+"""The guided press: readings in, the next thing to ask or the answer out. No I/O, no clock.
+
+Written as a dialogue: each step says something, then waits for readings that fulfil it. Time is that of the scans.
+"""
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.doctor.turns import CORNER_PLACES, CORNERS, Press, corner_taxel
+from edge.taps import OFF_COUNTS, ON_COUNTS
+from firmware_bridge.geometry import USPA44
+
+HOLD_SCANS: Final = 20
+FREE_SCANS: Final = 20
+PUSH_SCANS: Final = 10
+PUSH_COUNTS: Final = 300.0
+"""Of the summed x and y, which noise of two counts brings to eight: about .2 N."""
+PATIENCE_S: Final = 60.0
+TRIES: Final = 3
+STEADY_SCANS: Final = 50
+STEADY_COUNTS: Final = 30.0
+STEADY_SHARE: Final = 0.02
+LEAST_WEIGHT_COUNTS: Final = 100.0
+GRAVITY_M_S2: Final = 9.80665
+
+
+class Reading(NamedTuple):
+    """Readings over the baseline (3, rows, cols) in counts, and when, in [s]."""
+
+    zeroed: NDArray[np.float32]
+    time_s: float
+
+    @property
+    def load_counts(self) -> float:
+        """Summed size of z, whichever way it points."""
+        return float(np.abs(self.zeroed[2]).sum())
+
+    @property
+    def shear_counts(self) -> NDArray[np.float32]:
+        """Summed x and y."""
+        return self.zeroed[:2].sum(axis=(1, 2))
+
+
+@dataclass
+class Answer:
+    """What the presses told: those that were felt, and counts per newton where a weight was laid on."""
+
+    presses: list[Press] = field(default_factory=list)
+    counts_per_newton: float | None = None
+
+
+T = TypeVar("T")
+Dialogue = Generator[str | None, Reading, T]
+
+
+class GuidedPress:
+    """Asks for four corners, one after the other, then for a weight.
+
+    Attributes:
+        answer: what is known so far; whole when `done`.
+        done: nothing more is asked.
+    """
+
+    def __init__(self, weight_g: float | None = None) -> None:
+        """Prepare to ask; a weight is asked for where its mass is given in [g]."""
+        self.answer = Answer()
+        self.done = False
+        self._held: NDArray[np.float32] = np.zeros(USPA44.scan_shape, dtype=np.float32)
+        self._dialogue = self._all(weight_g)
+        self.first: Final = next(self._dialogue) or ""
+
+    def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
+        """Take one more reading; what to say now, or None.
+
+        Args:
+            zeroed: (3, rows, cols), over the baseline, in counts; where it is NaN the taxel's last reading stands.
+            time_s: of its scan, in [s].
+        """
+        if self.done:
+            return None
+        try:
+            self._held = np.where(np.isnan(zeroed), self._held, zeroed)
+            return self._dialogue.send(Reading(self._held, time_s))
+        except StopIteration:
+            self.done = True
+            return None
+
+    def _all(self, weight_g: float | None) -> Dialogue[None]:
+        for place, name in zip(CORNER_PLACES, CORNERS, strict=True):
+            press = yield from _corner(place, name)
+            if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
+                break
+            self.answer.presses.append(press)
+        if weight_g is not None:
+            self.answer.counts_per_newton = yield from _weigh(weight_g)
+
+
+def _corner(place: int, name: str) -> Dialogue[Press | None]:
+    ask = f"Press the {name} corner with a finger and hold it."
+    for _ in range(TRIES):
+        held = yield from _wait(ask, _touched, HOLD_SCANS)
+        if held is None:
+            return None
+        mean = np.mean([reading.zeroed for reading in held], axis=0)
+        taxel = corner_taxel(mean[2])
+        if taxel is not None:
+            break
+        yield from _wait("That was no corner. Let go.", _free, FREE_SCANS)
+        ask = f"Press the {name} corner itself and hold it."
+    else:
+        return None
+    before = mean[:2].sum(axis=(1, 2))
+
+    def pushed(reading: Reading) -> bool:
+        return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= PUSH_COUNTS)
+
+    felt = yield from _wait(
+        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), PUSH_SCANS
+    )
+    push = None
+    if felt is not None and pushed(felt[-1]):
+        x, y = np.mean([reading.shear_counts for reading in felt], axis=0) - before
+        push = (float(x), float(y))
+    yield from _wait("Good. Let go." if push else "No push was felt. Let go.", _free, FREE_SCANS)
+    return Press(place, taxel, float(mean[2].sum()), push)
+
+
+def _weigh(weight_g: float) -> Dialogue[float | None]:
+    """Counts of the summed z per [N]; None where nothing steady was laid on."""
+    steady: list[float] = []
+
+    def lies_still(reading: Reading) -> bool:
+        steady.append(float(reading.zeroed[2].sum()))
+        del steady[:-STEADY_SCANS]
+        low, high = min(np.abs(steady)), max(np.abs(steady))
+        return len(steady) == STEADY_SCANS and low > LEAST_WEIGHT_COUNTS and high - low < _leeway(high)
+
+    laid = yield from _wait(f"Lay {weight_g:g} g on the middle of the pad, hands off.", lies_still, 1)
+    if laid is None:
+        return None
+    counts = abs(float(np.mean(steady)))
+    yield from _wait("Good. Take it off.", _free, FREE_SCANS)
+    return counts / (weight_g / 1000 * GRAVITY_M_S2)
+
+
+def _leeway(counts: float) -> float:
+    return max(STEADY_COUNTS, STEADY_SHARE * counts)
+
+
+def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:
+    """Say it, and wait for so many readings in a row that fulfil it: these, or None when patience is at its end."""
+    reading = yield say
+    end_s = reading.time_s + PATIENCE_S
+    held: list[Reading] = []
+    while True:
+        held = [*held, reading] if fulfils(reading) else []
+        if len(held) >= scans:
+            return held
+        if reading.time_s > end_s:
+            return None
+        reading = yield None
+
+
+def _touched(reading: Reading) -> bool:
+    return reading.load_counts >= ON_COUNTS
+
+
+def _free(reading: Reading) -> bool:
+    return reading.load_counts < OFF_COUNTS

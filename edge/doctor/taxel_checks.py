@@ -1,0 +1,124 @@
+"""Are the taxels of one sensor well: silent, stuck, noisy, at rest where they can be, drifting."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.doctor.findings import Finding, Verdict
+from edge.doctor.samples import Samples, around_counts
+from edge.scene import NOISE_COUNTS
+from edge.taps import OFF_COUNTS
+from edge.taxels import RANGE_ENDS
+from firmware_bridge.baseline import CREEP_LIMIT_COUNTS
+from firmware_bridge.geometry import AXES
+
+NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))
+"""Of x, y, z: to look at, and wrong. 1.1 to 2.8 and 2 to 4.7 are on record; four taps need under eight."""
+STRAY_COUNTS: Final = 12_000.0
+"""How far from the others' a taxel's rest may lie on one axis: z of one model spans 9700 from end to end."""
+LONE_DRIFT_COUNTS: Final = 94.0
+"""So much in every taxel is a contact."""
+_OVERLOADED: Final = "overloaded, too near a magnet or steel, or broken: free it, and exchange the sensor if it stays"
+
+
+def check_silent(samples: Samples, wrong_map: bool) -> Finding:
+    """Taxels not heard. Half of them silent are no defect where the id map is wrong."""
+    silent = np.flatnonzero(~samples.living)
+    if not silent.size:
+        return Finding("silent taxels", "ok", "none")
+    measured = f"{_named(silent)} of {samples.living.size}"
+    if wrong_map:
+        return Finding("silent taxels", "not known", measured, "none", "see id map")
+    remedy = "broken, or a frame filter of the adapter leaves it out; the runtime makes up for up to eight"
+    return Finding("silent taxels", "wrong", measured, "none", remedy)
+
+
+def check_stuck(samples: Samples) -> Finding:
+    """Taxels that repeat one reading, or stand at an end of their range."""
+    stuck = samples.stuck()
+    rest = samples.rest_counts()
+    # What rests near an end and goes round the circle is noisy there; what has left the range is not.
+    ends = samples.living & (np.isin(rest, RANGE_ENDS) & (samples.noise_counts() == 0)).any(axis=0)
+    if ends.any():
+        return Finding("stuck taxels", "wrong", f"{_named(ends)} at an end of its range", "none", _OVERLOADED)
+    if not stuck.any():
+        return Finding("stuck taxels", "ok", "none")
+    if stuck[samples.living].all():
+        remedy = "one old scan is sent for ever: switch the sensor off and on, or restart the server that sends it"
+        return Finding("stuck taxels", "wrong", "all that are heard", "none", remedy)
+    return Finding("stuck taxels", "wrong", _named(stuck), "none", "broken: the runtime makes up for up to eight")
+
+
+def check_noise(samples: Samples) -> Finding:
+    """Standard deviation of each taxel at rest."""
+    noise = np.where(samples.stuck(), np.nan, samples.noise_counts())
+    if np.isnan(noise).all():
+        return Finding("noise", "not known", "no taxel sends new readings")
+    worst: Verdict = "ok"
+    for axis, (look, wrong) in enumerate(NOISE_LIMITS_COUNTS):
+        largest = np.nanmax(noise[axis])
+        if largest > wrong:
+            worst = "wrong"
+        elif largest > look and worst == "ok":
+            worst = "look"
+    limits = np.asarray(NOISE_LIMITS_COUNTS)[:, :1]
+    axis, taxel = _farthest(noise / limits)
+    medians = ", ".join(f"{name} {np.nanmedian(plane):.1f}" for name, plane in zip(AXES, noise, strict=True))
+    measured = f"{medians} counts; most on taxel {taxel} {AXES[axis]}, {noise[axis, taxel]:.1f}"
+    norm = f"{NOISE_COUNTS:.0f} counts, up to {' / '.join(f'{look:.0f}' for look, _ in NOISE_LIMITS_COUNTS)}"
+    loud = int((noise > limits).any(axis=0).sum())
+    remedy = (
+        "keep motors, magnets and power cables away from the pad, and keep it still; ask for --every-tap if it stays"
+        if loud > 1
+        else f"taxel {taxel} alone is loud: a loose magnet or a broken chip"
+    )
+    return Finding("noise", worst, measured, norm, "" if worst == "ok" else remedy)
+
+
+def check_rest(samples: Samples) -> Finding:
+    """What the free pad reads: of every model and axis something else, but alike within a pad."""
+    rest = samples.rest_counts()
+    if np.isnan(rest).all():
+        return Finding("rest levels", "not known", "no taxel heard")
+    spans = (f"{n} {np.nanmin(r):.0f} to {np.nanmax(r):.0f}" for n, r in zip(AXES, rest, strict=True))
+    apart = around_counts(rest - rest[:, np.flatnonzero(samples.living)[:1]])
+    stray = np.abs(around_counts(apart - np.nanmedian(apart, axis=1, keepdims=True)))
+    axis, taxel = _farthest(stray)
+    norm = f"alike within {STRAY_COUNTS:.0f} counts on an axis"
+    measured = f"{', '.join(spans)} counts"
+    if stray[axis, taxel] <= STRAY_COUNTS:
+        return Finding("rest levels", "ok", measured, norm)
+    remedy = f"taxel {taxel} {AXES[axis]} rests far from the others: pressed, too near a magnet, or broken"
+    return Finding("rest levels", "look", measured, norm, remedy)
+
+
+def check_drift(samples: Samples) -> Finding:
+    """How far the rest moved from the first tenth of the time to the last."""
+    duration_s = float(samples.time_s[-1])
+    drift = np.where(samples.stuck(), np.nan, samples.drift_counts())
+    if np.isnan(drift).all():
+        return Finding("drift", "not known", "no taxel sends new readings")
+    sizes = np.abs(drift)
+    axis, taxel = _farthest(sizes)
+    z_sum = float(np.nansum(drift[2]))
+    measured = (
+        f"{drift[axis, taxel]:+.0f} counts on taxel {taxel} {AXES[axis]}, summed z {z_sum:+.0f}, in {duration_s:.0f} s"
+    )
+    norm = f"under {CREEP_LIMIT_COUNTS:.0f} on a taxel"
+    remedy = "let it warm up for ten minutes, unloaded and still, then zero again"
+    if sizes[axis, taxel] > LONE_DRIFT_COUNTS or abs(z_sum) >= OFF_COUNTS:
+        return Finding("drift", "wrong", measured, norm, remedy)
+    if sizes[axis, taxel] > CREEP_LIMIT_COUNTS:
+        return Finding("drift", "look", measured, norm, remedy)
+    return Finding("drift", "ok", measured, norm)
+
+
+def _farthest(values: NDArray[np.floating]) -> tuple[int, int]:
+    axis, taxel = np.unravel_index(int(np.nanargmax(values)), values.shape)
+    return int(axis), int(taxel)
+
+
+def _named(taxels: NDArray[np.generic]) -> str:
+    numbers = np.flatnonzero(taxels) if taxels.dtype == bool else taxels
+    return f"taxel {', '.join(str(number) for number in numbers.tolist())}"

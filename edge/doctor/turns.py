@@ -1,0 +1,123 @@
+"""From presses on the four corners to how the pad sits: the turn of its taxels, and which way its axes point.
+
+Corners are those that a person sees; seen from above, as patterns are drawn, x points right and y down. Pushed towards
+the middle of the pad, its surface moves along both axes, and each corner has another pair of signs: so of two readings
+each can be only one axis, and either way round, and any three corners settle which.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.geometry import USPA44
+
+CORNERS: Final = ("top left", "top right", "bottom right", "bottom left")
+CORNER_PLACES: Final = (0, 3, 15, 12)
+TO_THE_MIDDLE: Final = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+"""Signs of x and y of a push from each corner to the middle."""
+FEWEST_CORNERS: Final = 3
+AGREEING: Final = 0.8
+"""How much of what was pushed must point along one axis: 1 where every corner does, 0.5 or 0 where one of four or
+three contradicts, 0 for the other axis."""
+_OFF_THE_MIDDLE: Final = 0.4
+"""In pitches: a press nearer to a midline than this is on no corner."""
+
+_GRID: Final = np.arange(USPA44.taxel_count).reshape(USPA44.rows, USPA44.cols)
+
+
+@dataclass(frozen=True)
+class Press:
+    """What one corner gave.
+
+    Attributes:
+        place: of the corner that was asked for, one of CORNER_PLACES.
+        taxel: the corner of the taxels that answered, one of CORNER_PLACES.
+        z_counts: summed z.
+        push_counts: by how much the summed x and y changed when pushed to the middle; None where no push was felt.
+    """
+
+    place: int
+    taxel: int
+    z_counts: float
+    push_counts: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Which way the axes point: `signs` of x and y, after the swap."""
+
+    swap_xy: bool
+    signs: tuple[int, int]
+
+
+def orders() -> dict[str, tuple[int, ...]]:
+    """The eight ways in which a pad can lie, by name; each gives the taxel of every place."""
+    turned = {
+        f"turned by {90 * quarters} degrees clockwise" if quarters else "as the id map says": np.rot90(_GRID, -quarters)
+        for quarters in range(4)
+    }
+    mirrored = {
+        name.replace("as the id map says", "mirrored left to right").replace(
+            "turned", "mirrored, then turned"
+        ): np.rot90(np.fliplr(_GRID), -quarters)
+        for quarters, name in enumerate(turned)
+    }
+    return {name: tuple(grid.ravel().tolist()) for name, grid in (turned | mirrored).items()}
+
+
+def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
+    """Which corner of the taxels z (rows, cols) lies on; None where it is none."""
+    sizes = np.abs(z_counts)
+    weights = np.clip(sizes - 0.2 * sizes.max(), 0, None)
+    if not weights.sum() > 0:
+        return None
+    rows, cols = np.indices(weights.shape)
+    down, right = (float((weights * at).sum() / weights.sum()) - (len(_GRID) - 1) / 2 for at in (rows, cols))
+    if min(abs(down), abs(right)) < _OFF_THE_MIDDLE:
+        return None
+    return int(_GRID[0 if down < 0 else -1, 0 if right < 0 else -1])
+
+
+def find_order(presses: Sequence[Press]) -> str | None:
+    """Name of the way the pad lies, of `orders`; None where it is none of the eight."""
+    for name, order in orders().items():
+        if all(order[press.place] == press.taxel for press in presses):
+            return name
+    return None
+
+
+def find_axes(presses: Sequence[Press]) -> Axes | None:
+    """Which way x and y point; None where too few pushes were felt, or where they contradict each other."""
+    pushes = [press for press in presses if press.push_counts is not None]
+    if len(pushes) < FEWEST_CORNERS:
+        return None
+    felt = np.array([press.push_counts for press in pushes])
+    expected = np.array([TO_THE_MIDDLE[CORNER_PLACES.index(press.place)] for press in pushes])
+    # A strong push at one corner must not outvote the others: a vote each.
+    votes = np.sign(felt).T @ expected / len(pushes)  # rows: the wire's x and y; columns: the pad's
+    for swap in (False, True):
+        along = votes[[1, 0]] if swap else votes
+        if (np.abs(np.diag(along)) >= AGREEING).all():
+            return Axes(swap, (int(np.sign(along[0, 0])), int(np.sign(along[1, 1]))))
+    return None
+
+
+def z_sign(presses: Sequence[Press]) -> int | None:
+    """1 if z rises under every press, -1 if it falls under every one; None where they contradict each other."""
+    signs = {int(np.sign(press.z_counts)) for press in presses}
+    return signs.pop() if len(signs) == 1 else None
+
+
+def why_no_order(presses: Sequence[Press]) -> str:
+    """What in these presses fits none of the eight ways."""
+    answered: Mapping[int, list[int]] = {
+        taxel: [press.place for press in presses if press.taxel == taxel] for taxel in CORNER_PLACES
+    }
+    twice = [places for places in answered.values() if len(places) > 1]
+    if twice:
+        names = " and ".join(CORNERS[CORNER_PLACES.index(place)] for place in twice[0])
+        return f"{names} answered at the same corner"
+    return "opposite corners do not answer at opposite corners"

@@ -1,0 +1,172 @@
+"""The sensor file: what was found of a sensor when it was put to work, in TOML that a person can read and mend.
+
+Here is what it tells, and the reading of it; `sensor_file_text` writes it.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.baseline import COUNTS_ON_CIRCLE, Baseline
+from firmware_bridge.bounded import read_bounded
+from firmware_bridge.errors import SensorFileError
+from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.scan import LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.sensor_file_table import (
+    REMEDY,
+    Table,
+    a_table,
+    flat_cells,
+    is_number,
+    one_of,
+    positive,
+    sensor_tables,
+    text_value,
+    truth,
+    whole,
+)
+from firmware_bridge.xela import ID_MAPS, USPA44_MAP
+
+FILE_FORMAT: Final = "tactile-sensor"
+FILE_VERSION: Final = 1
+MOST_BYTES: Final = 1 << 16
+"""A sensor takes 2 kB."""
+LONGEST_LINE_BYTES: Final = 2048
+"""Twice a line of all gains. Python's reader takes time that grows with the square of a key's dots: 60 kB took 27 s."""
+_GRID: Final = (USPA44.rows, USPA44.cols)
+
+
+@dataclass(frozen=True)
+class SensorEntry:
+    """What is known of one sensor: how it sits, its summed z per [N], and what its free pad reads."""
+
+    mounting: Mounting = field(default_factory=Mounting)
+    counts_per_newton: float | None = None
+    baseline: Baseline | None = None
+
+
+@dataclass(frozen=True)
+class SensorFile:
+    """What one file tells.
+
+    Attributes:
+        model: name of the id map, one of ID_MAPS.
+        adapter: serial number of the USB adapter, where it is known.
+        sensors: by sensor name.
+    """
+
+    model: str = USPA44_MAP.name
+    adapter: str | None = None
+    sensors: Mapping[str, SensorEntry] = field(default_factory=dict)
+
+    @property
+    def mountings(self) -> dict[str, Mounting]:
+        """How each sensor sits, by name."""
+        return {name: entry.mounting for name, entry in self.sensors.items()}
+
+    @property
+    def baselines(self) -> dict[str, Baseline]:
+        """The baselines there are, by sensor name."""
+        return {name: entry.baseline for name, entry in self.sensors.items() if entry.baseline is not None}
+
+    @property
+    def counts_per_newton(self) -> dict[str, float]:
+        """Summed z per [N] where it is known, by sensor name."""
+        known = {name: entry.counts_per_newton for name, entry in self.sensors.items()}
+        return {name: counts for name, counts in known.items() if counts is not None}
+
+
+def load_sensor_file(path: str | Path) -> SensorFile:
+    """Read a sensor file.
+
+    Raises:
+        SensorFileError: the file cannot be read, or says something that cannot be; the key is named.
+    """
+    path = Path(path)
+    try:
+        content = read_bounded(path, MOST_BYTES)
+        if max(map(len, content.splitlines()), default=0) > LONGEST_LINE_BYTES:
+            raise ValueError(f"a line longer than {LONGEST_LINE_BYTES} bytes")
+        document = tomllib.loads(content.decode())
+    except OSError as error:
+        raise SensorFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise SensorFileError(f"{path}: not TOML ({error}): {REMEDY}") from error
+    top = Table(path, "", document)
+    top.take("format", one_of(FILE_FORMAT))
+    top.take("version", one_of(FILE_VERSION))
+    model = top.take("model", one_of(*ID_MAPS))
+    adapter = top.take("adapter", text_value, required=False)
+    sensors = top.take("sensors", sensor_tables)
+    for name in sensors:
+        if not is_sensor_name(name):
+            top.refuse("sensors", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    top.end()
+    return SensorFile(model, adapter, {name: _entry(path, name, table) for name, table in sensors.items()})
+
+
+def _entry(path: Path, name: str, values: Mapping[str, Any]) -> SensorEntry:
+    table = Table(path, f"sensors.{name}.", values)
+    order = table.take("order", _order, required=False)
+    swap_xy = table.take("swap_xy", truth, required=False)
+    signs = table.take("signs", _signs, required=False)
+    gains = table.take("gains", _gains, required=False)
+    counts_per_newton = table.take("counts_per_newton", positive, required=False)
+    baseline = table.take("baseline", a_table, required=False)
+    table.end()
+    known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
+    mounting = Mounting(**{key: value for key, value in known.items() if value is not None})
+    return SensorEntry(mounting, counts_per_newton, None if baseline is None else _baseline(path, name, baseline))
+
+
+def _baseline(path: Path, name: str, values: Mapping[str, Any]) -> Baseline:
+    table = Table(path, f"sensors.{name}.baseline.", values)
+    expected_id = table.take("id", text_value)
+    created_unix_s = table.take("created_unix_s", positive)
+    scans = table.take("scans", whole)
+    axes = [table.take(axis, _rest_counts) for axis in AXES]
+    table.end()
+    baseline = Baseline.of(name, np.stack(axes), created_unix_s, scans, "file")
+    if baseline.id != expected_id:
+        table.refuse("id", repr(expected_id), f"'{baseline.id}', which the counts give; the baseline was changed")
+    return baseline
+
+
+def _order(value: Any) -> tuple[int, ...]:
+    expected = f"{_GRID[0]} rows of {_GRID[1]}, each of 0..{USPA44.taxel_count - 1} once"
+    cells = flat_cells(value, _GRID, expected)
+    if not all(type(cell) is int for cell in cells) or sorted(cells) != list(range(USPA44.taxel_count)):
+        raise ValueError(expected)
+    return tuple(cells)
+
+
+def _signs(value: Any) -> tuple[int, ...]:
+    expected = "1 or -1 for each of x, y, z"
+    signs = flat_cells(value, (len(AXES),), expected)
+    if not all(type(sign) is int and sign in (1, -1) for sign in signs):
+        raise ValueError(expected)
+    return tuple(signs)
+
+
+def _gains(value: Any) -> tuple[float, ...]:
+    expected = f"positive numbers, 3, or {len(AXES)} x {_GRID[0]} x {_GRID[1]}"
+    per_taxel = isinstance(value, list) and any(isinstance(one, list) for one in value)
+    cells = flat_cells(value, USPA44.scan_shape if per_taxel else (len(AXES),), expected)
+    if not all(is_number(cell) and cell > 0 for cell in cells):
+        raise ValueError(expected)
+    gains = [float(cell) for cell in cells]
+    return tuple(gains if per_taxel else [gain for gain in gains for _ in range(USPA44.taxel_count)])
+
+
+def _rest_counts(value: Any) -> NDArray[np.float64]:
+    expected = f"{_GRID[0]} rows of {_GRID[1]} numbers 0..{COUNTS_ON_CIRCLE - 1}"
+    cells = flat_cells(value, _GRID, expected)
+    if not all(is_number(cell) and 0 <= cell < COUNTS_ON_CIRCLE for cell in cells):
+        raise ValueError(expected)
+    return np.array(cells, dtype=np.float64).reshape(_GRID)

@@ -1,0 +1,102 @@
+"""Writing the sensor file, as text of our own making.
+
+A pad's numbers then lie in the file as they lie on the pad, and the comments say what they are.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.errors import SensorFileError
+from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.sensor_file import FILE_FORMAT, FILE_VERSION, SensorFile
+
+
+def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
+    """Write a sensor file. One that is there is replaced whole or not at all.
+
+    Raises:
+        SensorFileError: the file cannot be written, or holds a baseline with a taxel that was silent.
+    """
+    path = Path(path)
+    for name, entry in sensor_file.sensors.items():
+        if entry.baseline is not None and np.isnan(entry.baseline.counts).any():
+            raise SensorFileError(
+                f"{path}: a taxel of sensor {name} was silent while zeroing: zero again when it is not"
+            )
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(_text(sensor_file), encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise SensorFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _text(sensor_file: SensorFile) -> str:
+    adapter = [] if sensor_file.adapter is None else [f"adapter = {_quoted(sensor_file.adapter)}  # serial number"]
+    lines = [
+        "# A sensor as edge-sr doctor found it; edge-sr --sensor FILE goes by it.",
+        f'format = "{FILE_FORMAT}"',
+        f"version = {FILE_VERSION}",
+        f"model = {_quoted(sensor_file.model)}  # which CAN id is which taxel, as --id-map",
+        *adapter,
+    ]
+    for name, entry in sensor_file.sensors.items():
+        lines += ["", f"[sensors.{_quoted(name)}]", *_mounting_lines(entry.mounting)]
+        if entry.counts_per_newton is not None:
+            lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
+        if entry.baseline is not None:
+            lines += ["", f"[sensors.{_quoted(name)}.baseline]", *_baseline_lines(entry.baseline)]
+    return "\n".join([*lines, ""])
+
+
+def _mounting_lines(mounting: Mounting) -> list[str]:
+    gains = np.asarray(mounting.gains).reshape(len(AXES), -1)
+    even = (gains == gains[:, :1]).all()
+    gain_lines = (
+        [f"gains = {gains[:, 0].tolist()}  # of x, y and z"]
+        if even
+        else ["gains = [", *(line for plane in gains for line in [*_grid_lines("    ", plane.tolist()), "    ],"]), "]"]
+    )
+    return [
+        "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
+        *_grid_lines("order = ", list(mounting.order)),
+        "]",
+        f"swap_xy = {str(mounting.swap_xy).lower()}",
+        f"signs = {list(mounting.signs)}  # of x (to the right), y (down) and z (into the pad), after the swap",
+        *gain_lines,
+    ]
+
+
+def _baseline_lines(baseline: Baseline) -> list[str]:
+    axes = [
+        line
+        for axis, plane in zip(AXES, baseline.counts, strict=True)
+        for line in [*_grid_lines(f"{axis} = ", plane.ravel().tolist()), "]"]
+    ]
+    return [
+        "# What the free pad reads, in counts, place by place.",
+        f"id = {_quoted(baseline.id)}",
+        f"created_unix_s = {baseline.created_unix_s!r}",
+        f"scans = {baseline.scans}",
+        *axes,
+    ]
+
+
+def _grid_lines(start: str, values: Sequence[int | float]) -> list[str]:
+    """A grid row by row, without its last bracket."""
+    texts = [repr(value) for value in values]
+    width = max(map(len, texts))
+    indent = " " * (len(start) - len(start.lstrip()) + 4)
+    rows = (texts[at : at + USPA44.cols] for at in range(0, len(texts), USPA44.cols))
+    return [f"{start}[", *(f"{indent}[{', '.join(text.rjust(width) for text in row)}]," for row in rows)]
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,147 @@
+"""What a sensor file does to a run, and what goes before it."""
+
+import json
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, REST, FakeModel, make_scan, write_model
+from test_cli import assert_refused, records, run, write_recording
+
+from edge.commissioned import use_sensor_file
+from edge.doctor.options import doctor_parser
+from edge.errors import UsageError
+from edge.options import baseline_parser, run_parser
+from edge.runtime import Runtime
+from edge.taxels import TaxelWatch
+from firmware_bridge.baseline import Baseline, save_baselines
+from firmware_bridge.errors import RecordingError, SensorFileError
+from firmware_bridge.links.source import open_sources
+from firmware_bridge.mounting import AS_MAPPED, Mounting
+from firmware_bridge.sensor_file import SensorEntry, SensorFile
+from firmware_bridge.sensor_file_text import save_sensor_file
+
+TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, -1))
+
+
+@pytest.fixture
+def file(tmp_path):
+    known = SensorFile("XR1944", "D30BL366", {"4": SensorEntry(TURNED, 1180.0, BASELINE), "6": SensorEntry()})
+    save_sensor_file(tmp_path / "s.toml", known)
+    return tmp_path / "s.toml"
+
+
+def settled(parser, *arguments):
+    options = parser.parse_args(list(map(str, arguments)))
+    use_sensor_file(options)
+    return options
+
+
+@pytest.mark.parametrize("parser", [run_parser, baseline_parser, doctor_parser])
+def test_without_a_file_everything_is_as_it_was(parser):
+    options = settled(parser(), *(["--out", "x"] if parser is baseline_parser else []))
+    assert options.model_map.name == "uSPa44" and not options.mountings and options.source == []
+    assert options.baselines is None and options.counts_per_newton is None
+
+
+def test_a_file_gives_map_mounting_baseline_force_and_adapter(file):
+    options = settled(run_parser(), "--sensor", file)
+    assert options.model_map.name == "XR1944" and options.mountings["4"] == TURNED
+    assert options.baselines["4"].id == BASELINE.id and "6" not in options.baselines
+    assert options.counts_per_newton == {"4": 1180.0} and options.source == ["slcan:serial=D30BL366"]
+
+
+def test_a_baseline_of_another_order_is_refused(file, tmp_path):
+    """Each taxel would get another one's rest."""
+    save_baselines(tmp_path / "wired.json", [BASELINE])
+    with pytest.raises(RecordingError, match=r"wired\.json: the taxels of sensor 4 lay in another order: zero again"):
+        settled(run_parser(), "--sensor", file, "--baseline", tmp_path / "wired.json")
+    save_baselines(tmp_path / "placed.json", [BASELINE], {"4": TURNED.order})
+    assert settled(run_parser(), "--sensor", file, "--baseline", tmp_path / "placed.json").baselines
+    with pytest.raises(RecordingError, match="another order"):
+        settled(run_parser(), "--baseline", tmp_path / "placed.json")
+
+
+def test_what_is_typed_goes_before_the_file_but_for_another_id_map(file, tmp_path):
+    newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
+    save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
+    typed = ("--baseline", tmp_path / "zero.json", "--counts-per-newton", 900, "--source", "slcan:/dev/ttyUSB3")
+    options = settled(run_parser(), "--sensor", file, "--id-map", "XR1944", *typed)
+    assert options.baselines["4"].id == newer.id and options.counts_per_newton == 900
+    assert options.source == ["slcan:/dev/ttyUSB3"]
+    with pytest.raises(UsageError, match=r"--id-map A, but .*s\.toml is of a XR1944"):
+        settled(run_parser(), "--sensor", file, "--id-map", "A")
+
+
+def test_a_file_that_cannot_be_used_is_2(tmp_path):
+    (tmp_path / "s.toml").write_text("format = 1")
+    done = run("--sensor", tmp_path / "s.toml", "--source", "demo")
+    assert_refused(done, 2, "'format': 1, expected 'tactile-sensor'")
+    with pytest.raises(SensorFileError):
+        settled(doctor_parser(), "--sensor", tmp_path / "none.toml")
+
+
+def turned_rest():
+    """What the free pad reads where its taxels lie, (3, 4, 4)."""
+    return REST.reshape(3, 16)[:, list(TURNED.order)].reshape(3, 4, 4)
+
+
+def test_a_run_goes_by_it(tmp_path):
+    """A recording by edge-sr is in place; its axes are raw, and z falls where this sensor is pressed."""
+    write_model(tmp_path / "tiny.onnx")
+    write_recording(tmp_path / "taps.npz", [0] * 5 + [-3000] * 5)
+    entry = SensorEntry(Mounting(AS_MAPPED, signs=(1, 1, -1)), 1500.0, BASELINE)
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": entry}))
+    replay = ("--source", f"replay:{tmp_path}/taps.npz", "--model", tmp_path / "tiny.onnx", "--sink", "jsonl:-")
+    made = records(run("--sensor", tmp_path / "s.toml", *replay).stdout)
+    assert [record["contact"] for record in made] == [False] * 5 + [True] * 5
+    assert made[-1]["force_n"] == pytest.approx(2.0, abs=0.1) and made[-1]["counts"][2][1][1] < REST[2, 1, 1]
+    assert made[-1]["baseline"] == BASELINE.id and json.dumps(made[-1]["dead"]) == "{}"
+
+
+@pytest.mark.parametrize("press_counts", [900, 3000, 9000])
+def test_taxels_are_judged_by_the_axes_of_the_pad(press_counts):
+    """Uncorrected, a z that falls by so much is what no contact makes, and the taxel is taken for dead."""
+    mounting = Mounting(signs=(1, 1, -1))
+    scans = [make_scan(n, press_counts=-press_counts if n > 5 else 0, noise=3) for n in range(60)]
+    for scan in scans:
+        scan.counts.setflags(write=True)
+        scan.counts[2][scan.number % 2 :: 2] -= press_counts // 4 if scan.number > 5 else 0
+    corrected, plain = TaxelWatch((4, 4), mounting), TaxelWatch((4, 4))
+    for scan in scans:
+        zeroed = corrected.push(scan, BASELINE)
+        raw = plain.push(scan, BASELINE)
+    assert np.allclose(zeroed, mounting.correct(raw)) and not corrected.reasons
+    assert bool(plain.reasons) == (press_counts > 2800)
+
+
+def test_a_sensor_as_it_is_wired_is_not_corrected_at_all():
+    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, mountings={"4": Mounting()})
+    runtime.push(make_scan())
+    assert runtime._sensors["4"].watch._mounting is None
+
+
+def test_forces_are_those_of_each_sensor():
+    runtime = Runtime(
+        FakeModel(),
+        source="device",
+        baselines={name: Baseline.of(name, REST, 1000.0, 100, "file") for name in "46"},
+        counts_per_newton={"4": 1000.0},
+    )
+    assert runtime.push(make_scan(press_counts=3000)).force_n == pytest.approx(3.0)
+    assert runtime.push(make_scan(press_counts=3000, sensor="6")).force_n is None
+
+
+def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
+    """Sensor 4 of left and sensor 4 of right may sit in other ways."""
+    scan = make_scan()
+    header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
+    row = ",".join(map(str, scan.counts.reshape(3, 16).T.ravel()))
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "4.csv").write_text("\n".join([header, row, ""]))
+    texts = [f"{name}=replay:{tmp_path}/{name}/4.csv" for name in ("left", "right")]
+    found = {}
+    with open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])}) as link:
+        while not link.ended:
+            found |= {one.sensor: one.counts for one in link.read(0.2)}
+    assert np.array_equal(found["left/4"], turned_rest()) and np.array_equal(found["right/4"], REST)

@@ -1,0 +1,179 @@
+import re
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_mounting import mountings
+
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.errors import SensorFileError
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.xela import ID_MAPS
+
+names = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), min_size=1, max_size=9)
+
+
+def baseline(sensor, seed, created_unix_s=1.7e9):
+    counts = np.random.default_rng(seed).uniform(0, 65_535, (3, 4, 4))
+    return Baseline.of(sensor, counts, created_unix_s, 100, "file")
+
+
+@st.composite
+def sensor_files(draw):
+    entries = {}
+    for name in draw(st.sets(names, min_size=1, max_size=3)):
+        created = draw(st.sampled_from((1, 1.5, 1.7e9)))
+        entries[name] = SensorEntry(
+            draw(mountings),
+            draw(st.none() | st.floats(1e-3, 1e6)),
+            draw(st.none() | st.integers(0, 9).map(lambda seed, n=name, at=created: baseline(n, seed, at))),
+        )
+    return SensorFile(draw(st.sampled_from(sorted(ID_MAPS))), draw(st.none() | names), entries)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(sensor_files())
+def test_what_is_written_is_read(tmp_path, written):
+    save_sensor_file(tmp_path / "s.toml", written)
+    read = load_sensor_file(tmp_path / "s.toml")
+    assert (read.model, read.adapter, read.mountings) == (written.model, written.adapter, written.mountings)
+    assert read.counts_per_newton == written.counts_per_newton
+    assert {name: one.id for name, one in read.baselines.items()} == {
+        name: one.id for name, one in written.baselines.items()
+    }
+    assert max(map(len, (tmp_path / "s.toml").read_text().splitlines())) <= 120
+
+
+def test_a_person_can_read_the_pad_in_it(tmp_path):
+    turned = Mounting(order=tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()))
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(turned)}))
+    text = (tmp_path / "s.toml").read_text()
+    assert "    [ 3,  7, 11, 15],\n    [ 2,  6, 10, 14],\n" in text and "gains = [1.0, 1.0, 1.0]" in text
+    assert [one.name for one in tmp_path.iterdir()] == ["s.toml"]
+
+
+def test_a_short_file_by_hand_is_enough(tmp_path):
+    (tmp_path / "s.toml").write_text(
+        'format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.1]\nsigns = [1, -1, 1]\n'
+    )
+    read = load_sensor_file(tmp_path / "s.toml")
+    assert read.mountings == {"1": Mounting(signs=(1, -1, 1))} and read.model == "A"
+    assert read.adapter is None and not read.baselines and not read.counts_per_newton
+
+
+GRID = "[[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11], [12, 13, 14, 15]]"
+GOOD = {
+    "format": '"tactile-sensor"', "version": "1", "model": '"uSPa44"', "adapter": '"D30BL366"',
+    "order": GRID, "swap_xy": "false", "signs": "[1, 1, 1]", "gains": "[1, 1.5, 1]", "counts_per_newton": "1180",
+    "id": '"0000"', "created_unix_s": "1000.0", "scans": "100", "x": GRID, "y": GRID, "z": GRID,
+}  # fmt: skip
+
+
+def text_of(**changes):
+    values = GOOD | changes
+    tables = {"format": "", "order": "[sensors.4]\n", "id": "[sensors.4.baseline]\n"}
+    return "".join(tables.get(key, "") + (f"{key} = {value}\n" if value else "") for key, value in values.items())
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("format", '"tactile-baseline"', "'tactile-sensor'"),
+        ("format", "", "missing"),
+        ("version", "2", "expected 1"),
+        ("version", "true", "expected 1"),
+        ("model", '"XR9"', "'uSPa44' or 'XR1944' or 'A' or 'B'"),
+        ("adapter", '""', "printable"),
+        ("adapter", r'"a\nb"', "printable"),
+        ("adapter", "7", "printable"),
+        ("order", "[0, 1, 2]", "4 rows of 4"),
+        ("order", GRID.replace("15", "14"), "each of 0..15 once"),
+        ("order", GRID.replace("15", "15.0"), "each of 0..15 once"),
+        ("order", GRID.replace("[12,", "[12, 13,"), "4 rows of 4"),
+        ("swap_xy", "1", "true or false"),
+        ("signs", "[1, 1, 2]", "1 or -1 for each of x, y, z"),
+        ("signs", "[1, 1]", "1 or -1"),
+        ("signs", "[1, 1, true]", "1 or -1"),
+        ("gains", "[1, 1, 0]", "positive numbers, 3, or 3 x 4 x 4"),
+        ("gains", "[1, 1, inf]", "positive numbers"),
+        ("gains", f"[{GRID}, {GRID}]", "positive numbers, 3, or 3 x 4 x 4"),
+        ("counts_per_newton", "nan", "a positive number"),
+        ("counts_per_newton", "true", "a positive number"),
+        ("id", '"ffff"', "which the counts give; the baseline was changed"),
+        ("created_unix_s", "0", "a positive number"),
+        ("scans", "1.0", "a whole number from 1"),
+        ("x", GRID.replace("15", "65536"), "numbers 0..65535"),
+        ("z", GRID.replace("15", "nan"), "numbers 0..65535"),
+        ("y", "", "missing"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line_that_names_the_key(tmp_path, key, value, expected):
+    (tmp_path / "s.toml").write_text(text_of(**{key: value}))
+    with pytest.raises(SensorFileError, match=re.escape(expected)) as refused:
+        load_sensor_file(tmp_path / "s.toml")
+    assert f"{key}'" in str(refused.value) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith(f"{tmp_path}/s.toml, '")
+
+
+def test_that_text_is_refused_for_its_id_alone(tmp_path):
+    (tmp_path / "s.toml").write_text(text_of())
+    with pytest.raises(SensorFileError, match=r"'sensors\.4\.baseline\.id': '0000', expected '(\w+)'") as refused:
+        load_sensor_file(tmp_path / "s.toml")
+    right = re.findall(r"expected '(\w+)'", str(refused.value))[0]
+    (tmp_path / "s.toml").write_text(text_of(id=f'"{right}"'))
+    read = load_sensor_file(tmp_path / "s.toml").sensors["4"]
+    assert read.counts_per_newton == 1180 and read.mounting.gains[16:32] == (1.5,) * 16
+    assert read.baseline is not None and read.baseline.counts[2, 3, 3] == 15
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (text_of() + "colour = 1\n", "'sensors.4.baseline.colour': not known, expected one of id, created_unix_s"),
+        (text_of(swap_xy="false\nswap = true"), "'sensors.4.swap': not known"),
+        ("offset = 1\n" + text_of(), "'offset': not known"),
+        ('format = "tactile-sensor"\nversion = 1\nmodel = "A"\nsensors = 4\n', "a table for each sensor"),
+        ('format = "tactile-sensor"\nversion = 1\nmodel = "A"\n', "'sensors': missing"),
+        ("format = ", "not TOML"),
+        ("\udc80", "not TOML"),
+        (None, "cannot be read: No such file"),
+    ],
+)
+def test_what_is_no_sensor_file_is_refused(tmp_path, text, words):
+    path = tmp_path / "s.toml"
+    if text is not None:
+        path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(SensorFileError, match=re.escape(words)):
+        load_sensor_file(path)
+
+
+def test_a_file_that_cannot_be_replaced_stays_and_leaves_nothing_beside_it(tmp_path, monkeypatch):
+    path = tmp_path / "s.toml"
+    path.write_text("old")
+    monkeypatch.setattr(
+        "pathlib.Path.replace", lambda self, target: (_ for _ in ()).throw(OSError(28, "No space left"))
+    )
+    with pytest.raises(SensorFileError, match="cannot be written: No space left"):
+        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry()}))
+    assert path.read_text() == "old" and [one.name for one in tmp_path.iterdir()] == ["s.toml"]
+
+
+@pytest.mark.parametrize("name", ["", "4\\n", "x" * 65])
+def test_names_that_no_sensor_may_have_are_refused(tmp_path, name):
+    (tmp_path / "s.toml").write_text(f'format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors."{name}"]\n')
+    with pytest.raises(SensorFileError, match="names of 1 to 64 printable characters"):
+        load_sensor_file(tmp_path / "s.toml")
+
+
+def test_numpys_numbers_are_written_as_numbers_and_a_silent_taxel_not_at_all(tmp_path):
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(counts_per_newton=np.float64(1180.0))}))
+    assert load_sensor_file(tmp_path / "s.toml").sensors["4"].counts_per_newton == 1180.0
+    rest = np.full((3, 4, 4), 16_000.0)
+    rest[:, 1, 2] = np.nan
+    silent = Baseline.of("4", rest, 1.7e9, 100, "file")
+    with pytest.raises(SensorFileError, match="a taxel of sensor 4 was silent while zeroing: zero again"):
+        save_sensor_file(tmp_path / "t.toml", SensorFile(sensors={"4": SensorEntry(baseline=silent)}))
+    assert not (tmp_path / "t.toml").exists()
