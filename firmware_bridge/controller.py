@@ -1,6 +1,7 @@
 """A pretended XELA controller and the slcan adapter before it: what they say, and when. No I/O, no clock."""
 
 import heapq
+import math
 import random
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
@@ -8,7 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.recording import Track
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording import Recording, Track
 from firmware_bridge.scan import ABSENT
 from firmware_bridge.slcan import LAST_TIMESTAMP_MS, CanFrame, encode_frame
 from firmware_bridge.xela import USPA44_MAP
@@ -20,6 +23,7 @@ CR: Final = b"\r"
 BEL: Final = b"\a"
 _LONGEST_COMMAND: Final = 32
 _RIGHT_BITRATE: Final = 8
+_WRONG_BITRATE: Final = 6
 
 
 def scan_frames(counts: NDArray[np.int32], controller: int, noise: random.Random) -> list[CanFrame]:
@@ -43,6 +47,37 @@ class Controller(NamedTuple):
     track: Track
     can_id: int
     rate_hz: float
+
+
+def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate_hz: float | None) -> list[Controller]:
+    """Whoever plays these recordings on one bus.
+
+    Args:
+        recordings: each track is a controller.
+        can_ids: theirs, 0..15; by default 4, 6, 8, ...
+        rate_hz: scans a second of each; by default as recorded.
+
+    Raises:
+        ValueError: an id or the rate cannot be.
+        RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
+    """
+    tracks = [(recording, track) for recording in recordings for track in recording.tracks]
+    can_ids = can_ids or range(4, 4 + 2 * len(tracks), 2)
+    if not len(tracks) == len(can_ids) == len(set(can_ids)) or not all(0 <= can_id <= 15 for can_id in can_ids):
+        raise ValueError(f"controllers are {list(can_ids)}, expected {len(tracks)} different ones of 0..15")
+    controllers: list[Controller] = []
+    for (recording, track), can_id in zip(tracks, can_ids, strict=True):
+        if track.counts.shape[1:] != USPA44.scan_shape:
+            got = track.counts.shape[1:]
+            raise RecordingError(f"{recording.path}: scans of shape {got}, expected {USPA44.scan_shape}")
+        known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
+        own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
+        if own_rate_hz is None:
+            raise RecordingError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
+        if not 0 < own_rate_hz < math.inf:
+            raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
+        controllers.append(Controller(track, can_id, own_rate_hz))
+    return controllers
 
 
 def bus_timeline(
@@ -77,23 +112,42 @@ class SlcanAdapter:
         channel_open: it passes on what is on the bus.
         acknowledges: it answers commands (Lawicel's way); some firmwares never do.
         refused: commands it did not obey.
+        flags: what `F` tells, Lawicel's bits; telling clears them.
+        state: on the bus: a active, w warning, p passive, b bus-off, and then it hears nothing.
         sent: frames that it was given to put on the bus.
     """
 
-    def __init__(self, *, acknowledges: bool = True, left_open: bool = False) -> None:
-        """Switch it on; `left_open` as a client leaves it that died without closing."""
-        self.acknowledges = acknowledges
+    def __init__(self, *, acknowledges: bool = True, left_open: bool = False, old_canable: bool = False) -> None:
+        """Switch it on.
+
+        Args:
+            acknowledges: it answers commands.
+            left_open: as a client leaves it that died without closing.
+            old_canable: it answers nothing, and does nothing at all on commands that CANable's first firmware
+                does not know, such as time stamps and flags.
+        """
+        self.acknowledges = acknowledges and not old_canable
+        self.flags = 0
+        self.state = "a"
         self.channel_open = left_open
         self.refused = 0
         self.sent: list[bytes] = []
         self._bitrate = _RIGHT_BITRATE if left_open else None
+        self._known = b"OCSMAVTtRr" if old_canable else None
         self._timestamps = False
         self._pending = b""
 
     @property
     def hears_the_bus(self) -> bool:
-        """Open at the bitrate that the sensor uses."""
-        return self.channel_open and self._bitrate == _RIGHT_BITRATE
+        """Open at the bitrate that the sensor uses, and not bus-off."""
+        return self.channel_open and self._bitrate == _RIGHT_BITRATE and self.state != "b"
+
+    def begin_anew(self) -> None:
+        """Start up again, as after a reset: closed, and at a bitrate that is not the sensor's."""
+        self.channel_open = False
+        self._bitrate = _WRONG_BITRATE
+        self._timestamps = False
+        self._pending = b""
 
     def feed(self, data: bytes) -> bytes:
         """Take bytes from the client; the bytes to answer with."""
@@ -103,6 +157,11 @@ class SlcanAdapter:
         self.refused += answers.count(BEL)
         return b"".join(answers) if self.acknowledges else b""
 
+    def state_line(self, state: str, rx_errors: int, tx_errors: int) -> bytes:
+        """Change the state; what adapters that tell so say of it, as the kernel's driver reads it."""
+        self.state = state
+        return b"s%s%03d%03d\r" % (state.encode(), rx_errors, tx_errors) if self.channel_open else b""
+
     def encode(self, frame: CanFrame, time_s: float) -> bytes:
         """A frame from the bus as the client gets it."""
         if self._timestamps:
@@ -111,12 +170,17 @@ class SlcanAdapter:
 
     def _obey(self, command: bytes) -> bytes:
         name, value = command[:1], command[1:]
+        if self._known is not None and name not in self._known:
+            return b""
         if name == b"t" and self.channel_open:
             self.sent = [*self.sent[-15:], command]
             return b"z" + CR
         if name == b"V" and not value:
             return b"V1013" + CR
         if self.channel_open:
+            if command == b"F":
+                flags, self.flags = self.flags, 0
+                return b"F%02X" % flags + CR
             if command != b"C":
                 return BEL
             self.channel_open = False

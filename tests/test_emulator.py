@@ -14,14 +14,15 @@ import pytest
 import serial
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
 
-from firmware_bridge.assembler import SlcanScans
 from firmware_bridge.controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
-from firmware_bridge.emulator import Emulator, main
+from firmware_bridge.emulator import main
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording import Track
 from firmware_bridge.scan import ABSENT
 from firmware_bridge.slcan import CanFrame
+from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.xela import USPA44_MAP, decode
 
 # What the controller says.
@@ -152,6 +153,30 @@ def test_time_stamps_are_on_request_and_wrap_each_minute():
     assert adapter.encode(FRAME, 60.0) == b"t0048937E317E1593120F\r"
 
 
+def test_flags_are_told_while_it_is_open_and_cleared_by_telling():
+    adapter = SlcanAdapter(left_open=True)
+    assert adapter.feed(b"F\r") == b"F00\r"
+    adapter.flags = 0x8A
+    assert adapter.feed(b"F\r") + adapter.feed(b"F\r") == b"F8A\rF00\r"
+    assert adapter.feed(b"F1\r") == b"\a" and adapter.feed(b"C\r") == b"\r"
+    assert adapter.feed(b"F\r") == b"\a" and adapter.refused == 2
+
+
+def test_the_state_is_told_as_it_changes_and_bus_off_hears_nothing():
+    adapter = SlcanAdapter(left_open=True)
+    assert adapter.state_line("w", 96, 0) == b"sw096000\r" and adapter.hears_the_bus
+    assert adapter.state_line("b", 256, 256) == b"sb256256\r" and not adapter.hears_the_bus
+    adapter.feed(b"C\r")
+    assert adapter.state_line("a", 0, 0) == b"", "who is closed tells nothing"
+
+
+def test_old_canable_firmware_answers_nothing_and_knows_little():
+    adapter = SlcanAdapter(old_canable=True)
+    assert adapter.feed(b"C\rS8\rZ1\rO\rF\rV\rN\r") == b"" and adapter.hears_the_bus
+    assert adapter.encode(FRAME, 1.0) == b"t0048937E317E1593120F\r", "no time stamp"
+    assert adapter.refused == 1
+
+
 def test_an_adapter_left_open():
     assert SlcanAdapter(left_open=True).hears_the_bus
 
@@ -256,6 +281,25 @@ def test_the_cable_out():
             for _ in range(100):
                 port.read(1000)
         emulator.hang_up()
+
+
+def test_a_link_replaces_links_alone(tmp_path):
+    """Neither a user's file at its place nor one beside it is touched."""
+    link, beside = tmp_path / "skin", tmp_path / "skin.new"
+    beside.write_text("mine")
+    for make in (lambda: link.write_text("mine"), link.mkdir):
+        make()
+        with pytest.raises(ValueError, match=r"link is .*skin, expected a path that is free or a link: a file"):
+            Emulator([make_recording(3)], link=link)
+        assert link.exists() and not link.is_symlink()
+        link.unlink() if link.is_file() else link.rmdir()
+    link.symlink_to("/nowhere")  # as one that was killed leaves it
+    with Emulator([make_recording(3)], link=link) as emulator:
+        assert emulator.port == str(link) and link.resolve() != Path("/nowhere")
+        link.unlink()
+        link.write_text("mine by now")
+    assert sorted(tmp_path.iterdir()) == [link, beside]
+    assert (link.read_text(), beside.read_text()) == ("mine by now", "mine")
 
 
 def test_nothing_stays_open():
@@ -366,14 +410,29 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
     for arguments, words in (
         ([str(tmp_path / "gone.csv")], "cannot be read"),
         ([str(path)], "--rate-hz"),
-        ([str(path), "--controller", "x"], "invalid literal"),
+        ([str(path), "--controller", "x"], "'x' are no controller ids, such as 4,6"),
+        ([str(path), "--rate-hz", "9", "--link", "/nonexist/x"], "link is /nonexist/x, expected a path in a folder"),
+        ([str(path), "--rate-hz", "9", "--link", str(path)], "a.csv, expected a path that is free or a link"),
+        ([str(path), "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),
+        ([str(path), "--rate-hz", "9", "--truth", "/proc/x"], "/proc/x: cannot be written: No such file"),
+        ([str(path), "--rate-hz", "9", "--stamps", "/nonexist/x"], "/nonexist/x: cannot be written: No such file"),
         ([str(path), "--rate-hz", "0"], "positive"),
         ([str(path), "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),
     ):
         with pytest.raises(SystemExit) as ended:
             main(arguments)
         assert ended.value.code == 2
-        assert words in capsys.readouterr().err
+        assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):
+    def interrupt(emulator, timeout_s):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Emulator, "wait", interrupt)
+    path, link = write_recording(tmp_path / "a.csv", make_counts(1)), tmp_path / "skin"
+    assert main([str(path), "--rate-hz", "100", "--link", str(link)]) == 130
+    assert capsys.readouterr() == (f"{link}\n", "") and not link.is_symlink()
 
 
 def test_the_terminal_is_left_for_the_client_to_set_up():

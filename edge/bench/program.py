@@ -93,8 +93,10 @@ class Program:
             now_ns = time.monotonic_ns()
             if not line:
                 raise BenchError(f"edge-sr ended with {self._process.wait()} while it was measured")
-            # Nothing is parsed meanwhile: it would take the program's processor time away.
-            got.append((now_ns, line.partition(_MAPS)[0] + b"}"))
+            # Nothing is parsed meanwhile: it would take the program's processor time away. An event has no maps.
+            head, maps, _ = line.partition(_MAPS)
+            if maps:
+                got.append((now_ns, head + b"}"))
         return [Line(time_ns, json.loads(head)) for time_ns, head in got]
 
     def first_pattern_s(self) -> float:
@@ -156,7 +158,7 @@ def _emulator(folder: Path, play: Play) -> Iterator[tuple[str, Path]]:
     options = ["--loop", "--rate-hz", str(play.rate_hz), "--frame-us", str(play.frame_us), "--stamps", str(stamps)]
     command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", *options, *map(str, files)]
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=_environment(), start_new_session=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
     ) as emulator:
         try:
             port = emulator.stdout.readline().decode().strip() if emulator.stdout else ""
@@ -176,7 +178,7 @@ def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=_environment(),
+        env=environment(),
         start_new_session=True,
     ) as process:
         try:
@@ -185,7 +187,8 @@ def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
             process.kill()  # its last records are of no interest, and nobody reads them
 
 
-def _environment() -> dict[str, str]:
+def environment() -> dict[str, str]:
+    """For processes of the program's own parts."""
     # The same packages as here, whichever way this process came to find them.
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])}
 

@@ -88,8 +88,8 @@ def judged(windows: Sequence[Window]) -> Soak:
     """What so many windows, three at least, say."""
     third = len(windows) // 3
     first, last = (np.median([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))
-    slope, half = _slope([w.end_s / 60 for w in windows], [w.resident_mb for w in windows])
-    return Soak(windows[-1].end_s / 60, slope, half, float(last / first), tuple(windows))
+    growth, half = slope([w.end_s / 60 for w in windows], [w.resident_mb for w in windows])
+    return Soak(windows[-1].end_s / 60, growth, half, float(last / first), tuple(windows))
 
 
 def _windows(program: Program, count: int) -> Iterator[Window]:
@@ -104,12 +104,12 @@ def _windows(program: Program, count: int) -> Iterator[Window]:
         yield Window(end_s, program.resident_mb(), quiet_us, threads, descriptors, overruns)
 
 
-def _slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
+def slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
     """Least-squares slope, and half of its 95 % interval."""
     centred = np.asarray(times) - np.mean(times)
-    slope = float(centred @ np.asarray(values) / (centred @ centred))
-    rest = np.asarray(values) - np.mean(values) - slope * centred
-    return slope, float(1.96 * np.sqrt(rest @ rest / (len(times) - 2) / (centred @ centred)))
+    steepness = float(centred @ np.asarray(values) / (centred @ centred))
+    rest = np.asarray(values) - np.mean(values) - steepness * centred
+    return steepness, float(1.96 * np.sqrt(rest @ rest / (len(times) - 2) / (centred @ centred)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

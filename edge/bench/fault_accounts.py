@@ -1,0 +1,62 @@
+"""What was lost and what came in a run among faults, counted by the injector and by the program."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from edge.bench.fault_judge import Found
+from firmware_bridge.truth_files import Told
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """One count, by the injector and by the program.
+
+    Attributes:
+        name: of what.
+        told: by the injector, or found in records.
+        counted: by the program.
+        unknown: by how much the first may be more, or less where it is below zero: what was in records that were left
+            out for a reader that was too slow, here ourselves.
+    """
+
+    name: str
+    told: int
+    counted: int
+    unknown: int = 0
+
+    @property
+    def exact(self) -> bool:
+        """They agree."""
+        return min(self.unknown, 0) <= self.told - self.counted <= max(self.unknown, 0)
+
+
+_RECEIVED = re.compile(r"^received: (.*)$", re.MULTILINE)
+
+
+def counted_at_the_end(said: str) -> dict[str, int]:
+    """The counters in the summary of a run: what came behind its last record is in them, too."""
+    lines = _RECEIVED.findall(said)
+    pairs = (text.rpartition(" ") for text in lines[-1].split(", ")) if lines else ()
+    return {name: int(count) for name, _, count in pairs if count.isdigit()}
+
+
+def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
+    """What was lost and what came, by both sides; `said` is the program's summary."""
+    truth: Mapping[str, Any] = told.accounts["counters"]
+    counted = {**found.last_counters, **counted_at_the_end(said)}
+    left_out = counted.get("unwritten", 0)
+    readings = truth["frames"] - truth["foreign"]
+    explained = counted["duplicates"] + counted["unconfirmed"] + counted.get("abandoned", 0)
+    return [
+        Account("frames", truth["frames"], counted["frames"]),
+        Account("foreign frames", truth["foreign"], counted["foreign"]),
+        Account("lines that are no frame", truth["bad_lines"], counted["bad_lines"] + counted["non_ascii_lines"]),
+        Account("bytes of no frame", truth["skipped_bytes"], counted["skipped_bytes"]),
+        Account("readings", readings, counted["readings"]),
+        Account("frames twice in a row", truth["duplicates"], counted["duplicates"]),
+        Account("readings in no record", found.unshown, explained, 16 * left_out),
+        Account("taxels missing in records", found.missing, counted["missing_taxels"], -16 * left_out),
+        Account("records of scans", found.records + left_out, counted["scans"]),
+    ]

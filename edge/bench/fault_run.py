@@ -1,0 +1,135 @@
+"""`edge-sr` among faults: two fingers on one bus, sinks and consumers that fail, everything kept for the judge."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge.bench.errors import BenchError
+from edge.bench.fault_played import playing_emulator
+from edge.bench.fault_records import Ran, Seen, Size, in_thread, keep_lines, read_records
+from edge.bench.fault_sinks import failing_sinks, fill_up, look_into_files, read_and_go, read_slowly
+from edge.bench.program import CONTROLLERS, REST_COUNTS, environment
+from firmware_bridge.baseline import Baseline, save_baselines
+from firmware_bridge.faults.stretches import parse_stretches
+from firmware_bridge.truth_files import EVENTS, read_truth
+
+CALM_S: Final = 4.0
+"""Before the first fault: what a run without faults is like."""
+WATCH_S: Final = 1.0
+QUIET_S: Final = 0.4
+"""Without a record, so that everything is read."""
+END_TIMEOUT_S: Final = 20.0
+CLOCK_STEP_S: Final = 3600.0
+_CLOCK: Final = f"""
+import time
+_true, _start = time.time, time.monotonic()
+def _stepping():
+    since = time.monotonic() - _start
+    return _true() + (0.0 if since < 3 else {CLOCK_STEP_S} if since < 6 else -{CLOCK_STEP_S})
+time.time = _stepping
+"""
+"""The wall clock of a machine cannot be set here: that of the program's own Python is stepped on and back instead."""
+
+
+def run_among_faults(faults: str, seed: int, folder: Path, *, options: Sequence[str] = ()) -> Ran:
+    """Run the program and keep all there is to judge it by.
+
+    Args:
+        faults: as the emulator takes them; when the last has begun, and silenced all, the program is ended.
+        seed: of faults.
+        folder: for everything that is written.
+        options: more of edge-sr's.
+
+    Raises:
+        BenchError: the emulator or edge-sr did not start.
+    """
+    ran = Ran()
+    with playing_emulator(folder, faults, seed) as port, _program(folder, port, options) as process:
+        reader = in_thread(read_records, process.stdout, ran.seen)
+        errors: list[bytes] = []
+        talker = in_thread(keep_lines, process.stderr, errors)
+        slow = in_thread(read_slowly, folder / "slow.fifo", ran)
+        gone = in_thread(read_and_go, folder / "gone.fifo")
+        _watch(process, f'"stretch": "{parse_stretches(faults, seed)[-1]}"', folder / "truth" / EVENTS, ran)
+        process.send_signal(signal.SIGINT)
+        try:
+            ran.exit_code = process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        for thread in (reader, talker, slow, gone):
+            thread.join(END_TIMEOUT_S)
+        ran.said = b"".join(errors).decode(errors="replace")
+    ran.told = read_truth(folder / "truth")
+    ran.clock_steps_s = _clock_steps_s(ran.seen)
+    look_into_files(folder, ran)
+    return ran
+
+
+def _clock_steps_s(seen: Sequence[Seen]) -> list[float]:
+    taken_s = [  # by the wall clock: what the record says of the age, less the time by the clock that is not stepped
+        one.head["baseline_age_s"] - one.head["time_ns"] / 1e9
+        for one in seen
+        if one.head.get("baseline_age_s") is not None
+    ]
+    return [round(later - taken) for taken, later in pairwise(taken_s) if abs(later - taken) > CLOCK_STEP_S / 2]
+
+
+@contextmanager
+def _program(folder: Path, port: str, options: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+    rest = np.asarray(REST_COUNTS)[:, None, None] + np.zeros((3, 4, 4))
+    rest[2] += 37 * np.arange(16).reshape(4, 4)
+    baselines = [Baseline.of(name, rest.astype(np.float32), time.time(), 100, "file") for name in CONTROLLERS]
+    save_baselines(folder / "zero.json", baselines)
+    (folder / "clock").mkdir()
+    (folder / "clock" / "sitecustomize.py").write_text(_CLOCK)
+    clocked = environment()
+    clocked["PYTHONPATH"] = os.pathsep.join([str(folder / "clock"), clocked["PYTHONPATH"]])
+    command = [sys.executable, "-m", "edge.cli", "--source", f"slcan:{port}", "--baseline", str(folder / "zero.json")]
+    for sink in ("jsonl:-", *failing_sinks(folder)):
+        command += ["--sink", sink]
+    with subprocess.Popen(
+        [*command, *options],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=clocked,
+        start_new_session=True,
+        preexec_fn=fill_up,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def _watch(process: subprocess.Popen[bytes], last_fault: str, events: Path, ran: Ran) -> None:
+    """Let it run until the last fault has begun and no record comes any more, or until it ends."""
+    start_s = time.monotonic()
+    while process.poll() is None and not ran.seen:
+        if time.monotonic() - start_s > END_TIMEOUT_S:
+            raise BenchError("edge-sr gave no record")
+        time.sleep(0.01)
+    proc = Path(f"/proc/{process.pid}")
+    start_s = looked_s = time.monotonic()
+    over = False
+    while process.poll() is None and not (over and time.monotonic() > ran.seen[-1].read_ns / 1e9 + QUIET_S):
+        time.sleep(0.05)
+        if over or time.monotonic() < looked_s + WATCH_S:
+            continue
+        looked_s = time.monotonic()
+        over = last_fault in events.read_text()
+        try:
+            resident_mb = int((proc / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+            threads, descriptors = (len(list((proc / name).iterdir())) for name in ("task", "fd"))
+        except OSError:
+            break
+        ran.sizes.append(Size(looked_s - start_s, resident_mb, threads, descriptors))

@@ -1,0 +1,137 @@
+"""Faults of the bytes between adapter and reader.
+
+None makes a well-formed frame that was never sent but `flipped`, which says so. For that, noise holds no line end but
+its own, and a line is cut from its end and never down to a whole frame.
+"""
+
+import random
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from firmware_bridge.faults.frames import BusFrame, share
+
+LINE_ENDS: Final = b"\r\a"
+SHORTEST_NOISE: Final = 12
+"""Anything shorter might be an adapter's answer."""
+LONGEST_NOISE: Final = 200
+MOST_LEFT_BYTES: Final = 20
+"""Of a line that is cut: one less than a whole frame has without a time stamp."""
+_NOISE_BYTES: Final = bytes(value for value in range(256) if value not in LINE_ENDS)
+_READING_DIGITS: Final = range(7, 19)
+"""Of a line: those of x, y and z."""
+
+
+class Piece(NamedTuple):
+    """Bytes for the reader.
+
+    Attributes:
+        data: what goes out.
+        sent: the frame of which `data` is the whole line or, where it is lost, was; None for what never was one.
+        answer: it is the adapter's answer to a command.
+    """
+
+    data: bytes
+    sent: BusFrame | None
+    answer: bool = False
+
+
+class LineFault(ABC):
+    """Something that goes wrong on the line for a while, with a share of what goes over it."""
+
+    usual_share = 0.02
+
+    def __init__(self, draw: random.Random, parameter: str) -> None:
+        """Begin; `parameter` is the share as the user wrote it, empty for the usual one.
+
+        Raises:
+            ValueError: it is no share.
+        """
+        self.draw = draw
+        self._share = share(parameter, self.usual_share)
+
+    def take(self, piece: Piece) -> Iterator[Piece]:
+        """What there is instead of a line whose frame is not lost yet."""
+        sent = piece.sent
+        if sent is None or sent.lost or self.draw.random() >= self._share:
+            yield piece
+        else:
+            yield from self.strike(piece.data, sent)
+
+    @abstractmethod
+    def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
+        """What there is instead of it."""
+
+
+class Garbage(LineFault):
+    """Bursts of any bytes before a line, every other one with a line end."""
+
+    def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
+        """Put one before it."""
+        length = self.draw.randint(SHORTEST_NOISE, LONGEST_NOISE)
+        yield Piece(bytes(self.draw.choices(_NOISE_BYTES, k=length)) + self.draw.choice((b"", b"\r")), None)
+        yield Piece(line, sent)
+
+
+class Truncated(LineFault):
+    """Lines that end too soon."""
+
+    def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
+        """Cut it."""
+        yield Piece(line[: self.draw.randint(1, MOST_LEFT_BYTES)] + b"\r", sent._replace(fate="truncated"))
+
+
+class Merged(LineFault):
+    """Lines whose end is missing, or more of it, so that the next one follows at once."""
+
+    def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
+        """Leave its end away."""
+        yield Piece(line[: self.draw.randint(1, len(line) - 1)], sent._replace(fate="merged"))
+
+
+class NonAscii(LineFault):
+    """Lines with a byte in them that is no character."""
+
+    def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
+        """Set the highest bit of a byte."""
+        at = self.draw.randrange(len(line) - 1)
+        spoilt = line[:at] + bytes([line[at] | 0x80]) + line[at + 1 :]
+        yield Piece(spoilt, sent._replace(fate="non-ascii"))
+
+
+class Flipped(LineFault):
+    """Readings with another digit than was sent. The wire has no checksum: nobody can tell."""
+
+    usual_share = 0.002
+
+    def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
+        """Change a digit of the reading."""
+        if sent.fate == "foreign":
+            yield Piece(line, sent)
+            return
+        at = self.draw.choice(_READING_DIGITS)
+        digit = self.draw.choice([value for value in b"0123456789ABCDEF" if value != line[at]])
+        line = line[:at] + bytes([digit]) + line[at + 1 :]
+        frame = sent.frame._replace(data=bytes.fromhex(line[5:21].decode()))
+        yield Piece(line, sent._replace(frame=frame, fate="flipped"))
+
+
+LINE_FAULTS: Final[Mapping[str, Callable[[random.Random, str], LineFault]]] = MappingProxyType(
+    {
+        "garbage": Garbage,
+        "truncated": Truncated,
+        "merged": Merged,
+        "non-ascii": NonAscii,
+        "flipped": Flipped,
+    }
+)
+
+
+def through(faults: Sequence[LineFault], piece: Piece) -> Iterator[Piece]:
+    """A piece through one fault after the other."""
+    if not faults:
+        yield piece
+        return
+    for left in faults[0].take(piece):
+        yield from through(faults[1:], left)

@@ -1,0 +1,152 @@
+"""What became of every frame, and what its reader must have counted.
+
+It reads no line: it knows by its own bookkeeping where in the stream whole frames end, and calls everything else what
+it is. So it cannot share a mistake with the decoder.
+"""
+
+import struct
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from firmware_bridge.faults.frames import READ, BusFrame
+from firmware_bridge.faults.lines import LINE_ENDS, Piece
+from firmware_bridge.xela import USPA44_MAP
+
+FATES: Final = (
+    *READ,
+    *("lost", "dead", "silent", "vanished", "bus-off"),
+    *("truncated", "merged", "non-ascii"),
+    *("overflow", "unread", "unheard"),
+)
+"""Of frames. Those that the faults do not name: no room, since the reader was too slow; not fetched when the channel
+was closed; and sent while nobody listened."""
+ROW: Final = np.dtype(
+    [
+        ("handed_ns", "<i8"),
+        ("bus_us", "<i8"),
+        ("cycle", "<u4"),
+        ("can_id", "<u2"),
+        ("xyz", "<u2", 3),
+        ("opening", "<u2"),
+        ("fate", "u1"),
+    ],
+    align=False,
+)
+"""A frame in a log: when it was handed on, monotonic, in [ns]; when it was on the bus, in [us] since the first scan;
+cycle and id; the reading that the reader gets; how often the channel had been opened; and the number of its fate."""
+_pack = struct.Struct("<qqIH3HHB").pack
+_xyz = struct.Struct(">xHHHx").unpack
+_FATE_NUMBERS: Final = {fate: number for number, fate in enumerate(FATES)}
+
+
+class Truth:
+    """Follows the bytes that go to the reader.
+
+    Attributes:
+        fates: how many frames met which.
+        frames: that the reader must have seen whole.
+        foreign: of these, frames of somebody else.
+        bad_lines: lines that are no frame, with or without bytes that are no characters.
+        skipped_bytes: bytes that belong to no frame.
+        duplicates: frames like that sensor's frame before.
+        openings: how often the channel was opened.
+        noise: bursts that never were a frame.
+    """
+
+    def __init__(self, log: Callable[[bytes], object] = lambda row: None) -> None:
+        """Know of nothing yet; `log` is told of every frame once its fate is certain, a ROW each."""
+        self.fates: Counter[str] = Counter()
+        self.frames = 0
+        self.foreign = 0
+        self.bad_lines = 0
+        self.skipped_bytes = 0
+        self.duplicates = 0
+        self.openings = 0
+        self.noise = 0
+        self._log = log
+        self._on_the_way: deque[tuple[Piece, int, int]] = deque()
+        self._on_the_way_bytes = 0
+        self._pending = 0
+        self._last: dict[str, tuple[int, tuple[int, ...]]] = {}
+
+    def counters(self) -> dict[str, int]:
+        """What a reader must have counted, by its names; `bad_lines` holds `non_ascii_lines`."""
+        names = ("frames", "foreign", "bad_lines", "skipped_bytes", "duplicates")
+        return {name: getattr(self, name) for name in names}
+
+    def hand_on(self, piece: Piece, written_bytes: int, time_ns: int) -> None:
+        """Keep what went out, as far as there was room for it."""
+        if written_bytes < len(piece.data) and piece.sent is not None and not piece.sent.lost:
+            piece = piece._replace(sent=piece.sent._replace(fate="overflow"))
+        self.noise += piece.sent is None and not piece.answer
+        self._on_the_way.append((piece, written_bytes, time_ns))
+        self._on_the_way_bytes += written_bytes
+
+    def settle(self, unread_bytes: int) -> None:
+        """The reader has fetched all but so many bytes."""
+        while self._on_the_way and self._on_the_way_bytes - self._on_the_way[0][1] >= unread_bytes:
+            piece, written_bytes, time_ns = self._on_the_way.popleft()
+            self._on_the_way_bytes -= written_bytes
+            self._read(piece, written_bytes, time_ns)
+
+    def open_channel(self) -> None:
+        """The reader begins anew: what it had of a line belongs to nothing."""
+        self.openings += 1
+        self.skipped_bytes += self._pending
+        self._pending = 0
+        self._last.clear()
+
+    def close_channel(self, unread_bytes: int) -> None:
+        """The reader has gone and left so many bytes."""
+        self.settle(unread_bytes)
+        for piece, written_bytes, time_ns in self._on_the_way:
+            fetched = max(0, self._on_the_way_bytes - unread_bytes)
+            self._pending += fetched  # the head of a line at most: settled are all that were fetched whole
+            self._on_the_way_bytes -= written_bytes
+            unread_bytes -= written_bytes - fetched
+            if piece.sent is not None:
+                lost = piece.sent if piece.sent.lost else piece.sent._replace(fate="unread")
+                self.lose(lost, time_ns)
+        self._on_the_way.clear()
+        self._on_the_way_bytes = 0
+
+    def lose(self, sent: BusFrame, time_ns: int) -> None:
+        """A frame of which no byte is read; its fate says why."""
+        self._keep(sent, time_ns)
+
+    def _read(self, piece: Piece, written_bytes: int, time_ns: int) -> None:
+        sent = piece.sent
+        if sent is not None and not sent.lost:
+            self.skipped_bytes += self._pending
+            self._pending = 0
+            self.frames += 1
+            self._keep(sent, time_ns)
+            return
+        if sent is not None:
+            self._keep(sent, time_ns)
+        if piece.answer and not self._pending:
+            return
+        for byte in piece.data[:written_bytes]:
+            if byte not in LINE_ENDS:
+                self._pending += 1
+            elif self._pending:
+                self.bad_lines += 1
+                self.skipped_bytes += self._pending
+                self._pending = 0
+
+    def _keep(self, sent: BusFrame, time_ns: int) -> None:
+        self.fates[sent.fate] += 1
+        place = USPA44_MAP.taxels.get(sent.frame.can_id)
+        xyz = _xyz(sent.frame.data) if len(sent.frame.data) == 8 else (0, 0, 0)
+        if not sent.lost:
+            if place is None:
+                self.foreign += 1
+            else:
+                reading = (sent.frame.can_id, xyz)
+                self.duplicates += self._last.get(place[0]) == reading
+                self._last[place[0]] = reading
+        fate, bus_us = _FATE_NUMBERS[sent.fate], round(sent.time_s * 1e6)
+        self._log(_pack(time_ns, bus_us, sent.cycle, sent.frame.can_id, *xyz, self.openings, fate))

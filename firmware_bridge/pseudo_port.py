@@ -1,0 +1,122 @@
+"""The far end of a pseudo-terminal: what stands for an adapter's port, its cable and its line."""
+
+import fcntl
+import math
+import os
+import random
+import select
+import struct
+import termios
+import time
+from pathlib import Path
+from typing import Final
+
+from firmware_bridge.errors import DeviceError
+
+LINE_SPEED_BAUD: Final = 3_000_000
+_SPEEDS_BAUD: Final = {
+    getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
+}
+
+
+class PseudoPort:
+    """A port whose clients may come and go, and be cut off.
+
+    Attributes:
+        path: where a client finds it: the pseudo-terminal, or the link that was asked for.
+        plugged: the cable is in.
+    """
+
+    def __init__(self, link: Path | None = None, *, ignores_line_speed: bool = False, seed: int = 0) -> None:
+        """Prepare a port; it is not plugged in yet.
+
+        Args:
+            link: made to point to the pseudo-terminal of the day, as udev keeps one by serial number.
+            ignores_line_speed: as USB-CDC adapters do.
+            seed: of what arrives at another speed.
+
+        Raises:
+            ValueError: at `link` is something else, which is not ours to replace, or there is no such folder.
+        """
+        if link is not None and not link.is_symlink():
+            if link.exists():
+                raise ValueError(f"link is {link}, expected a path that is free or a link: a file or folder is there")
+            if not link.parent.is_dir():
+                raise ValueError(f"link is {link}, expected a path in a folder that exists: make {link.parent} first")
+        self.path = ""
+        self.plugged = False
+        self._link = link
+        self._ignores_line_speed = ignores_line_speed
+        self._garble = random.Random(f"line {seed}")
+        self._terminal = ""
+        self._far_fd = self._client_fd = -1
+
+    def plug(self, *, elsewhere: bool = False) -> None:
+        """Put the cable in; `elsewhere`, under another name than before.
+
+        Raises:
+            DeviceError: the link cannot be made.
+        """
+        # The client's side stays open here as well, so that clients may come and go.
+        self._far_fd, self._client_fd = os.openpty()
+        terminal = os.ttyname(self._client_fd)
+        if elsewhere and terminal == self._terminal:
+            taken = self._far_fd, self._client_fd
+            self._far_fd, self._client_fd = os.openpty()
+            terminal = os.ttyname(self._client_fd)
+            for descriptor in taken:
+                os.close(descriptor)
+        os.set_blocking(self._far_fd, False)
+        self.path = self._terminal = terminal
+        if self._link is not None:
+            draft = self._link.with_name(f".{self._link.name}.{os.getpid()}")
+            try:
+                draft.unlink(missing_ok=True)
+                draft.symlink_to(terminal)
+                draft.replace(self._link)
+            except OSError as error:
+                os.close(self._far_fd)
+                os.close(self._client_fd)
+                raise DeviceError(f"link is {self._link}, which cannot be made: {error.strerror}") from error
+            self.path = str(self._link)
+        self.plugged = True
+
+    def unplug(self) -> None:
+        """Pull the cable out: whoever reads is hung up on, and finds nothing at the link."""
+        if self.plugged:
+            self.plugged = False
+            if self._link is not None and self._link.is_symlink():
+                self._link.unlink(missing_ok=True)
+            os.close(self._far_fd)
+            os.close(self._client_fd)
+
+    def listen(self, timeout_s: float) -> bytes:
+        """What the client has written; waits at most so long for it."""
+        if not self.plugged:
+            time.sleep(timeout_s)
+            return b""
+        readable, _, _ = select.select([self._far_fd], [], [], timeout_s)
+        return self._through_line(os.read(self._far_fd, 4096)) if readable else b""
+
+    def write(self, data: bytes) -> int:
+        """Send what finds room; an adapter has nowhere to keep the rest. Returns how much went out."""
+        try:
+            return os.write(self._far_fd, self._through_line(data)) if self.plugged else 0
+        except BlockingIOError:
+            return 0
+
+    def unread_bytes(self) -> int:
+        """What the client has not fetched yet."""
+        if not self.plugged:
+            return 0
+        # Asking whether its side is readable makes the kernel bring up what it still holds back, but says no while
+        # there is less than the client wants at once (VMIN); asking for the number alone says none too early.
+        select.select([self._client_fd], [], [], 0)
+        return struct.unpack("i", fcntl.ioctl(self._client_fd, termios.FIONREAD, bytes(4)))[0]
+
+    def _through_line(self, data: bytes) -> bytes:
+        """What arrives at the other end: bytes of another speed are read as fewer or more, and as noise."""
+        speed_baud = _SPEEDS_BAUD.get(termios.tcgetattr(self._client_fd)[5])
+        if self._ignores_line_speed or speed_baud == LINE_SPEED_BAUD:
+            return data
+        return self._garble.randbytes(math.ceil(len(data) * min(1.0, (speed_baud or 0) / LINE_SPEED_BAUD)))

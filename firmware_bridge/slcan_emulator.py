@@ -1,0 +1,234 @@
+"""Emulator: a XELA controller behind an slcan adapter, on a pseudo-terminal.
+
+No kinder than the device: silent until bitrate and open, deaf at the wrong line speed, and frames
+that the client does not fetch in time are lost. `emulator` is its command line.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Final, Self
+
+from firmware_bridge.controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
+from firmware_bridge.faults.injector import Injector
+from firmware_bridge.faults.lines import Piece
+from firmware_bridge.pseudo_port import PseudoPort
+from firmware_bridge.recording import Recording
+from firmware_bridge.slcan import CanFrame
+from firmware_bridge.xela import USPA44_MAP
+
+_STOP_POLL_S: Final = 0.05
+_DRAIN_POLL_S: Final = 0.01
+_LONGEST_DRAIN_S: Final = 0.5
+
+
+class Emulator:
+    """Plays recordings on `port`, from the moment the channel is first opened; hangs up at the end.
+
+    Attributes:
+        port: where a client finds it, once entered.
+        adapter: its state, and what it refused.
+        sent_frames: frames that went out whole.
+        lost_frames: frames that found no room, because the client did not read.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        controllers: Sequence[int] = (),
+        rate_hz: float | None = None,
+        loop: bool = False,
+        acknowledges: bool = True,
+        left_open: bool = False,
+        old_canable: bool = False,
+        jitter_s: float = 0.001,
+        latency_s: float = 0.001,
+        frame_s: float = FRAME_S,
+        ignores_line_speed: bool = False,
+        seed: int = 0,
+        on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
+        faults: Injector | None = None,
+        link: Path | None = None,
+    ) -> None:
+        """Prepare to play; nothing is opened yet.
+
+        Args:
+            recordings: each track is one sensor on the bus.
+            controllers: their controller ids 0..15; by default 4, 6, 8, ...
+            rate_hz: scans a second of each sensor; by default as recorded.
+            loop: begin again after the last scan.
+            acknowledges: answer commands.
+            left_open: the channel is open from the start, as a client leaves it that was killed.
+            old_canable: answer nothing, and know no time stamps and no flags.
+            jitter_s: a scan comes up to so much early or late, in [s].
+            latency_s: the adapter hands on what it has once in this time, in [s].
+            frame_s: what a frame takes on the bus, in [s]; a real one carries no more than 480 scans a second.
+            ignores_line_speed: as USB-CDC adapters do.
+            seed: of jitter and unused bytes.
+            on_scan: told the controller and the monotonic time in [ns] when the last frame of a scan is handed on.
+            faults: what goes wrong on the way.
+            link: made to point to the pseudo-terminal; by default clients are given the terminal itself.
+
+        Raises:
+            ValueError: an option is out of range.
+            RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
+        """
+        for name, value in (("jitter_s", jitter_s), ("latency_s", latency_s), ("frame_s", frame_s)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} is {value}, expected 0 or more")
+        bus = controllers_of(recordings, controllers, rate_hz)
+        self.port = ""
+        self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
+        self.sent_frames = 0
+        self.lost_frames = 0
+        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s)
+        self._latency_s = latency_s
+        self._on_scan = on_scan
+        self._last_frames = {USPA44_MAP.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
+        self._faults = faults
+        self._resets = 0
+        self._elsewhere = False
+        self._line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
+        self._stop = threading.Event()
+        self._through = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="emulator", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._line.plug()
+        self.port = self._line.path
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.hang_up()
+
+    def hang_up(self) -> None:
+        """Pull the cable out."""
+        self._stop.set()
+        self._thread.join()
+
+    def tell(self, line: bytes) -> None:
+        """Say a line that nobody asked for, such as `adapter.state_line(...)`."""
+        if self._faults is None:
+            self._line.write(line)
+        else:
+            self._send([Piece(line, None, answer=True)], time.monotonic_ns())
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until it has hung up; False if it has not in time."""
+        return self._through.wait(timeout_s)
+
+    def _serve(self) -> None:
+        try:
+            while not self.adapter.channel_open:
+                if not self._obey_until(time.monotonic() + _STOP_POLL_S):
+                    return
+            start_s = time.monotonic()
+            for handed_on_s, frames in groupby(self._timeline, key=self._handed_on_s):
+                if not self._obey_until(start_s + handed_on_s):
+                    return
+                if self._faults is not None:
+                    self._hand_on_spoilt(self._faults, frames)
+                elif self.adapter.hears_the_bus:
+                    self._hand_on(frames)
+            self._drain()
+        finally:
+            if self._faults is not None:
+                self._faults.truth.close_channel(self._line.unread_bytes())
+            self._line.unplug()
+            self._through.set()
+
+    def _handed_on_s(self, timed: tuple[float, CanFrame]) -> float:
+        latency_s = self._latency_s if self._faults is None else self._faults.latency_s(timed[0], self._latency_s)
+        if latency_s == 0:
+            return timed[0]
+        return math.ceil(timed[0] / latency_s) * latency_s
+
+    def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
+        lines: list[bytes] = []
+        ended: list[int] = []
+        for time_s, frame in frames:
+            lines.append(self.adapter.encode(frame, time_s))
+            if frame.can_id in self._last_frames:
+                ended.append(self._last_frames[frame.can_id])
+        now_ns = time.monotonic_ns()  # before the write: who reads may be through before it is back
+        room = self._line.write(b"".join(lines))
+        for line in lines:
+            room -= len(line)
+            self.sent_frames += room >= 0
+            self.lost_frames += room < 0
+        for controller in ended:
+            self._on_scan(controller, now_ns)
+
+    def _hand_on_spoilt(self, faults: Injector, frames: Iterable[tuple[float, CanFrame]]) -> None:
+        """The same through faults, which also pull the cable and reset the adapter."""
+        truth, pieces = faults.truth, list[Piece]()
+        now_ns = time.monotonic_ns()
+        for time_s, frame in frames:
+            for sent in faults.disturb(time_s, frame):
+                if sent.lost:
+                    truth.lose(sent, now_ns)
+                elif not (self._line.plugged and self.adapter.hears_the_bus):
+                    truth.lose(sent._replace(fate="unheard"), now_ns)
+                else:
+                    pieces += faults.corrupt(self.adapter.encode(sent.frame, sent.time_s), sent)
+        truth.settle(self._line.unread_bytes())
+        self._send(pieces, now_ns)
+        if faults.resets > self._resets:
+            self._resets = faults.resets
+            self.adapter.begin_anew()
+        if faults.unplugged and self._line.plugged:
+            self._drain(time.monotonic() + _LONGEST_DRAIN_S)
+            truth.close_channel(self._line.unread_bytes())
+            self._line.unplug()
+            self._elsewhere = faults.renamed
+        elif not faults.unplugged and not self._line.plugged:
+            self.adapter.begin_anew()
+            self._line.plug(elsewhere=self._elsewhere)
+
+    def _send(self, pieces: Sequence[Piece], now_ns: int) -> None:
+        """Write pieces, and tell the truth how far that went."""
+        room = self._line.write(b"".join(piece.data for piece in pieces))
+        for piece in pieces:
+            written = min(max(room, 0), len(piece.data))
+            room -= len(piece.data)
+            if self._faults is not None:
+                self._faults.truth.hand_on(piece, written, now_ns)
+            self.sent_frames += room >= 0 and piece.sent is not None
+            self.lost_frames += room < 0 and piece.sent is not None
+
+    def _obey_until(self, deadline_s: float) -> bool:
+        """Serve commands until a time on the monotonic clock; False when told to stop."""
+        while not self._stop.is_set():
+            left_s = deadline_s - time.monotonic()
+            heard = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
+            if heard:
+                self._obey(heard)
+            elif left_s <= 0:
+                return True
+        return False
+
+    def _obey(self, heard: bytes) -> None:
+        if self._faults is None:
+            self._line.write(self.adapter.feed(heard))
+            return
+        was_open, unread_bytes = self.adapter.channel_open, self._line.unread_bytes()
+        answer = self.adapter.feed(heard)
+        if self.adapter.channel_open != was_open:  # who closes or opens drops what is old, answers as well
+            self._faults.truth.close_channel(unread_bytes)
+        if not self.adapter.channel_open:
+            self._line.write(answer)
+            return
+        if not was_open:
+            self._faults.truth.open_channel()
+        self._send([Piece(answer, None, answer=True)], time.monotonic_ns())
+
+    def _drain(self, deadline_s: float = math.inf) -> None:
+        """Let the client fetch what is under way: hanging up takes it away from it."""
+        while self.adapter.channel_open and self._line.unread_bytes() and time.monotonic() < deadline_s:
+            if not self._obey_until(time.monotonic() + _DRAIN_POLL_S):
+                return

@@ -1,0 +1,83 @@
+"""The same line, spoken by python-can: it reads our emulator, and we read what it writes."""
+
+import os
+import random
+import threading
+import time
+
+import can
+import pytest
+from bridge_samples import make_recording, read_scans
+from can.interfaces.slcan import slcanBus
+from test_links_serial import SilentDevice
+
+from firmware_bridge.controller import SlcanAdapter, scan_frames
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.slcan import CanFrame, SlcanDecoder
+from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.xela import USPA44_MAP
+
+
+def open_peer(port: str) -> slcanBus:
+    """As its users do, without the two seconds that it sleeps."""
+    return slcanBus(f"{port}@3000000", bitrate=1_000_000, rtscts=True, sleep_after_open=0)
+
+
+@pytest.mark.parametrize("options", [{}, {"acknowledges": False}, {"old_canable": True}], ids=str)
+def test_it_reads_our_emulator(options):
+    recording = make_recording(20)
+    received: list[can.Message] = []
+    with Emulator([recording], loop=True, **options) as emulator, open_peer(emulator.port) as bus:
+        end_s = time.monotonic() + 20
+        while len(received) < 20 * 16 and time.monotonic() < end_s:
+            message = bus.recv(0.1)
+            if message is not None:
+                received.append(message)
+    order = [can_id for can_id, _ in USPA44_MAP.wire_order("4")]
+    assert [message.arbitration_id for message in received] == order * 20
+    assert all(message.dlc == len(message.data) == 8 and not message.is_extended_id for message in received)
+    values = [int.from_bytes(message.data[5:7], "big") for message in received]
+    taxels = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
+    assert values == [int(scan.reshape(3, 16)[2, taxel]) for scan in recording.tracks[0].counts for taxel in taxels]
+
+
+def test_it_reads_our_emulator_with_time_stamps():
+    with Emulator([make_recording(5)], loop=True) as emulator:
+        emulator.adapter.feed(b"Z1\r")
+        with open_peer(emulator.port) as bus:
+            received = [bus.recv(5) for _ in range(80)]
+        assert emulator.adapter.encode(CanFrame(4, bytes(8)), 1.0).endswith(b"03E8\r")
+    assert all(message is not None and len(message.data) == 8 for message in received)
+
+
+def test_we_read_what_it_writes():
+    """It takes the place of the adapter: what it sends is put on our line."""
+    counts = make_recording(3).tracks[0].counts
+    noise = random.Random(1)
+    frames = [frame for scan in counts for frame in scan_frames(scan, 4, noise)]
+    with SilentDevice() as far_end, slcanBus(f"{far_end.port}@3000000", sleep_after_open=0) as bus:
+        assert far_end.received(2) == b"O\r"
+        for frame in frames:
+            bus.send(can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False))
+        written = far_end.received(len(frames) * 22)
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        os.write(device.device_fd, written)
+        scans = read_scans(link, 3)
+        assert link.counters()["frames"] == 48 and link.counters()["bad_lines"] == 0
+    assert [(scan.counts == expected).all() for scan, expected in zip(scans, counts, strict=True)] == [True] * 3
+
+
+def test_what_it_says_on_opening_is_obeyed_and_is_no_frame():
+    heard = b""
+    with SilentDevice() as device:
+        opened = threading.Thread(target=lambda: open_peer(device.port).shutdown())
+        opened.start()
+        while b"C\r" not in heard[2:]:  # the last thing it says
+            heard += os.read(device.device_fd, 1000)
+        opened.join()
+    assert heard.startswith(b"C\rS8\r\rO\rO\r")
+    adapter = SlcanAdapter()
+    # An empty command, and opening what is open: refused as by any strict adapter, and open all the same.
+    assert adapter.feed(heard.removesuffix(b"C\r")) == b"\a\r\a\r\a" and adapter.hears_the_bus
+    decoder = SlcanDecoder()
+    assert decoder.feed(heard) == [] and decoder.counters()["frames"] == 0
