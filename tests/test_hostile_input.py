@@ -1,0 +1,403 @@
+"""Files and models made to harm: each is refused in one line, before it costs time or memory."""
+
+import io
+import json
+import pickle
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from edge_samples import BASELINE, make_contract, write_model
+from fuzz_targets import archive, npy, recording_arrays, stored
+from onnx import TensorProto, helper, numpy_helper
+
+from edge.bench.errors import BenchError
+from edge.bench.record import read_record
+from edge.calibration_cache import CalibrationCache
+from edge.contract import KEY_PREFIX, Contract
+from edge.errors import EdgeError, ModelError
+from edge.frozen import load_frozen_set
+from edge.onnx_file import check_plain, read_model
+from edge.session import ModelSession
+from firmware_bridge import recording
+from firmware_bridge.baseline import load_baselines, save_baselines
+from firmware_bridge.bounded import read_bounded
+from firmware_bridge.errors import NpzError, RecordingError
+from firmware_bridge.npz import read_npz
+from firmware_bridge.recording import CSV_HEADER, load_recording
+from train.authors_files import load_authors_taps
+from train.dataset import load_sequences
+from train.errors import CheckpointError, DatasetError
+from train.training import load_network
+
+MEMORY_LIMIT_BYTES = 60_000_000
+
+
+class Harm:
+    """Leaves a file where it was unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.fixture
+def bounded_memory():
+    tracemalloc.start()
+    yield
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < MEMORY_LIMIT_BYTES
+
+
+def one_line(error: pytest.ExceptionInfo) -> bool:
+    return "\n" not in str(error.value) and len(str(error.value)) < 1000
+
+
+def test_a_file_without_end_is_read_up_to_the_limit():
+    with pytest.raises(OSError, match="larger than the 1,000 bytes"):
+        read_bounded(Path("/dev/zero"), 1000)
+    for read, error in (
+        (load_baselines, RecordingError),
+        (read_record, BenchError),
+        (load_recording, RecordingError),
+        (read_model, ModelError),
+    ):
+        with pytest.raises(error):
+            read(Path("/dev/zero"))
+    assert "larger than" in CalibrationCache(Path("/dev/zero"), 100.0).notes[0]
+
+
+class TestPickles:
+    def readers(self):
+        yield "finger.npz", load_recording, RecordingError
+        yield "frozen.npz", load_frozen_set, EdgeError
+        yield "taps.npz", load_sequences, DatasetError
+
+    @pytest.mark.parametrize("how", ["pickle", "array of objects", "npy"])
+    def test_no_reader_of_arrays_runs_what_is_pickled(self, tmp_path, how):
+        for name, read, error in self.readers():
+            path, harm = tmp_path / name, tmp_path / "harm"
+            if how == "pickle":
+                path.write_bytes(pickle.dumps(Harm(harm)))
+            elif how == "npy":
+                with path.open("wb") as file:
+                    np.save(file, np.array([Harm(harm)], dtype=object), allow_pickle=True)
+            else:
+                objects = np.array([Harm(harm)], dtype=object)
+                names = (*recording_arrays(), "newest", "schema", "facts", "surfaces")
+                np.savez(path, **dict.fromkeys(names, objects))
+            with pytest.raises(error) as raised:
+                read(path)
+            assert one_line(raised) and not harm.exists()
+
+    def test_nor_do_checkpoints_and_the_authors_files(self, tmp_path):
+        harm = tmp_path / "harm"
+        path = tmp_path / "stsr.pt"
+        path.write_bytes(pickle.dumps(Harm(harm)))
+        report = {"network": "compact-stsr", "scale": 10, "options": {}}
+        path.with_suffix(".json").write_text(json.dumps(report))
+        with pytest.raises(CheckpointError) as raised:
+            load_network(path)
+        assert one_line(raised) and not harm.exists()
+        with (tmp_path / "C.npy").open("wb") as file:
+            np.save(file, np.array([Harm(harm)], dtype=object), allow_pickle=True)
+        with pytest.raises(DatasetError, match="no array needs") as raised:
+            load_authors_taps(tmp_path / "C.npy")
+        assert one_line(raised) and not harm.exists()
+
+    @pytest.mark.parametrize(
+        ("body", "complaint"),
+        [
+            (b"r\xff\xff\xff\x7f", "kept in place 2147483647"),  # the memo would take 32 GB
+            (b"\x96" + (1 << 40).to_bytes(8, "little"), "expected 1099511627776 bytes"),
+            (b"P1\n", "PERSID, which no array needs"),
+            (b"\x82\x01", "EXT1, which no array needs"),
+        ],
+    )
+    def test_a_pickle_that_claims_much_is_refused_before_it_is_run(self, tmp_path, bounded_memory, body, complaint):
+        file = io.BytesIO()
+        np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": (1,)})
+        (tmp_path / "C.npy").write_bytes(file.getvalue() + b"\x80\x04]" + body + b".")
+        with pytest.raises(DatasetError, match=complaint):
+            load_authors_taps(tmp_path / "C.npy")
+
+
+class TestArchives:
+    def refused(self, tmp_path, content: bytes, complaint: str) -> None:
+        path = tmp_path / "finger.npz"
+        path.write_bytes(content)
+        with pytest.raises(RecordingError, match=complaint) as raised:
+            load_recording(path)
+        assert one_line(raised)
+
+    def test_a_bomb(self, tmp_path, monkeypatch, bounded_memory):
+        monkeypatch.setattr(recording, "MOST_NPZ_BYTES", 1 << 20)
+        bomb = archive(compressed=True, **recording_arrays() | {"counts": np.zeros((300_000, 3, 4, 4), np.int8)})
+        assert len(bomb) < 50_000
+        self.refused(tmp_path, bomb, r"arrays of 14,400,\d+ bytes, expected at most 1,048,576")
+
+    def test_an_array_larger_than_its_member(self, tmp_path, bounded_memory):
+        header = npy(np.zeros((1, 3, 4, 4), np.int32)).replace(b"(1, 3", b"(9999999999, 3").replace(b" " * 9, b"", 1)
+        self.refused(tmp_path, stored({"counts": header} | members("counts")), "tells of 1919999999808 bytes and holds")
+
+    def test_lengths_whose_product_wraps_around(self, tmp_path):
+        shape = f"({1 << 32}, {1 << 32})"
+        content = npy(np.zeros((1, 1)))[:80].replace(b"(1, 1)", shape.encode())
+        self.refused(tmp_path, stored({"counts": content} | members("counts")), "counts.npy|not a whole")
+
+    def test_a_table_of_contents_of_a_million_members(self, tmp_path, bounded_memory):
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w") as whole:
+            for number in range(13_000):
+                whole.writestr(f"{number:060d}", b"")
+        self.refused(tmp_path, file.getvalue(), r"a piece of 1,\d+,\d+ bytes, expected at most 1,048,576")
+
+    @pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+    def test_other_compressions(self, tmp_path, kind):
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w", kind) as whole:
+            whole.writestr("counts.npy", npy(np.zeros(3)))
+        self.refused(tmp_path, file.getvalue(), "compressed in another way")
+
+    @pytest.mark.parametrize("text", [b"\0\0\x11\0", b"\0\xd8\0\0"])
+    def test_text_that_is_no_unicode(self, tmp_path, text):
+        sensors = npy(np.array(["4", "4"])).replace(b"4\0\0\0", text)
+        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "no Unicode")
+
+    def test_a_header_of_pieces_of_python(self, tmp_path):
+        sensors = npy(np.array(["4", "4"])).replace(b"'shape': (2,)", b"'shape': (((((")
+        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "not a whole")
+
+    @pytest.mark.parametrize(
+        ("changes", "complaint"),
+        [
+            ({"time_ns": np.array([1 << 61, 5])}, "times 5..2305843009213693952, expected 0"),
+            ({"time_ns": np.array([1 << 63, 5], np.uint64)}, "expected 0"),
+            ({"sensor": np.array(["4", "4\n5"])}, "printable"),
+            ({"sensor": np.array(["4", "x" * 65])}, "printable"),
+            ({"rate_hz": np.array(1e-300)}, "a positive number"),
+            ({"counts": np.zeros((2, 3, 2, 2), np.int32)}, r"\(scans, 3, 4, 4\)"),
+        ],
+    )
+    def test_values_that_nothing_can_be_done_with(self, tmp_path, changes, complaint):
+        self.refused(tmp_path, archive(**recording_arrays() | changes), complaint)
+
+    def test_more_sensors_than_a_wire_can_hold(self, tmp_path):
+        count = 65
+        many = {"scan": np.arange(count), "time_ns": np.arange(count), "counts": np.zeros((count, 3, 4, 4), np.int32)}
+        many["sensor"] = np.arange(count).astype(str)
+        self.refused(tmp_path, archive(**recording_arrays() | many), "65 sensors, expected at most 64")
+
+    def test_what_is_asked_for_alone_is_read(self, tmp_path):
+        path = tmp_path / "two.npz"
+        np.savez(path, wanted=np.arange(3), other=np.array([object()], dtype=object))
+        assert read_npz(path, ["wanted", "absent"], 1000)["wanted"].tolist() == [0, 1, 2]
+        with pytest.raises(NpzError, match="plain arrays"):
+            read_npz(path, ["other"], 1000)
+
+
+def members(without: str) -> dict[str, bytes]:
+    return {name: npy(value) for name, value in recording_arrays().items() if name != without}
+
+
+class TestText:
+    def test_a_csv_line_without_end(self, tmp_path, bounded_memory):
+        path = tmp_path / "finger.csv"
+        with path.open("wb") as file:
+            file.write((",".join(CSV_HEADER) + "\n").encode())
+            file.truncate(1 << 32)
+        with pytest.raises(RecordingError, match="line 2: a line longer than 16384 bytes"):
+            load_recording(path)
+
+    def test_a_csv_file_larger_than_is_read(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(recording, "MOST_CSV_BYTES", 1000)
+        path = tmp_path / "finger.csv"
+        path.write_text(",".join(CSV_HEADER) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
+        with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):
+            load_recording(path)
+
+    @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "1" * 10_000, "\xff", "NaN", '"', ""])
+    def test_json_that_no_parser_should_choke_on(self, tmp_path, text):
+        path = tmp_path / "file.json"
+        path.write_bytes(text.encode("latin1"))
+        for read, error in ((load_baselines, RecordingError), (read_record, BenchError)):
+            with pytest.raises(error) as raised:
+                read(path)
+            assert one_line(raised)
+        assert CalibrationCache(path, 100.0).notes
+
+    @pytest.mark.parametrize(
+        ("key", "value"),
+        [("created_unix_s", 10**400), ("created_unix_s", 1e300), ("sensor", "4\x1b[2J"), ("sensor", "x" * 65)],
+    )
+    def test_a_baseline_of_values_that_nothing_can_be_done_with(self, tmp_path, key, value):
+        path = tmp_path / "zero.json"
+        save_baselines(path, [BASELINE])
+        document = json.loads(path.read_text())
+        document["baselines"][0][key] = value
+        path.write_text(json.dumps(document))
+        with pytest.raises(RecordingError, match=f"'{key}'") as raised:
+            load_baselines(path)
+        assert one_line(raised)
+
+
+class TestContract:
+    @pytest.mark.parametrize(
+        ("key", "text"),
+        [
+            ("taps", "1000000"),
+            ("scale", "1000"),
+            ("rows", "65"),
+            ("scale", "9" * 5000),
+            ("pitch_mm", "1" + "0" * 400),
+            ("pitch_mm", "1e-300"),
+            ("counts_per_unit", "[1e-300, 1, 1]"),
+            ("counts_per_unit", "[-1, 1, 1]"),
+            ("counts_per_unit", "[NaN, 1, 1]"),
+            ("output_full_scale", "1e300"),
+            ("interval_factor", "Infinity"),
+            ("confidence", "[" * 60_000),
+            ("test_error", " " * 70_000),
+            ("sensor", '"a\\nb"'),
+        ],
+    )
+    def test_values_that_nothing_can_be_done_with(self, key, text):
+        metadata = make_contract().to_metadata() | {KEY_PREFIX + key: text}
+        with pytest.raises(ModelError, match=f"'{key}'") as raised:
+            Contract.from_metadata(metadata)
+        assert one_line(raised)
+
+    def test_a_pattern_of_too_many_pixels(self):
+        metadata = make_contract(scale=255, rows=64, cols=64).to_metadata()
+        with pytest.raises(ModelError, match=r"'scale' is 255, expected patterns of at most 1048576 pixels"):
+            Contract.from_metadata(metadata)
+
+
+class TestModels:
+    def outside(self, tmp_path, location: str, where: str) -> Path:
+        """A model whose weights lie elsewhere, in an initializer or in a node's attribute."""
+        tensor = TensorProto(name="w", data_type=1, dims=[4], data_location=TensorProto.EXTERNAL)
+        tensor.external_data.add(key="location", value=location)
+        take = [helper.make_node("Constant", [], ["w"], value=tensor)] if where == "attribute" else []
+        nodes = [*take, helper.make_node("Add", ["x", "w"], ["y"])]
+        ends = [helper.make_tensor_value_info(name, 1, [4]) for name in "xy"]
+        graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [] if take else [tensor])
+        path = tmp_path / "models" / "m.onnx"
+        path.parent.mkdir()
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+        path.write_bytes(model.SerializeToString())
+        return path
+
+    @pytest.mark.parametrize("where", ["initializer", "attribute"])
+    @pytest.mark.parametrize("location", ["../../etc/passwd", "{}/secret", "link", "beside", ""])
+    def test_weights_in_another_file_are_refused_before_onnxruntime_sees_them(
+        self, tmp_path, monkeypatch, location, where
+    ):
+        (tmp_path / "secret").write_bytes(bytes(16))
+        path = self.outside(tmp_path, location.format(tmp_path), where)
+        (path.parent / "link").symlink_to(tmp_path / "secret")
+        (path.parent / "beside").write_bytes(bytes(16))
+        monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: pytest.fail("it was asked"))
+        with pytest.raises(ModelError, match=r"m.onnx: keeps its weights in a side file, expected one file") as raised:
+            ModelSession(path)
+        assert one_line(raised)
+
+    def test_a_part_of_a_tensor_that_another_part_denies_is_refused_too(self):
+        # Protocol Buffers join messages that come twice, and of numbers the last one counts.
+        tensor = TensorProto(name="w", data_location=TensorProto.EXTERNAL).SerializeToString()
+        tensor += TensorProto(data_location=TensorProto.DEFAULT).SerializeToString()
+        with pytest.raises(ModelError, match="side file"):
+            check_plain(in_graph(tensor))
+
+    def test_weights_of_more_elements_than_bytes(self):
+        tensor = TensorProto(name="w", data_type=1, dims=[1 << 30, 1 << 30]).SerializeToString()
+        with pytest.raises(ModelError, match=r"shape \[1073741824, 1073741824\], more than its \d+ bytes"):
+            check_plain(in_graph(tensor))
+        with pytest.raises(ModelError, match="more than its"):
+            check_plain(in_graph(TensorProto(dims=[1] * 100_000).SerializeToString()))
+
+    def test_graphs_within_the_graph_functions_and_sparse_weights(self):
+        inner = helper.make_graph([], "inner", [], [])
+        node = helper.make_node("If", ["x"], ["y"], then_branch=inner, else_branch=inner)
+        model = onnx.ModelProto(graph=helper.make_graph([node], "g", [], []))
+        with pytest.raises(ModelError, match="graphs within its graph"):
+            check_plain(model.SerializeToString())
+        with pytest.raises(ModelError, match="graphs within its graph"):
+            check_plain(onnx.ModelProto(functions=[onnx.FunctionProto(name="f")]).SerializeToString())
+        sparse = onnx.SparseTensorProto(dims=[1 << 40])
+        with pytest.raises(ModelError, match="sparse"):
+            check_plain(onnx.ModelProto(graph=onnx.GraphProto(sparse_initializer=[sparse])).SerializeToString())
+
+    def test_more_fields_than_a_graph_has(self, monkeypatch):
+        monkeypatch.setattr("edge.onnx_file.MOST_FIELDS", 1000)
+        with pytest.raises(ModelError, match="more than 1000 fields"):
+            check_plain(b"\x08\x01" * 1001)
+
+    def test_the_encoding_is_read_as_onnxruntime_reads_it(self):
+        seven = in_graph(TensorProto(name="w", data_location=TensorProto.EXTERNAL).SerializeToString())
+        assert seven[:1] == b"\x3a"
+        with pytest.raises(ModelError, match="side file"):  # a tag may be written longer than it must
+            check_plain(b"\xba\x00" + seven[1:])
+        for broken in (
+            b"\xba\x80\x80\x80\x80\x00" + seven[1:],
+            b"\xba\x80\x80\x80\x10" + seven[1:],
+            b"\x3b",
+            b"\x02\x00",
+        ):
+            with pytest.raises(ModelError, match="damaged"):
+                check_plain(broken)
+
+    def test_a_file_larger_than_any_model(self, tmp_path, monkeypatch, bounded_memory):
+        monkeypatch.setattr("edge.onnx_file.MOST_BYTES", 1 << 20)
+        path = tmp_path / "large.onnx"
+        with path.open("wb") as file:
+            file.truncate(3_000_000_000)
+        with pytest.raises(ModelError, match=r"large.onnx: cannot be read: larger than the 1,048,576 bytes"):
+            ModelSession(path)
+
+    def test_names_that_are_no_text_are_one_line_and_nothing_on_stdout(self, tmp_path, capfd):
+        path = write_model(tmp_path / "tiny.onnx")
+        for name in (b"Squeeze", b"tactile.sensor", b"window"):
+            content = path.read_bytes()
+            (tmp_path / "odd.onnx").write_bytes(content.replace(name, b"\xe5" * len(name)))
+            with pytest.raises(ModelError) as raised:
+                ModelSession(tmp_path / "odd.onnx")
+            assert one_line(raised)
+        assert capfd.readouterr().out == ""
+
+    def test_an_array_that_no_machine_holds(self, tmp_path):
+        shape = numpy_helper.from_array(np.array([1 << 30, 1 << 20]), "shape")
+        nodes = [
+            helper.make_node("ConstantOfShape", ["shape"], ["huge"]),
+            helper.make_node("ReduceSum", ["huge"], ["s"]),
+        ]
+        nodes += [helper.make_node("Add", ["window", "s"], ["pattern"])]
+        ends = [
+            helper.make_tensor_value_info("window", 1, [1, 3, 4, 4]),
+            helper.make_tensor_value_info("pattern", 1, None),
+        ]
+        graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [shape])
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+        helper.set_model_props(model, make_contract(taps=1).to_metadata())
+        (tmp_path / "huge.onnx").write_bytes(model.SerializeToString())
+        with pytest.raises(ModelError, match=r"huge\.onnx") as raised:
+            ModelSession(tmp_path / "huge.onnx")
+        assert one_line(raised)
+
+
+def in_graph(tensor: bytes) -> bytes:
+    """A model of nothing but these weights."""
+
+    def field(number: int, content: bytes) -> bytes:
+        length, size = b"", len(content)
+        while size > 0x7F:
+            length, size = length + bytes([size & 0x7F | 0x80]), size >> 7
+        return bytes([number << 3 | 2]) + length + bytes([size]) + content
+
+    return field(7, field(5, tensor))

@@ -1,0 +1,77 @@
+"""What others on the network can reach of a running `edge-sr`: nothing."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from edge_samples import ROOT
+
+LISTENING = "0A"
+LOOPBACK = ("0100007F", "00000000000000000000000001000000")
+ANY_PEER = {"00000000:0000", "00000000000000000000000000000000:0000"}
+RUN = """
+import socket, sys
+from edge import cli
+if len(sys.argv) > 1:
+    kind = socket.SOCK_DGRAM if sys.argv[1] == "udp" else socket.SOCK_STREAM
+    family = socket.AF_INET6 if ":" in sys.argv[2] else socket.AF_INET
+    listener = socket.socket(family, kind)
+    listener.bind((sys.argv[2], 0))
+    sys.argv[1] == "udp" or listener.listen()
+sys.exit(cli.main(["--source", "demo", "--sink", "jsonl:-"]))
+"""
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
+
+
+def family(process_id: int) -> list[int]:
+    """A process and all below it: the demo's emulator is one of its own."""
+    below = Path(f"/proc/{process_id}/task/{process_id}/children").read_text().split()
+    return [process_id, *(one for child in below for one in family(int(child)))]
+
+
+def reachable(process_id: int) -> list[str]:
+    """Sockets of a process, and of those below it, that wait for whoever comes and are bound to more than loopback."""
+    found = []
+    for one in family(process_id):
+        mine = set()
+        for handle in Path(f"/proc/{one}/fd").iterdir():
+            try:
+                mine.add(str(handle.readlink()))
+            except FileNotFoundError:
+                continue
+        for protocol in ("tcp", "tcp6", "udp", "udp6"):
+            for line in Path(f"/proc/{one}/net/{protocol}").read_text().splitlines()[1:]:
+                _, local, peer, state, *_, inode = line.split()[:10]
+                waits = state == LISTENING if protocol.startswith("tcp") else peer in ANY_PEER
+                if waits and f"socket:[{inode}]" in mine and local.partition(":")[0] not in LOOPBACK:
+                    found.append(f"{protocol} {local}")
+    return found
+
+
+def reachable_of_a_demo(*listener: str) -> list[str]:
+    command = [sys.executable, "-c", RUN, *listener]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as demo:
+        try:
+            assert demo.stdout is not None and demo.stdout.readline().startswith(b"{"), "the demo says nothing"
+            return reachable(demo.pid)
+        finally:
+            demo.terminate()
+            demo.stdout.close()
+
+
+def test_a_running_demo_can_be_reached_by_nobody():
+    assert reachable_of_a_demo() == []
+
+
+@pytest.mark.parametrize(
+    ("listener", "count"),
+    [(("tcp", "0.0.0.0"), 1), (("tcp", "127.0.0.1"), 0), (("udp", "0.0.0.0"), 1)],
+)
+def test_and_one_that_could_would_be_seen(listener, count):
+    assert len(reachable_of_a_demo(*listener)) == count
