@@ -1,0 +1,321 @@
+"""A sensor that is well gives no finding but ok, and each fault by itself gives its own and only that."""
+
+import numpy as np
+import pytest
+from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
+
+from edge.doctor.examine import Watched, examine
+from edge.doctor.findings import Finding, page, worst
+from edge.doctor.heard import HeardIds, check_id_map
+from edge.doctor.line_checks import (
+    LineFacts,
+    capacity_hz,
+    check_baud,
+    check_latency,
+    check_link,
+    latency_timer_ms,
+)
+from edge.doctor.samples import Samples
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.slcan_scans import SlcanScans
+from firmware_bridge.xela import ID_MAPS, LAYOUT_A_MAP, USPA44_MAP, XR1944_MAP, trigger_frame
+
+FULL = {"rate": "not known", "baud rate": "wrong", "latency timer": "not known"}
+FREE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")
+
+
+def faults(scans, **changes):
+    """Names and verdicts of what is not ok, where all that can be known is."""
+    changes.setdefault("references", {"4": FREE})
+    return {
+        finding.name: finding.verdict
+        for finding in examine(watched(scans, **changes), 0.0).findings
+        if finding.verdict != "ok"
+    }
+
+
+def remedy_of(name, scans, **changes):
+    findings = examine(watched(scans, **changes), 0.0).findings
+    return next(finding.remedy for finding in findings if finding.name == name)
+
+
+class TestSensor:
+    def test_a_healthy_one_is_ok_in_every_line_and_may_be_zeroed(self):
+        examined = examine(watched(as_scans(healthy_counts()), references={"4": FREE}), 5.0)
+        assert {finding.verdict for finding in examined.findings} == {"ok"} and len(examined.findings) == 11
+        assert not any(finding.remedy for finding in examined.findings)
+        baseline = examined.baselines["4"]
+        assert np.abs(baseline.counts - REST).max() <= 1 and baseline.created_unix_s == 5.0
+
+    @pytest.mark.parametrize(("sigma", "verdict"), [(4.6, "look"), (9.0, "wrong")])
+    def test_noise(self, sigma, verdict):
+        counts = healthy_counts()
+        counts[:, 0, 1, 1] += np.rint(np.random.default_rng(3).normal(0, sigma, len(counts))).astype(np.int32)
+        # So loud a taxel cannot be zeroed, which is told as what follows from it.
+        assert faults(as_scans(counts)) == {"noise": verdict, "baseline": "not known"}
+        assert "taxel 5 alone is loud" in remedy_of("noise", as_scans(counts))
+
+    @pytest.mark.parametrize("sigma", [1.2, 2.0, 3.0])
+    def test_noise_is_measured_right_and_creeping_is_none(self, sigma):
+        counts = healthy_counts(2000, sigma=sigma) + np.linspace(0, 500, 2000).astype(np.int32)[:, None, None, None]
+        noise = Samples(as_scans(counts, times_ns(2000))).noise_counts()
+        rounding = 0.45  # of the readings, and of the creeping
+        assert np.median(noise) == pytest.approx(np.hypot(sigma, rounding), rel=0.05)
+
+    def test_a_silent_taxel(self):
+        scans = as_scans(silenced(healthy_counts(), [6]))
+        assert faults(scans) == {"silent taxels": "wrong"}
+        assert not examine(watched(scans), 0.0).baselines
+
+    def test_a_taxel_that_comes_and_goes_is_named(self):
+        scans = as_scans(silenced(healthy_counts(), [6], slice(0, 400, 10)))
+        assert faults(scans) == {"torn scans": "wrong"}
+        assert "taxel 6 comes and goes" in remedy_of("torn scans", scans)
+
+    def test_torn_scans(self):
+        counts = healthy_counts()
+        for scan in range(0, 400, 8):
+            counts = silenced(counts, [scan // 8 % 16], slice(scan, scan + 1))
+        assert faults(as_scans(counts)) == {"torn scans": "wrong"}
+
+    def test_a_source_that_repeats_itself(self):
+        counts = healthy_counts()
+        counts[1::2] = counts[::2]
+        assert faults(as_scans(counts)) == {"torn scans": "wrong"}
+
+    def test_a_stuck_taxel(self):
+        counts = healthy_counts()
+        counts[:, :, 2, 2] = REST[:, 2, 2]
+        assert faults(as_scans(counts)) == {"stuck taxels": "wrong"}
+
+    def test_a_taxel_at_an_end_of_its_range(self):
+        counts = healthy_counts()
+        counts[:, 2, 2, 2] = 65_535
+        found = faults(as_scans(counts), references={})
+        assert found.pop("stuck taxels") == "wrong" and found.pop("rest levels") == "look"
+        assert found == {"load": "not known"}
+
+    def test_all_stuck_is_an_old_scan_sent_for_ever(self):
+        scans = as_scans(np.repeat(healthy_counts(1), 400, axis=0))
+        assert "one old scan" in remedy_of("stuck taxels", scans)
+        assert worst(examine(watched(scans), 0.0).findings) == "wrong"
+
+    @pytest.mark.parametrize(("counts_moved", "verdict"), [(15, "look"), (60, "wrong")])
+    def test_drift_of_all_taxels(self, counts_moved, verdict):
+        """15 in each are 240 of the summed z: to look at; 60 are 960, more than what ends a tap."""
+        drift = np.zeros((6000, 3, 1, 1))
+        drift[:, 2] = np.linspace(0, counts_moved * 1.12, 6000)[:, None, None]
+        counts = np.rint(healthy_counts(6000) + drift).astype(np.int32)
+        assert faults(as_scans(counts, times_ns(6000)), duration_s=60.0) == {"drift": verdict}
+
+    def test_a_rest_at_the_seam_of_the_circle_is_like_any_other(self):
+        counts = healthy_counts()
+        counts[:, 2] = (counts[:, 2] - REST[2] + 65_535) % 65_536
+        assert faults(as_scans(counts), references={}) == {"load": "not known"}
+
+    def test_a_first_scan_cut_in_mid_cycle_is_none_torn(self):
+        counts = silenced(healthy_counts(), [1, 2, 3], slice(0, 1))
+        assert faults(as_scans(counts)) == {}
+
+    def test_a_loaded_pad_is_seen_against_an_earlier_baseline_alone(self):
+        counts = healthy_counts()
+        counts[:, 2, 1, 1] += 800
+        scans = as_scans(counts)
+        assert faults(scans) == {"load": "wrong"}
+        assert "free the pad" in remedy_of("load", scans, references={"4": FREE})
+        assert faults(scans, references={}) == {"load": "not known"}
+        counts[:, 2, 1, 1] -= 1600
+        assert "taken of a loaded pad" in remedy_of("load", as_scans(counts), references={"4": FREE})
+
+    def test_a_load_is_told_by_the_pads_own_z(self):
+        """Where z is reversed, what reads less is pressed."""
+        counts = healthy_counts()
+        counts[:, 2, 1, 1] -= 800
+        given = {"references": {"4": FREE}, "mountings": {"4": Mounting(signs=(1, 1, -1))}}
+        assert "free the pad" in remedy_of("load", as_scans(counts), **given)
+        counts[:, 2, 1, 1] += 1600
+        assert "taken of a loaded pad" in remedy_of("load", as_scans(counts), **given)
+
+    def test_a_pad_that_moves_cannot_be_zeroed(self):
+        counts = healthy_counts()
+        counts[:, 2, 1, 1] += (20 * np.cos(np.arange(400) * np.pi / 50)).astype(np.int32)
+        assert faults(as_scans(counts)) == {"baseline": "wrong"}
+        assert "keep the pad still" in remedy_of("baseline", as_scans(counts))
+
+    def test_lost_scans_are_counted_by_the_gaps(self):
+        kept = np.ones(400, dtype=bool)
+        kept[[50, 120, 121]] = False
+        scans = as_scans(healthy_counts()[kept], times_ns()[kept])
+        assert Samples(scans).lost() == 3
+        assert faults(scans) == {"lost scans": "look"}
+
+    def test_a_sensor_that_fell_silent_has_lost_what_did_not_come(self):
+        scans = as_scans(healthy_counts())
+        assert faults(scans, until_ns=scans[-1].time_ns + 9_000_000_000) == {"lost scans": "wrong"}
+        assert faults(scans, until_ns=scans[-1].time_ns + 1_000_000_000) == {}
+
+    def test_of_two_sensors_the_silent_one_is_named(self):
+        both = {"4": as_scans(healthy_counts(700), times_ns(700)), "6": as_scans(healthy_counts(), sensor="6")}
+        found = examine(Watched(both, COUNTERS, 7.0), 0.0).findings
+        assert [(one.sensor, one.name) for one in found if one.verdict == "wrong"] == [("6", "lost scans")]
+
+    def test_one_scan_late_is_none_lost(self):
+        late = times_ns()
+        late[200] += 9_000_000
+        late[201] = max(late[201], late[200])
+        late[399] += 9_000_000
+        assert faults(as_scans(healthy_counts(), late)) == {}
+
+    @pytest.mark.parametrize(
+        ("rate_hz", "wanted_hz", "verdict"), [(50, None, "look"), (50, 50, None), (100, 50, "look")]
+    )
+    def test_rate(self, rate_hz, wanted_hz, verdict):
+        scans = as_scans(healthy_counts(), times_ns(rate_hz=rate_hz))
+        assert faults(scans, rate_hz=wanted_hz).get("rate") == verdict
+
+    def test_a_rest_far_from_the_others(self):
+        counts = healthy_counts()
+        counts[:, 1, 3, 3] += 15_000
+        assert faults(as_scans(counts), references={}) == {"rest levels": "look", "load": "not known"}
+
+    def test_too_few_scans_tell_nothing(self):
+        assert faults(as_scans(healthy_counts(20), times_ns(20))) == {"scans": "wrong"}
+        assert faults(as_scans(healthy_counts(80), times_ns(80))) == {"baseline": "not known"}
+
+
+class TestLine:
+    def test_counters(self):
+        assert check_link({"scans": 5}, 1.0) is None
+        cases = [
+            ({"received_bytes": 0, "frames": 0}, "wrong", "both USB plugs"),
+            ({"received_bytes": 9, "frames": 0}, "wrong", "both USB plugs"),
+            ({"received_bytes": 5000, "frames": 0, "bad_lines": 70}, "wrong", "line speed"),
+            ({"received_bytes": 2, "frames": 0, "refusals": 2}, "wrong", "held open"),
+            (COUNTERS | {"bad_lines": 1}, "ok", ""),
+            (COUNTERS | {"bad_lines": 9}, "look", "garbled"),
+            (COUNTERS | {"bad_lines": 900}, "wrong", "garbled"),
+            (COUNTERS | {"receive_overruns": 3}, "look", "loses frames"),
+            ({"receive_overruns": 3}, "look", "loses frames"),
+        ]
+        for counters, verdict, words in cases:
+            finding = check_link(counters, 4.0)
+            assert finding is not None and finding.verdict == verdict and words in finding.remedy, counters
+
+    def test_baud_arithmetic_is_exact(self):
+        assert int(capacity_hz(115_200, 22)) == 32 and int(capacity_hz(115_200, 26)) == 27
+        assert capacity_hz(115_200, 22) * 22 * 16 * 10 == 115_200
+        assert capacity_hz(3_000_000, 22, sensors=2) > 400
+
+    @pytest.mark.parametrize(
+        ("baud", "rate_hz", "verdict"),
+        [
+            (3_000_000, 100, "ok"),
+            (115_200, 32, "wrong"),
+            (230_400, 60, "wrong"),
+            (230_400, 20, "look"),
+            (115_200, 100, "ok"),
+        ],
+    )
+    def test_baud(self, baud, rate_hz, verdict):
+        counters = {"received_bytes": 22 * 16 * rate_hz * 4, "frames": 16 * rate_hz * 4}
+        finding = check_baud(LineFacts("/dev/ttyUSB0", baud), counters, 4.0, 1, None)
+        assert finding is not None and finding.verdict == verdict
+
+    def test_a_full_line_is_the_only_thing_wrong(self):
+        rate_hz = capacity_hz(115_200, 22)
+        counters = {"received_bytes": 115_200 // 10 * 4, "frames": int(115_200 / 220 * 4)}
+        scans = as_scans(healthy_counts(), times_ns(rate_hz=rate_hz))
+        facts = LineFacts("/dev/ttyUSB0", 115_200, 1)
+        assert faults(scans, counters=counters, facts=facts) == FULL
+
+    def test_latency_is_read_where_the_kernel_shows_it(self, tmp_path):
+        (tmp_path / "ttyUSB7").mkdir()
+        (tmp_path / "ttyUSB7" / "latency_timer").write_text("16\n")
+        assert latency_timer_ms("/dev/ttyUSB7", tmp_path) == 16
+        assert latency_timer_ms("/dev/ttyUSB8", tmp_path) is None
+        (tmp_path / "ttyUSB7" / "latency_timer").write_text("none\n")
+        assert latency_timer_ms("/dev/ttyUSB7", tmp_path) is None
+
+    def test_latency_by_the_timer_or_by_the_bunches(self):
+        assert check_latency(LineFacts("/dev/ttyUSB0", 3_000_000, 16), 0.0, False).verdict == "wrong"
+        assert "ttyUSB0/latency_timer" in check_latency(LineFacts("/dev/ttyUSB0", 3_000_000, 16), 0.0, False).remedy
+        assert check_latency(LineFacts("/dev/ttyUSB0", 3_000_000, 1), 0.0, False).verdict == "ok"
+        bunched = np.ceil(times_ns() / 16e6).astype(np.int64) * 16_000_000
+        scans = as_scans(healthy_counts(), bunched)
+        assert 9 < Samples(scans).held_back_ms() < 13 and Samples(as_scans(healthy_counts())).held_back_ms() < 2
+        assert faults(scans, facts=LineFacts("/dev/ttyACM0", 3_000_000)) == {"latency timer": "wrong"}
+
+
+def heard_of(model, ids, scans=60):
+    """A stream of frames with these ids through the real stages: the scans, and the ids that were noted."""
+    heard = HeardIds(model.taxels)
+    stages = SlcanScans(heard.listening(model))
+    rng = np.random.default_rng(0)
+    closed = []
+    for scan in range(scans):
+        frames = [CanFrame(can_id, bytes(rng.integers(1, 99, 8).tolist())) for can_id in ids]
+        closed += stages.feed(b"".join(map(encode_frame, frames)), (scan + 1) * 10_000_000)
+    return heard.ids, closed, stages.counters()
+
+
+class TestIdMap:
+    @pytest.mark.parametrize("spoken", ID_MAPS)
+    @pytest.mark.parametrize("asked", ID_MAPS)
+    def test_the_map_to_try_is_that_of_the_ids_heard(self, asked, spoken):
+        sensor = {"uSPa44": "4", "XR1944": "4", "A": "1", "B": "1a"}[spoken]
+        ids = [can_id for can_id, _ in ID_MAPS[spoken].wire_order(sensor)]
+        heard, closed, counters = heard_of(ID_MAPS[asked], ids)
+        found = {
+            one.name: one
+            for one in examine(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0).findings
+        }
+        if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
+            sensor = {"AB": "7b"}.get(spoken + asked, sensor)
+            assert found["id map"].verdict == "ok" and f"sensor {sensor} heard" in found["id map"].measured
+            return
+        assert found["id map"].verdict == "wrong" and found["id map"].remedy.startswith(f"--id-map {spoken}")
+        if {asked, spoken} == {"uSPa44", "XR1944"}:
+            assert found["silent taxels"].verdict == "not known" and "torn scans" in found
+            assert found["torn scans"].verdict == "ok"
+        else:
+            assert found["scans"].verdict == "wrong"
+
+    def test_a_sensor_that_is_half_broken_is_not_talked_into_another_map(self):
+        ids = [can_id for can_id, _ in USPA44_MAP.wire_order("4")][:8]
+        heard, _, _ = heard_of(USPA44_MAP, ids)
+        finding = check_id_map(heard, USPA44_MAP, half_silent=True)
+        assert finding is not None and finding.verdict == "wrong" and "no map has all" in finding.remedy
+        assert "8 ids heard, 8 of them uSPa44's: 0x004" in finding.measured
+
+    def test_one_of_two_sensors_may_be_of_another_map(self):
+        ids = [can_id for can_id, _ in (*USPA44_MAP.wire_order("4"), *XR1944_MAP.wire_order("6"))]
+        heard, _, _ = heard_of(USPA44_MAP, ids)
+        finding = check_id_map(heard, USPA44_MAP, half_silent=True)
+        assert finding is not None and finding.verdict == "wrong" and "XR1944 (sensor 6)" in finding.measured
+
+    def test_a_silent_taxel_is_no_wrong_map(self):
+        ids = [can_id for can_id, _ in XR1944_MAP.wire_order("4")][1:]
+        heard, _, _ = heard_of(XR1944_MAP, ids)
+        finding = check_id_map(heard, XR1944_MAP, half_silent=False)
+        assert finding is not None and finding.verdict == "ok"
+
+    def test_links_without_ids_say_nothing_of_maps(self):
+        assert check_id_map({}, USPA44_MAP, half_silent=True) is None
+        assert trigger_frame(1).can_id not in LAYOUT_A_MAP.taxels
+
+
+def test_the_page_fits_any_width_and_tells_verdict_norm_and_remedy():
+    findings = [
+        Finding("link", "ok", "fine"),
+        Finding(
+            "noise", "wrong", "9.9 counts", "2 counts", "keep the motors away from the pad, and keep it still", "4"
+        ),
+        Finding("load", "not known", "nothing to compare with", sensor="4"),
+    ]
+    for columns in (40, 80):
+        text = page(findings, columns)
+        assert max(map(len, text.splitlines())) <= columns
+    assert text.splitlines()[0] == "link" and "WRONG noise: 9.9 counts (norm: 2 counts)" in text
+    assert "-> keep the motors away" in text and "?     load: nothing" in text

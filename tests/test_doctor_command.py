@@ -1,0 +1,293 @@
+"""`edge-sr doctor` over a real pseudo-terminal: an emulated sensor, its faults, and a person who does as told."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
+from edge_samples import ROOT, FakeLink
+
+from edge import cli
+from edge.commissioned import use_sensor_file
+from edge.doctor import command, keep, visit
+from edge.doctor.options import doctor_parser
+from edge.doctor.turns import CORNER_PLACES, CORNERS, orders
+from firmware_bridge import pseudo_port
+from firmware_bridge.links.ports import Port
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.recording import Recording, Track
+from firmware_bridge.sensor_file import load_sensor_file
+from firmware_bridge.slcan_emulator import Emulator
+
+WEIGHT_COUNTS = 2400.0
+
+
+class Person:
+    """Holds a sensor and does what is asked of them; gives what the pad sends, scan by scan, as long as it goes on.
+
+    Args:
+        mounting: how the sensor sits; the person sees the pad as it is.
+        resting: counts that lie on every taxel from the start.
+    """
+
+    shape = (1, 3, 4, 4)
+
+    def __init__(self, mounting: Mounting | None = None, resting: float = 0.0) -> None:
+        self._mounting = mounting or Mounting()
+        self._free = np.zeros((3, 4, 4))
+        self._free[2] = resting
+        self._felt = self._free
+        self._place = 0
+        self._rng = np.random.default_rng(7)
+
+    def hear(self, text: str) -> None:
+        for place, corner in zip(CORNER_PLACES, CORNERS, strict=True):
+            if f"the {corner} corner" in text:
+                self._place = place
+                self._felt = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(place)])
+        if "push towards" in text:
+            x, y = PUSHES[self._place]
+            self._felt = self._felt + np.stack([0.2 * x * self._felt[2], 0.2 * y * self._felt[2], 0 * self._felt[2]])
+        if "Lay 200 g" in text:
+            self._felt = np.zeros((3, 4, 4))
+            self._felt[2] = WEIGHT_COUNTS / 16
+        if "et go" in text or "Take it off" in text:
+            self._felt = self._free
+
+    def __iter__(self):
+        while True:
+            mounting = self._mounting
+            wire = self._felt * np.array(mounting.signs)[:, None, None]
+            wire = (wire[[1, 0, 2]] if mounting.swap_xy else wire).reshape(3, 16)
+            taxels = np.empty((3, 16))
+            taxels[:, list(mounting.order)] = wire
+            yield np.rint(REST + taxels.reshape(3, 4, 4) + self._rng.normal(0, 2, (3, 4, 4))).astype(np.int32)
+
+
+class Terminal(io.StringIO):
+    """Where prompts go, with a person before it."""
+
+    def __init__(self, *people: Person) -> None:
+        super().__init__()
+        self._people = people
+
+    def isatty(self) -> bool:
+        return bool(self._people)
+
+    def write(self, text: str) -> int:
+        for person in self._people:
+            person.hear(text)
+        return super().write(text)
+
+
+def recording(*counts, rate_hz=200.0):
+    tracks = [Track(str(number), one, None) for number, one in enumerate(counts)]
+    return Recording(Path("made.csv"), tuple(tracks), rate_hz)
+
+
+def doctor(monkeypatch, port, *arguments, drift_s=0.7, people=()):
+    """The exit code, what was printed, and what was said to the people."""
+    out, err = io.StringIO(), Terminal(*people)
+    with monkeypatch.context() as streams:
+        streams.setattr(sys, "stdout", out)
+        streams.setattr(sys, "stderr", err)
+        rate = () if "--rate-hz" in arguments else ("--rate-hz", 200)
+        asked = ("--source", f"slcan:{port}", "--drift-s", drift_s, *rate, *arguments)
+        code = cli.main(["doctor", *map(str, asked)])
+    return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
+
+
+BY_THE_CLOCK = {"rate", "lost scans", "latency timer", "torn scans"}
+"""Findings that a busy machine makes as well as a bad sensor: not asserted where nothing is wrong with them."""
+
+
+def verdicts(done):
+    """Of what is neither ok nor by the clock, nor left unknown for want of a person or an earlier baseline."""
+    document = json.loads(done.out)
+    assert done.code == (document["verdict"] == "wrong")
+    return {
+        one["name"]: one["verdict"]
+        for one in document["findings"]
+        if one["verdict"] != "ok" and one["name"] not in {"load", "guided press"} | BY_THE_CLOCK
+    }
+
+
+def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
+    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json")
+    document = json.loads(done.out)
+    assert verdicts(done) == {}
+    assert document["kind"] == "emulated" and document["sensor_file"] is None and document["id_map"] == "uSPa44"
+    names = [one["name"] for one in document["findings"]]
+    of_link = "link, baud rate, latency timer, id map"
+    of_sensor = "rate, torn scans, lost scans, silent taxels, stuck taxels, noise, rest levels, drift, baseline, load"
+    assert names == f"{of_link}, {of_sensor}, guided press".split(", ")
+    assert "nobody is at a terminal" in document["findings"][-1]["remedy"]
+    assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
+
+
+def test_a_line_that_is_too_slow(monkeypatch):
+    """At 115200 baud a frame takes 1.9 ms on the line: 32 scans a second arrive of a hundred."""
+    monkeypatch.setattr(pseudo_port, "LINE_SPEED_BAUD", 115_200)
+    with Emulator([recording(healthy_counts(200))], loop=True, frame_s=220 / 115_200, jitter_s=0) as emulator:
+        done = doctor(monkeypatch, f"{emulator.port}@115200", "--json", drift_s=1.7)
+    found = verdicts(done)
+    assert found.pop("baud rate") == "wrong" and done.code == 1
+    assert found == {"baseline": "not known"}
+    settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
+    assert settled["rate"] == settled["latency timer"] == "not known"
+    assert "115200 baud carry 33 scans" in done.out or "115200 baud carry 32 scans" in done.out
+
+
+def test_an_adapter_that_hands_on_every_16_ms(monkeypatch):
+    with Emulator([recording(healthy_counts(200))], loop=True, latency_s=0.016) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json")
+    settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
+    assert verdicts(done) == {} and settled["latency timer"] == "wrong" and done.code == 1
+
+
+def test_the_wrong_id_map_names_the_right_one(monkeypatch):
+    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json", "--id-map", "XR1944")
+    found = verdicts(done)
+    assert found.pop("id map") == "wrong" and found == {"silent taxels": "not known"} and done.code == 1
+    remedies = {one["name"]: one["remedy"] for one in json.loads(done.out)["findings"]}
+    assert remedies["id map"] == "--id-map uSPa44"
+
+
+def test_another_line_speed_than_the_adapters(monkeypatch):
+    with Emulator([recording(healthy_counts(200))], loop=True, left_open=True) as emulator:
+        monkeypatch.setattr(visit, "SILENCE_S", 0.5)
+        done = doctor(monkeypatch, f"{emulator.port}@115200", "--json")
+    found = verdicts(done)
+    assert found["link"] == "wrong" and found["scans"] == "wrong" and len(found) == 2 and done.code == 1
+    assert "another line speed" in done.out
+
+
+def test_a_sensor_that_says_nothing(monkeypatch):
+    with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
+        monkeypatch.setattr(visit, "SILENCE_S", 0.5)
+        done = doctor(monkeypatch, emulator.port, drift_s=60)
+    assert done.code == 1 and "WRONG" in done.out and "is the sensor powered" in done.out
+
+
+def test_a_pad_that_is_pressed_since_its_baseline(monkeypatch, tmp_path):
+    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json", "--out", tmp_path / "s.toml")
+        assert verdicts(done) == {}
+    loaded = healthy_counts(200)
+    loaded[:, 2] += 250
+    with Emulator([recording(loaded)], loop=True) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json", "--sensor", tmp_path / "s.toml")
+    load = next(one for one in json.loads(done.out)["findings"] if one["name"] == "load")
+    assert verdicts(done) == {} and load["verdict"] == "wrong" and done.code == 1
+
+
+@pytest.mark.parametrize(
+    ("turn", "swap", "signs"),
+    [("turned by 90 degrees clockwise", True, (1, -1, 1)), ("mirrored left to right", False, (-1, 1, -1))],
+)
+def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypatch, tmp_path, turn, swap, signs):
+    sits = Mounting(orders()[turn], swap, signs)
+    file = tmp_path / "sensor.toml"
+    monkeypatch.setattr(keep, "serial_ports", list)
+    person = Person(sits)
+    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+        monkeypatch.setenv("COLUMNS", "40")
+        asked = ("--rate-hz", 400, "--weight-g", 200, "--out", file)
+        done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+    assert f"taxel order: {turn.split()[0]}" in done.out, done.out
+    assert max(map(len, (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines())) <= 40
+    known = load_sensor_file(file)
+    entry = known.sensors["4"]
+    assert entry.mounting == sits and known.model == "uSPa44" and known.adapter is None
+    assert entry.counts_per_newton == pytest.approx(signs[2] ** 2 * WEIGHT_COUNTS / 1.96133, rel=0.02)
+    in_place = REST.reshape(3, 16)[:, list(sits.order)].reshape(3, 4, 4)
+    assert entry.baseline is not None and np.abs(entry.baseline.counts - in_place).max() <= 2
+
+    person = Person(sits)
+    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+        asked = ("--rate-hz", 400, "--json", "--sensor", file)
+        done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+    assert verdicts(done) == {}, done.out
+    settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
+    assert settled["taxel order"] == settled["axis signs"] == settled["load"] == "ok"
+
+
+def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong(monkeypatch):
+    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
+    with Emulator([recording(*people, rate_hz=300.0)], jitter_s=0.0) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 300, people=people, drift_s=0.5)
+    found = {(one["sensor"], one["name"]): one["verdict"] for one in json.loads(done.out)["findings"]}
+    assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
+    assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
+
+
+def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
+    monkeypatch.setattr(visit, "SILENCE_S", 0.3)
+    options = doctor_parser().parse_args(["--drift-s", "0.1", "--json"])
+    use_sensor_file(options)
+    out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
+    assert command.run(options, lambda _: link, out, Terminal(Person())) == 1
+    settled = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
+    assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"
+
+
+def test_a_cable_pulled_out_is_3_after_what_was_found(monkeypatch, tmp_path):
+    with Emulator([recording(healthy_counts(150), rate_hz=150.0)]) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--out", tmp_path / "s.toml", drift_s=30)
+    assert done.code == 3 and "link: lost" in done.out and "noise" in done.out
+    assert "link lost" in done.err and not (tmp_path / "s.toml").exists()
+
+
+def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
+    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "edge.cli", "doctor", "--source", f"slcan:{emulator.port}", "--out", tmp_path / "s"],
+            cwd=ROOT,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stderr is not None and "watching for 60 s" in process.stderr.readline()
+        time.sleep(0.9)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=20)
+    assert process.returncode == 130 and "rate:" in out and "\nstopped after " in out and not (tmp_path / "s").exists()
+
+
+def test_the_serial_number_of_the_adapter_is_kept(monkeypatch, tmp_path):
+    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
+        seen = [Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter")]
+        monkeypatch.setattr(keep, "serial_ports", lambda: seen)
+        doctor(monkeypatch, emulator.port, "--out", tmp_path / "s.toml")
+    assert load_sensor_file(tmp_path / "s.toml").adapter == "D30BL366"
+
+
+def test_a_recording_is_examined_but_not_pressed(monkeypatch, tmp_path):
+    out, err = io.StringIO(), Terminal(Person())
+    counts = healthy_counts(150)
+    np.savez(
+        tmp_path / "r.npz",
+        format=np.array("tactile-recording"),
+        version=np.array(1),
+        sensor=np.array(["4"] * 150),
+        scan=np.arange(150),
+        time_ns=np.arange(150) * 10_000_000,
+        counts=counts,
+    )
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    assert cli.main(["doctor", "--source", f"replay:{tmp_path}/r.npz", "--json"]) == 0
+    document = json.loads(out.getvalue())
+    assert document["kind"] == "replay" and not any(one["sensor"] is None for one in document["findings"])
+    assert "cannot be pressed" in document["findings"][-1]["remedy"]

@@ -1,0 +1,203 @@
+"""The guided press, by simulated fingers: every way a pad can lie, by itself and over a real pseudo-terminal."""
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bridge_samples import read_until_lost
+from doctor_samples import finger, healthy_counts, visit
+
+from edge.doctor.examine import check_baseline
+from edge.doctor.press import PATIENCE_S, Answer, GuidedPress
+from edge.doctor.turns import CORNER_PLACES, Press, corner_taxel, find_axes, find_order, orders, z_sign
+from edge.doctor.verdicts import judge_press
+from firmware_bridge.baseline import deformation
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.recording import Recording, Track
+from firmware_bridge.slcan_emulator import Emulator
+
+AXES = [(swap, (x, y, z)) for swap, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1))]
+UPRIGHT = list(range(16))
+
+
+def answer_to(deformations, guide=None, period_s=0.01):
+    """What a guide asked, and itself, for these deformations (n, 3, 4, 4)."""
+    guide = guide or GuidedPress()
+    asked = [guide.first]
+    for number, zeroed in enumerate(deformations):
+        ask = guide.push(zeroed.astype(np.float32), number * period_s)
+        if ask is not None:
+            asked.append(ask)
+    return asked, guide
+
+
+def judged(guide, kept=False, weighed=False):
+    findings, mounting = judge_press(guide.answer, kept, weighed)
+    return {finding.name: finding for finding in findings}, mounting
+
+
+@pytest.mark.parametrize("name", orders())
+def test_every_turn_and_every_axis_is_found(name):
+    order = orders()[name]
+    for swap, signs in AXES:
+        noise = np.random.default_rng(1).normal(0, 2, visit(list(order), swap, signs).shape)
+        asked, guide = answer_to(visit(list(order), swap, signs) + noise)
+        assert guide.done and len(asked) == 12
+        findings, mounting = judged(guide)
+        assert mounting == Mounting(order, swap, signs)
+        assert (findings["taxel order"].verdict == "ok") == (order == tuple(UPRIGHT))
+        assert (findings["axis signs"].verdict == "ok") == (not mounting.turns_axes)
+
+
+def test_there_are_eight_ways_and_they_are_all_there_are():
+    assert len(set(orders().values())) == 8
+    for order in orders().values():  # neighbours stay neighbours
+        grid = np.array(order).reshape(4, 4)
+        assert set(np.abs(np.diff(grid, axis=0)).ravel()) | set(np.abs(np.diff(grid, axis=1)).ravel()) == {1, 4}
+
+
+def test_the_dialogue_is_what_a_person_is_told():
+    asked, _ = answer_to(visit(UPRIGHT, False, (1, 1, 1)))
+    assert asked[:5] == [
+        "Press the top left corner with a finger and hold it.",
+        "Still pressing, push towards the middle of the pad.",
+        "Good. Let go.",
+        "Press the top right corner with a finger and hold it.",
+        "Still pressing, push towards the middle of the pad.",
+    ]
+
+
+def test_a_pad_that_is_held_over_eight_real_sensors_on_one_pseudo_terminal():
+    """Each turn with another swap and signs; its order, axes and z come out of CAN frames over a serial line."""
+    ways = [(list(order), *axes) for order, axes in zip(orders().values(), AXES[::2], strict=True)]
+    ways = [(order, swap, (x, y, -z if n == 5 else z)) for n, (order, swap, (x, y, z)) in enumerate(ways)]
+    tracks = []
+    for number, way in enumerate(ways):
+        moved = np.rint(visit(*way, rest=22, hold=35)).astype(np.int32)
+        free = healthy_counts(120, number)
+        noise = healthy_counts(len(moved), number + 100)
+        tracks.append(Track(str(number), np.concatenate([free, noise + moved]), None))
+    recording = Recording(Path("made.csv"), tuple(tracks), 200.0)
+    with (
+        Emulator([recording], controllers=range(8), frame_s=0, jitter_s=0) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        scans = read_until_lost(link)
+    for number, way in enumerate(ways):
+        own = [scan for scan in scans if scan.sensor == str(number)]
+        baseline, finding = check_baseline(own[5:115], np.ones(16, dtype=bool), None, 0.0)
+        assert baseline is not None, finding
+        guide = GuidedPress()
+        for scan in own[115:]:
+            guide.push(deformation(scan.counts, baseline), scan.time_ns / 1e9)
+        _, mounting = judged(guide)
+        assert mounting == Mounting(tuple(way[0]), way[1], way[2]), number
+
+
+def press(place, taxel=None, z=4000.0, push=(500.0, 500.0)):
+    x, y = dict(zip(CORNER_PLACES, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True))[place]
+    return Press(place, place if taxel is None else taxel, z, None if push is None else (push[0] * x, push[1] * y))
+
+
+class TestAnswers:
+    def test_presses_that_fit_no_turn_are_told_apart(self):
+        crossed = [press(0, 0), press(3, 15), press(15, 3), press(12, 12)]
+        assert find_order(crossed) is None
+        assert find_order([press(0, 0), press(3, 0), press(15, 15), press(12, 12)]) is None
+
+    def test_three_corners_settle_the_turn_and_the_axes(self):
+        for left_out in range(4):
+            presses = [press(place) for place in CORNER_PLACES]
+            del presses[left_out]
+            assert find_order(presses) == "as the id map says"
+            axes = find_axes(presses)
+            assert axes is not None and (axes.swap_xy, axes.signs) == (False, (1, 1))
+
+    @pytest.mark.parametrize("wrong", range(4))
+    def test_one_contradicting_push_is_not_outvoted(self, wrong):
+        pushes = [(-500, 500) if n == wrong else (900, 900) for n in range(4)]
+        presses = [press(place, push=push) for place, push in zip(CORNER_PLACES, pushes, strict=True)]
+        assert find_axes(presses) is None
+        findings, mounting = judge_press(Answer(presses), False, False)
+        assert mounting is None
+        assert [(one.name, one.verdict) for one in findings] == [("taxel order", "ok"), ("axis signs", "wrong")]
+        assert "contradict" in findings[1].measured
+
+    def test_pushes_that_were_not_felt_are_told(self):
+        presses = [press(place, push=None if n > 1 else (500, 500)) for n, place in enumerate(CORNER_PLACES)]
+        findings, mounting = judge_press(Answer(presses), False, False)
+        assert findings[1].verdict == "not known" and "2 of 4 pushes" in findings[1].measured and mounting is None
+
+    def test_z_that_does_both_is_wrong(self):
+        presses = [press(place, z=-4000.0 if place == 15 else 4000.0) for place in CORNER_PLACES]
+        assert z_sign(presses) is None
+        findings, mounting = judge_press(Answer(presses), False, False)
+        assert findings[1].verdict == "wrong" and "falls under others" in findings[1].measured and mounting is None
+
+    def test_what_a_sensor_file_keeps_is_no_longer_wrong(self):
+        turned = [press(place, CORNER_PLACES[(n + 1) % 4]) for n, place in enumerate(CORNER_PLACES)]
+        for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file says so")):
+            findings, mounting = judge_press(Answer(turned), kept, False)
+            assert mounting is not None and mounting.moves_taxels
+            assert findings[0].verdict == verdict and words in findings[0].remedy
+            assert findings[0].measured == "turned by 270 degrees clockwise"
+
+    def test_corners_by_the_load(self):
+        assert [corner_taxel(finger(place)) for place in CORNER_PLACES] == list(CORNER_PLACES)
+        assert [corner_taxel(-finger(place)) for place in CORNER_PLACES] == list(CORNER_PLACES)
+        assert corner_taxel(np.zeros((4, 4))) is None
+        middle = np.zeros((4, 4))
+        middle[0, 1:3] = 900
+        assert corner_taxel(middle) is None
+
+
+class TestPerson:
+    def test_a_press_in_the_middle_is_asked_for_again(self):
+        middle = np.zeros((40, 3, 4, 4))
+        middle[:, 2, 1:3, 1:3] = 1000
+        asked, guide = answer_to([*middle, *np.zeros((30, 3, 4, 4)), *visit(UPRIGHT, False, (1, 1, 1))])
+        assert asked[1:3] == ["That was no corner. Let go.", "Press the top left corner itself and hold it."]
+        assert guide.done and len(guide.answer.presses) == 4
+
+    def test_a_corner_let_go_without_a_push_is_a_press_all_the_same(self):
+        script = visit(UPRIGHT, False, (1, 1, 1))
+        script[65:110] = 0
+        asked, guide = answer_to(script)
+        assert asked[2] == "No push was felt. Let go."
+        assert guide.answer.presses[0].push_counts is None and len(guide.answer.presses) == 4
+        assert judged(guide)[1] == Mounting()
+
+    def test_nobody_there(self):
+        asked, guide = answer_to(np.zeros((700, 3, 4, 4)), period_s=PATIENCE_S / 600)
+        assert guide.done and len(asked) == 1
+        findings, mounting = judged(guide)
+        assert mounting is None and {one.verdict for one in findings.values()} == {"not known"}
+
+    @pytest.mark.parametrize(("z_counts", "verdict"), [(2353.6, "ok"), (200.0, "look")])
+    def test_a_weight_gives_counts_per_newton(self, z_counts, verdict):
+        laid = np.zeros((120, 3, 4, 4))
+        laid[:, 2] = z_counts / 16 + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
+        laid[:20, 2] *= np.linspace(0, 1, 20)[:, None, None]
+        script = [*visit(UPRIGHT, False, (1, 1, 1)), *laid, *np.zeros((30, 3, 4, 4))]
+        asked, guide = answer_to(script, GuidedPress(weight_g=200.0))
+        assert asked[-2:] == ["Lay 200 g on the middle of the pad, hands off.", "Good. Take it off."]
+        assert guide.answer.counts_per_newton == pytest.approx(z_counts / 1.96133, rel=0.02)
+        assert judged(guide, weighed=True)[0]["force"].verdict == verdict
+
+    def test_an_unsteady_weight_gives_none(self):
+        laid = np.zeros((7000, 3, 4, 4))
+        laid[:, 2] = (200 + 40 * (np.arange(7000) % 2))[:, None, None]
+        _, guide = answer_to([*visit(UPRIGHT, False, (1, 1, 1)), *laid], GuidedPress(weight_g=200.0))
+        assert guide.done and judged(guide, weighed=True)[0]["force"].verdict == "not known"
+
+    def test_a_torn_scan_is_not_taken_for_letting_go(self):
+        script = visit(UPRIGHT, False, (1, 1, 1), rest=25)
+        script[5::7, :, :2] = np.nan
+        assert judged(answer_to(script)[1])[1] == Mounting()
+
+    def test_silent_taxels_count_as_nothing(self):
+        script = visit(UPRIGHT, False, (1, 1, 1))
+        script[:, :, 1, 2] = np.nan
+        assert judged(answer_to(script)[1])[1] == Mounting()
