@@ -3,7 +3,9 @@
 import csv
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -39,7 +41,24 @@ def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None
     return path
 
 
-def read_until_lost(link: Link, timeout_s: float = 20.0) -> list[Scan]:
+class _Played(Protocol):
+    lost_frames: int
+
+
+_P = TypeVar("_P", bound=_Played)
+
+
+def undisturbed(play: Callable[[], _P], tries: int = 4) -> _P:
+    """A play without a lost frame: where the machine stands still, the terminal overflows as a device's buffer does."""
+    played = play()
+    for _ in range(tries - 1):
+        if not played.lost_frames:
+            break
+        played = play()
+    return played
+
+
+def read_until_lost(link: Link, timeout_s: float = 60.0) -> list[Scan]:
     """All scans until the link is lost or ends."""
     scans: list[Scan] = []
     end_s = time.monotonic() + timeout_s
@@ -52,7 +71,7 @@ def read_until_lost(link: Link, timeout_s: float = 20.0) -> list[Scan]:
     return scans
 
 
-def read_scans(link: Link, count: int, timeout_s: float = 20.0) -> list[Scan]:
+def read_scans(link: Link, count: int, timeout_s: float = 60.0) -> list[Scan]:
     """The first scans, at least `count`."""
     scans: list[Scan] = []
     end_s = time.monotonic() + timeout_s

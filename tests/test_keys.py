@@ -17,7 +17,7 @@ from edge_samples import BASELINE, ROOT, make_scan, write_model
 
 from firmware_bridge.baseline import save_baselines
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 60.0
 SCANS = 5000
 # A shell of the least words. One that people use would mend the terminal itself after a job that was stopped or killed.
 SHELL = """

@@ -194,7 +194,7 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes):
             for at in range(0, len(text), piece_bytes):
                 os.write(device.device_fd, text[at : at + piece_bytes])
             scans = []
-            end_s = time.monotonic() + 10
+            end_s = time.monotonic() + 60
             while len(scans) < len(complete) and time.monotonic() < end_s:
                 scans += link.read(0.1)
             assert [scan.complete for scan in scans] == complete

@@ -92,14 +92,14 @@ def test_a_client_that_does_not_read_gets_what_is_old_and_is_told():
         while not server.lost_messages:
             server.say(" " * 200_000)  # fills what the kernel and the server keep
         wait_for(lambda: server.lost_messages > 30)
-        end_s = time.monotonic() + 20
+        end_s = time.monotonic() + 60
         while not link.counters()["missed_messages"]:
             link.read(0.1)
             assert time.monotonic() < end_s
         assert link.counters()["stale_scans"] > 0
 
 
-def wait_for(condition, timeout_s=20.0):
+def wait_for(condition, timeout_s=60.0):
     end_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end_s
@@ -122,7 +122,7 @@ def test_what_fails_while_it_is_opened_leaves_nothing_open(monkeypatch):
 
 def lose(link):
     """What the link says when it is lost."""
-    end_s = time.monotonic() + 20
+    end_s = time.monotonic() + 60
     while time.monotonic() < end_s:
         try:
             link.read(0.05)
@@ -152,7 +152,7 @@ def test_a_server_killed_and_restarted():
 def read_notices(link, count):
     """The first notices, at least `count`."""
     notices = []
-    end_s = time.monotonic() + 20
+    end_s = time.monotonic() + 60
     while len(notices) < count:
         assert time.monotonic() < end_s, notices
         link.read(0.05)
@@ -434,13 +434,6 @@ def test_addresses(url, known):
 def test_addresses_that_are_none(url):
     with pytest.raises(SourceError, match=r"expected ws://HOST or ws://HOST:PORT"):
         open_source(f"xela-server:{url}")
-
-
-def test_without_the_package_it_says_what_to_install(monkeypatch):
-    monkeypatch.delitem(sys.modules, "firmware_bridge.links.xela_server")
-    monkeypatch.setitem(sys.modules, "websockets.exceptions", None)
-    with pytest.raises(SourceError, match=r"websockets.*pip install 'tactile-edge-sr\[xela-server\]'"):
-        open_source("xela-server:ws://robot")
 
 
 # The whole program.

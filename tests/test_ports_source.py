@@ -254,7 +254,7 @@ def read_one_scan(model, ids):
         with open_source(f"slcan:{os.ttyname(slave)}", model=model) as link:
             for can_id in [*ids, ids[0]]:
                 os.write(master, encode_frame(CanFrame(can_id, bytes((1, 2, 3, 4, 5, can_id >> 8, can_id & 0xF0, 7)))))
-            scans, end_s = [], time.monotonic() + 20
+            scans, end_s = [], time.monotonic() + 60
             while not scans and time.monotonic() < end_s:
                 scans = link.read(0.05)
             scans += link.read(0.05)

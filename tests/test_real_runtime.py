@@ -6,9 +6,11 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from bridge_samples import undisturbed
 from edge_samples import ROOT, write_model
 
 from firmware_bridge.baseline import Baseline, save_baselines
@@ -29,7 +31,12 @@ def counts_of(trial):
     return [load_recording(RECORDINGS / trial / f"xela_sensor{n}.csv").tracks[0].counts for n in (1, 2)]
 
 
-def play(trial, folder):
+class Played(NamedTuple):
+    records: dict[str, list[dict[str, Any]]]
+    lost_frames: int
+
+
+def play(trial, folder) -> Played:
     """Records of `edge-sr` for one trial, both fingers at once at the recorded rate."""
     baselines = [
         Baseline.from_counts(sensor, counts[-BASELINE_ROWS:], created_unix_s=1.0)
@@ -50,8 +57,10 @@ def play(trial, folder):
         )
         lost_frames = emulator.lost_frames
     assert done.returncode == 3, done.stderr  # the emulator hangs up at the end, which is the cable out
-    records = [json.loads(line) for line in done.stdout.splitlines()]
-    return {sensor: [record for record in records if record["sensor"] == sensor] for sensor in SENSORS}, lost_frames
+    # A machine that stands still for a moment tells of a silent sensor; what counts is that no scan is lost of it.
+    records = [one for one in map(json.loads, done.stdout.splitlines()) if one["state"] != "event"]
+    by_sensor = {sensor: [record for record in records if record["sensor"] == sensor] for sensor in SENSORS}
+    return Played(by_sensor, lost_frames)
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +68,14 @@ def played(tmp_path_factory):
     folder = tmp_path_factory.mktemp("real")
     write_model(folder / "tiny.onnx")
     with ThreadPoolExecutor(len(TRIALS)) as pool:
-        return dict(zip(TRIALS, pool.map(lambda trial: play(trial, folder), TRIALS), strict=True))
+        told = pool.map(lambda trial: undisturbed(lambda: play(trial, folder)), TRIALS)
+        return dict(zip(TRIALS, told, strict=True))
 
 
 @pytest.mark.parametrize("trial", TRIALS)
 def test_one_record_for_every_row_none_lost_none_invented(played, trial):
-    records, lost_frames = played[trial]
-    assert lost_frames == 0, "this machine was too busy to read in time"
+    records = played[trial].records
+    assert played[trial].lost_frames == 0, "this machine was too busy to read in time"
     for sensor, counts in zip(SENSORS, counts_of(trial), strict=True):
         mine = records[sensor]
         assert [record["scan"] for record in mine] == list(range(len(counts)))
@@ -76,7 +86,7 @@ def test_one_record_for_every_row_none_lost_none_invented(played, trial):
 
 @pytest.mark.parametrize("trial", TRIALS)
 def test_torn_and_repeated_rows_are_reported(played, trial):
-    records, _ = played[trial]
+    records = played[trial].records
     torn = repeated = 0
     for sensor, counts in zip(SENSORS, counts_of(trial), strict=True):
         changed = (np.diff(counts, axis=0) != 0).any(axis=1).reshape(len(counts) - 1, 16)
@@ -91,7 +101,7 @@ def test_torn_and_repeated_rows_are_reported(played, trial):
 
 @pytest.mark.skipif(RELEASED not in TRIALS, reason=f"{RELEASED} is not there")
 def test_contact_is_seen_from_the_start_and_its_end_within_five_scans_of_the_release(played):
-    records, _ = played[RELEASED]
+    records = played[RELEASED].records
     for sensor, counts in zip(SENSORS, counts_of(RELEASED), strict=True):
         z_counts = (counts[:, 2] - np.median(counts[-BASELINE_ROWS:, 2], axis=0)).sum(axis=(1, 2))
         # Released: the first row with less than half of the grip that the trial starts with.
