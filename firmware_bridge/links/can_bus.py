@@ -11,6 +11,7 @@ from typing import Any, Final, Self
 from firmware_bridge.bus_errors import BusErrors
 from firmware_bridge.device_clock import DeviceClock
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.extras import how_to_install
 from firmware_bridge.frame_scans import FrameScans
 from firmware_bridge.gs_usb import BITRATE_BIT_S
 from firmware_bridge.links.base import Link, SourceKind
@@ -181,7 +182,7 @@ def _python_can() -> ModuleType:
     try:
         import can
     except ImportError as error:
-        raise DeviceError("can: sources need python-can: pip install 'tactile-edge-sr[can]'") from error
+        raise DeviceError(f"can: sources need python-can: {how_to_install('can')}") from error
     return can
 
 
