@@ -7,6 +7,7 @@ BridgeError
 +-- BaselineRefusedError (ValueError)  the pad moved or was loaded while zeroing
 +-- RecordingError (ValueError)        a recording or baseline file that cannot be used
 +-- NpzError (ValueError)              an npz file that is not plain arrays
++-- CdrError (ValueError)              bytes that are no such ROS message
 +-- SensorFileError (ValueError)       a sensor file that cannot be used
 +-- SourceError (ValueError)           a text that names no source
 
@@ -40,6 +41,10 @@ class RecordingError(BridgeError, ValueError):
 
 class NpzError(BridgeError, ValueError):
     """An npz file that is damaged, larger than expected, or not plain arrays."""
+
+
+class CdrError(BridgeError, ValueError):
+    """Bytes that are no message of the type they are said to be."""
 
 
 class SensorFileError(BridgeError, ValueError):

@@ -1,13 +1,14 @@
-"""Recordings of scans, read from disk: CSV rows, or what the npz sink wrote."""
+"""Recordings of scans, read from disk: CSV rows, or what the sinks npz: and mcap: wrote."""
 
 import csv
 import itertools
+import math
 import re
 from array import array
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,23 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.npz import read_npz
-from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, VendorReading, is_sensor_name
 from firmware_bridge.schedule import NS_PER_S
+
+if TYPE_CHECKING:
+    from firmware_bridge.baseline import Baseline
+    from firmware_bridge.mounting import Mounting
 
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
+MOUNTING_METADATA: Final = "mounting"
+"""Of an MCAP file: one a sensor."""
+SOURCE_METADATA: Final = "source"
+"""The same: what kind of source it was."""
 _NPZ_REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
+_NPZ_ORIGINS: Final = ("origin", "source")
+"""The latter of files that were written before there was the former."""
+_NPZ_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
 HIGHEST_COUNT: Final = 0xFFFF
 
 MOST_CSV_BYTES: Final = 1 << 30
@@ -51,11 +63,19 @@ class Track:
         sensor: name of the sensor.
         counts: (n, 3, rows, cols) int32, ABSENT where a taxel gave no reading.
         time_ns: (n,) int64 monotonic time of each scan in [ns], never falling; None if not recorded.
+        numbers: (n,) int64, as the scans were numbered; None if not recorded, as what follows.
+        device_time_ns: (n,) int64, on the same clock as `time_ns`; -1 where the device gave none.
+        renewed: (n, rows, cols) bool, which readings were new.
+        vendor: (n,) of what the vendor's software said.
     """
 
     sensor: str
     counts: NDArray[np.int32]
     time_ns: NDArray[np.int64] | None
+    numbers: NDArray[np.int64] | None = None
+    device_time_ns: NDArray[np.int64] | None = None
+    renewed: NDArray[np.bool_] | None = None
+    vendor: tuple[VendorReading | None, ...] | None = None
 
     @property
     def mean_rate_hz(self) -> float | None:
@@ -73,28 +93,50 @@ class Recording:
         path: of the file.
         tracks: one per sensor, in the order in which they first occur.
         rate_hz: scans a second of each sensor; None if the file does not say.
+        baselines: what was subtracted from the first scan of each sensor; without those that were not zeroed yet.
+        mountings: of the sensors, by name. The taxels are in place; what is to be done still is to turn the axes.
+        unix_offset_ns: added to `time_ns` gives [ns] since 1970; None if the file does not say.
+        notes: what whoever plays it should know.
+        origin: "device" or "emulated", what its scans come from, however often they were played and recorded again;
+            None if the file does not say.
     """
 
     path: Path
     tracks: tuple[Track, ...]
     rate_hz: float | None
+    baselines: "Mapping[str, Baseline]" = field(default_factory=dict)
+    mountings: "Mapping[str, Mounting]" = field(default_factory=dict)
+    unix_offset_ns: int | None = None
+    notes: tuple[str, ...] = ()
+    origin: Literal["device", "emulated"] | None = None
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; its name's ending, .csv or .npz, says which form.
+    """Read a recording; its name's ending, .csv, .npz or .mcap, says which form.
 
     Raises:
         RecordingError: the file cannot be read, or is not a recording.
     """
     path = Path(path)
-    readers = {".csv": _load_csv, ".npz": _load_npz}
+    readers = {".csv": _load_csv, ".npz": _load_npz, ".mcap": _load_mcap}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise RecordingError(f"{path}: a recording ends in .csv or .npz")
+        raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
     try:
-        return reader(path)
+        recording = reader(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if recording.origin != "emulated":
+        return recording
+    return replace(recording, notes=(*recording.notes, f"{path} was recorded from an emulated sensor"))
+
+
+def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:
+    """What scans come from whose file names these kinds of sources."""
+    found = set(kinds)
+    if "emulated" in found:
+        return "emulated"
+    return "device" if found == {"device"} else None
 
 
 def _load_csv(path: Path) -> Recording:
@@ -215,12 +257,55 @@ def _load_npz(path: Path) -> Recording:
         for sensor in _npz_sensors(path, arrays["sensor"])
         for mine in [arrays["sensor"] == sensor]
     ]
-    return Recording(path, tuple(tracks), _npz_rate_hz(path, arrays.get("rate_hz")))
+    return Recording(
+        path, tuple(tracks), _npz_rate_hz(path, arrays.get("rate_hz")), origin=_npz_origin(path, arrays, len(counts))
+    )
+
+
+def _load_mcap(path: Path) -> Recording:
+    from firmware_bridge.mcap_recording import load_mcap  # which loads the mcap package
+
+    return load_mcap(path)
+
+
+def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
+    """What was subtracted from the first scan of each sensor of an npz, taken by the clock of the scans.
+
+    Raises:
+        RecordingError: what stands there cannot be a baseline.
+    """
+    from firmware_bridge.baseline import LAST_UNIX_S, Baseline  # which most who read a recording have no need of
+
+    path = recording.path
+    try:
+        arrays = read_npz(path, ("sensor", *_NPZ_BASELINE), MOST_NPZ_BYTES)
+    except NpzError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    if not all(name in arrays for name in _NPZ_BASELINE):
+        return {}
+    ids, counts, ages_s = (arrays[name] for name in _NPZ_BASELINE)
+    scans = len(arrays["sensor"])
+    for name, kind, shape in zip(_NPZ_BASELINE, "Uff", ((scans,), (scans, *USPA44.scan_shape), (scans,)), strict=True):
+        if arrays[name].dtype.kind != kind or arrays[name].shape != shape:
+            _refuse_array(path, name, f"{arrays[name].dtype} of shape {arrays[name].shape}", f"shape {shape}")
+    baselines: dict[str, Baseline] = {}
+    for track in recording.tracks:
+        first = int(np.argmax(arrays["sensor"] == track.sensor))
+        own, text, age_s = counts[first].astype(np.float32), str(ids[first]), float(ages_s[first])
+        if not text or track.time_ns is None:
+            continue
+        known = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
+        if not known.all() or not is_sensor_name(text):
+            _refuse_array(path, "baseline_counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
+        own.setflags(write=False)
+        taken_s = int(track.time_ns[0]) / NS_PER_S - (age_s if 0 <= age_s <= LAST_UNIX_S else math.nan)
+        baselines[track.sensor] = Baseline(track.sensor, own, taken_s, 1, "file", text)
+    return baselines
 
 
 def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        arrays = read_npz(path, (*_NPZ_REQUIRED, "rate_hz"), MOST_NPZ_BYTES)
+        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, "rate_hz"), MOST_NPZ_BYTES)
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
     for name in _NPZ_REQUIRED:
@@ -258,6 +343,17 @@ def _check_npz_counts(path: Path, counts: NDArray[Any]) -> NDArray[np.int32]:
     if (absent.any(axis=1) != absent.all(axis=1)).any():
         _refuse_array(path, "counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
     return counts.astype(np.int32)
+
+
+def _npz_origin(path: Path, arrays: Mapping[str, NDArray[Any]], scans: int) -> Literal["device", "emulated"] | None:
+    for name in _NPZ_ORIGINS:
+        array = arrays.get(name)
+        if array is None:
+            continue
+        if array.dtype.kind != "U" or array.shape != (scans,):
+            _refuse_array(path, name, f"{array.dtype} of shape {array.shape}", f"text of shape {(scans,)}")
+        return origin_of(np.unique(array).tolist())
+    return None
 
 
 def _npz_rate_hz(path: Path, rate: NDArray[Any] | None) -> float | None:

@@ -31,7 +31,7 @@ from firmware_bridge.sensor_file_table import (
     truth,
     whole,
 )
-from firmware_bridge.xela import ID_MAPS, USPA44_MAP
+from firmware_bridge.xela import ID_MAPS, USPA44_MAP, ModelMap
 
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1
@@ -69,6 +69,16 @@ class SensorFile:
     def mountings(self) -> dict[str, Mounting]:
         """How each sensor sits, by name."""
         return {name: entry.mounting for name, entry in self.sensors.items()}
+
+    @property
+    def orders(self) -> dict[str, tuple[int, ...]]:
+        """In which order taxels lie, by name of the sensors whose were put elsewhere than the id map says."""
+        return {name: one.order for name, one in self.mountings.items() if one.moves_taxels}
+
+    @property
+    def model_map(self) -> ModelMap:
+        """The id map."""
+        return ID_MAPS[self.model]
 
     @property
     def baselines(self) -> dict[str, Baseline]:

@@ -5,6 +5,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bridge_samples import make_counts, read_scans, read_until_lost, stacked, write_recording
 
@@ -27,7 +28,7 @@ def processes_playing(path: Path) -> list[int]:
 
 
 def wait_until_gone(path: Path) -> None:
-    end_s = time.monotonic() + 10
+    end_s = time.monotonic() + 60
     while processes_playing(path):
         assert time.monotonic() < end_s, "the emulator lives on"
         time.sleep(0.02)
@@ -46,7 +47,16 @@ def test_the_demo_plays_through_and_ends(recording):
         scans = read_until_lost(link)
         assert link.ended and link.read(0.1) == []
         assert link.counters()["scans"] == 30
+    assert link.counters()["scans"] == 30, "the summary is told when the link is closed"
     assert (stacked(scans) == make_counts(30)).all()
+    assert processes_playing(recording) == []
+
+
+def test_a_loop_goes_on_where_the_demo_ends_until_it_is_left(recording):
+    with DemoLink(recording, rate_hz=1000, loop=True) as link:
+        scans = read_scans(link, 75)
+        assert not link.ended
+    assert (stacked(scans[:75]) == np.concatenate([make_counts(30)] * 3)[:75]).all()
     assert processes_playing(recording) == []
 
 
@@ -130,7 +140,7 @@ def test_the_emulator_ends_however_its_parent_ends(recording, how):
         assert len(processes_playing(recording)) == 1
         # To the whole process group, as a terminal sends Ctrl-C.
         os.killpg(parent.pid, how)
-        last_words, _ = parent.communicate(timeout=20)
+        last_words, _ = parent.communicate(timeout=60)
     wait_until_gone(recording)
     if how == signal.SIGINT:
         # Ctrl-C was for the parent alone: the emulator was told to end, and ended well.

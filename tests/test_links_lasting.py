@@ -2,14 +2,17 @@
 
 import itertools
 import threading
+from queue import SimpleQueue
 
 import pytest
 from edge_samples import FakeLink, make_scan
 
+from edge.doctor.line_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links.base import Link, Notice
 from firmware_bridge.links.lasting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.several import NamedLink, SeveralLinks
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 S = 1_000_000_000
 
@@ -176,6 +179,25 @@ def test_after_a_long_silence_one_that_was_plugged_again_is_opened_anew_as_soon_
     assert len([time_s for time_s in world.opened_at_s if 600.2 < time_s < 602.5]) >= 2
 
 
+def test_one_that_comes_back_as_another_kind_is_given_up():
+    """Every result says of what kind its source is: the pretended must not follow the real under its name."""
+
+    class Changeling(WorldLink):
+        def __enter__(self):
+            super().__enter__()
+            self.kind = "device" if self.world.now_ns < 1.5 * S else "emulated"
+            return self
+
+    world = World(away=[(1.0, 2.0)])
+    inner = Changeling(world)
+    link = LastingLink(inner, clock_ns=lambda: world.now_ns, sleep=world.sleep)
+    with pytest.raises(LinkLostError, match=r"^slcan:x was device and came back as emulated: start anew$"), link:
+        while world.now_ns < 5 * S:
+            for _ in link.read(0.1):
+                assert inner.kind == "device"
+    assert not inner.is_open
+
+
 def test_the_first_opening_must_succeed():
     with pytest.raises(DeviceError, match="no such port"):
         lasting(World(away=[(0.0, 1.0)]), 1.0)
@@ -225,6 +247,11 @@ def test_sensors_of_several_links_bear_their_names():
     assert SeveralLinks(links).counters() == {"scans": 100}
 
 
+def test_the_doctor_knows_the_port_behind_a_name():
+    link = NamedLink("left", SlcanSerialLink("/dev/ttyUSB7", 115_200))
+    assert line_facts(link) == LineFacts("/dev/ttyUSB7", 115_200)
+
+
 def test_a_link_that_hangs_holds_up_no_other():
     gate = threading.Event()
     slow, fast = FakeLink([gate, [make_scan(0)]]), FakeLink([[make_scan(n)] for n in range(5)])
@@ -263,6 +290,35 @@ def test_one_that_gives_up_is_told_after_its_scans():
         while True:
             heard += link.read(0.05)
     assert len(heard) == 1
+
+
+class Hesitant(SimpleQueue):
+    """Whoever puts a marker is held up until somebody has met it and asks for more, or for a while."""
+
+    def __init__(self):
+        super().__init__()
+        self._met = False
+        self._asked_for_more = threading.Event()
+
+    def put(self, item):
+        super().put(item)
+        if item is None:
+            self._asked_for_more.wait(0.2)
+
+    def get(self, *, timeout):
+        if self._met:
+            self._asked_for_more.set()
+        item = super().get(timeout=timeout)
+        self._met = self._met or item is None
+        return item
+
+
+def test_one_that_gives_up_is_told_also_if_its_marker_is_met_at_once(monkeypatch):
+    monkeypatch.setattr("firmware_bridge.links.several.SimpleQueue", Hesitant)
+    links = [FakeLink([], error=LinkLostError("gone")), FakeLink([], endless=True)]
+    with SeveralLinks(links) as link, pytest.raises(LinkLostError, match="gone"):
+        for _ in range(20):
+            link.read(0.05)
 
 
 def test_the_kind_of_several_is_what_they_are_once_open():

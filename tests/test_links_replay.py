@@ -123,5 +123,10 @@ def test_what_cannot_be_replayed(tmp_path):
     for rate_hz in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(SourceError, match="positive"):
             ReplayLink([path], rate_hz=rate_hz)
+    with pytest.raises(SourceError, match=r"finger\.csv lasts .* give a higher rate"):
+        ReplayLink([write_recording(path, make_counts(2))], rate_hz=1e-10)
+    timed = write_npz(tmp_path / "timed.npz", ["4"], [5], make_counts(1))
+    with pytest.raises(SourceError, match=r"timed\.npz has times of its own.*leave out --rate-hz, or add --paced"):
+        ReplayLink([timed], rate_hz=100, paced=False)
     with pytest.raises(RecordingError, match="cannot be read"):
         ReplayLink([tmp_path / "gone.csv"])

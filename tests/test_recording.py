@@ -132,7 +132,7 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "folder.csv").mkdir()
     with pytest.raises(RecordingError, match="directory"):
         load_recording(tmp_path / "folder.csv")
-    with pytest.raises(RecordingError, match=r"ends in \.csv or \.npz"):
+    with pytest.raises(RecordingError, match=r"ends in \.csv, \.npz or \.mcap"):
         load_recording(write_csv(tmp_path, HEADER + row(0), "finger.txt"))
 
 

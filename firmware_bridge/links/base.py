@@ -1,7 +1,10 @@
 """What every link offers; adding a link is one file with this interface, and its form in `source`."""
 
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan import Scan
 
 SourceKind = Literal["device", "replay", "emulated"]
@@ -39,12 +42,22 @@ class Link(Protocol):
         kind: "device" for hardware, "replay" for a file, "emulated" for a pretended device.
         ended: no more scans will come, because the source is finite and is through.
         trouble: what the device reports that the user must know of, in plain words; None while all is well.
+        patient: it waits for its reader, and has one scan for each `read`, of whatever time: nothing can be overtaken.
+        unix_offset_ns: of a patient link: added to the time of a scan gives [ns] since 1970; None where that is not
+            known.
+        origin: of a recording, however often it was played and recorded again: what kind of source its scans come from;
+            None where that is not known, or it is `kind`.
+        mountings: of sensors whose scans come with their taxels in place, as a recording has them: how they sat.
     """
 
     name: str
     kind: SourceKind
     ended: bool
     trouble: str | None = None
+    patient: bool = False
+    unix_offset_ns: int | None = None
+    origin: SourceKind | None = None
+    mountings: Mapping[str, Mounting] = MappingProxyType({})
 
     def __enter__(self) -> "Link": ...
 
@@ -63,5 +76,13 @@ class Link(Protocol):
         return []
 
     def counters(self) -> dict[str, int]:
-        """What was received, skipped and missed so far, by name."""
+        """What was received, skipped and missed so far, by name; also after it was closed."""
         ...
+
+
+def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
+    """Of what is played together: one that is emulated makes all of it so; else what all of them are."""
+    found = set(origins)
+    if "emulated" in found:
+        return "emulated"
+    return found.pop() if len(found) == 1 else None

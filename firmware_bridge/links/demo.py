@@ -21,21 +21,33 @@ class DemoLink(Link):
     The emulator ends with this link, and with this process however it ends.
     """
 
-    def __init__(self, recording: str | Path, rate_hz: float | None = None) -> None:
+    def __init__(self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False) -> None:
         self.name = "demo"
         self.kind: SourceKind = "emulated"
         self.ended = False
         self.trouble: str | None = None
         self._recording = str(recording)
         self._rate_hz = rate_hz
+        self._loop = loop
         self._process: subprocess.Popen[str] | None = None
         self._link: SlcanSerialLink | None = None
+        self._counts: dict[str, int] = {}
 
     def __enter__(self) -> Self:
         rate = [] if self._rate_hz is None else ["--rate-hz", str(self._rate_hz)]
+        loop = ["--loop"] if self._loop else []
         # A session of its own: Ctrl-C is for us, and the cable must not go before we have closed.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", *rate, "--", self._recording],
+            [
+                sys.executable,
+                "-m",
+                "firmware_bridge.emulator",
+                "--until-stdin-closes",
+                *rate,
+                *loop,
+                "--",
+                self._recording,
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -55,6 +67,7 @@ class DemoLink(Link):
         try:
             if link is not None:
                 link.__exit__(*exc_info)
+                self._counts = link.counters()
         finally:
             self._reap()
 
@@ -80,8 +93,8 @@ class DemoLink(Link):
         return scans
 
     def counters(self) -> dict[str, int]:
-        """Counters of the serial link."""
-        return self._link.counters() if self._link else {}
+        """Counters of the serial link, the last ones after it was closed."""
+        return self._link.counters() if self._link else self._counts
 
     def _reap(self) -> None:
         process, self._process = self._process, None

@@ -142,8 +142,9 @@ class LastingLink(Link):
             self._close(f"{error}", now_ns)
         else:
             self._reopenings += 1
-            self.kind = self._link.kind
             self._open = True
+            if self._link.kind != self.kind:  # every result would go on to say the other
+                raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start anew")
 
     def _close(self, why: str, now_ns: int | None = None) -> None:
         now_ns = self._clock_ns() if now_ns is None else now_ns

@@ -1,4 +1,4 @@
-"""Recordings played back at the speed they were made."""
+"""Recordings played back, at the speed they were made or as fast as they are read."""
 
 import heapq
 import math
@@ -12,26 +12,32 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.links.base import Link, SourceKind
-from firmware_bridge.recording import Recording, Track, load_recording
-from firmware_bridge.scan import Scan, ScanSeries
+from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.recording import LAST_TIME_NS, Recording, Track, load_recording
+from firmware_bridge.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.schedule import NS_PER_S, Clock, Sleep, sleep_until
 
 
 class _Due(NamedTuple):
     due_ns: int
     lane: int
-    counts: NDArray[np.int32]
+    row: int
 
 
 class ReplayLink(Link):
-    """Scans from recordings, all started together. It never leaves a scan out; late ones come at once."""
+    """Scans from recordings, all started together. It never leaves a scan out; late ones come at once.
+
+    Attributes:
+        recordings: that it plays.
+    """
 
     def __init__(
         self,
         paths: Sequence[str | Path],
         rate_hz: float | None = None,
         *,
+        paced: bool = True,
         clock: Clock = time.monotonic_ns,
         sleep: Sleep = time.sleep,
     ) -> None:
@@ -39,7 +45,9 @@ class ReplayLink(Link):
 
         Args:
             paths: of the recordings.
-            rate_hz: scans a second of each sensor; by default the recorded times, else the recorded rate.
+            rate_hz: scans a second of each sensor, also of one with recorded times if paced; by default the recorded
+                times, else the recorded rate.
+            paced: at that speed, from now on; else each scan when it is asked for, at its recorded time.
             clock: monotonic time in [ns].
             sleep: sleeps for a time in [s].
 
@@ -49,50 +57,84 @@ class ReplayLink(Link):
         """
         if rate_hz is not None and not 0 < rate_hz < math.inf:
             raise SourceError(f"rate is {rate_hz} Hz, expected a positive number")
-        recordings = [load_recording(path) for path in paths]
+        self.recordings = [load_recording(path) for path in paths]
+        timed = next((one.path for one in self.recordings for track in one.tracks if track.time_ns is not None), None)
+        if not paced and rate_hz is not None and timed is not None:
+            raise SourceError(f"{timed} has times of its own, which are kept: leave out --rate-hz, or add --paced")
         self.name = f"replay:{','.join(map(str, paths))}"
         self.kind: SourceKind = "replay"
         self.ended = False
+        self.patient = not paced
+        self.origin = one_origin(recording.origin for recording in self.recordings)
+        self.mountings = {
+            track.sensor: recording.mountings.get(track.sensor, Mounting())
+            for recording in self.recordings
+            if recording.mountings
+            for track in recording.tracks
+        }
         self._clock = clock
         self._sleep = sleep
         lanes = [
-            (track, _due_times_ns(recording, track, rate_hz)) for recording in recordings for track in recording.tracks
+            (track, _due_times_ns(recording, track, rate_hz))
+            for recording in self.recordings
+            for track in recording.tracks
         ]
-        sensors = [track.sensor for track, _ in lanes]
+        self._tracks = [track for track, _ in lanes]
+        sensors = [track.sensor for track in self._tracks]
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
-        self._series = [ScanSeries(track.sensor, USPA44) for track, _ in lanes]
-        self._timeline = heapq.merge(*(_lane(i, *lane) for i, lane in enumerate(lanes)), key=lambda due: due.due_ns)
+        self._series = [ScanSeries(track.sensor, USPA44) for track in self._tracks]
+        dues = (_lane(lane, due_times_ns) for lane, (_, due_times_ns) in enumerate(lanes))
+        self._timeline = heapq.merge(*dues, key=lambda due: due.due_ns)
         self._next: _Due | None = next(self._timeline, None)
         self._start_ns = 0
+        if not paced:
+            self._start_ns = _first_ns(self.recordings[0]) or 0
+            self.unix_offset_ns = self.recordings[0].unix_offset_ns
+        self._notes = [note for recording in self.recordings for note in recording.notes]
         self._counts: dict[str, int] = dict.fromkeys(("scans", "torn_wire", "torn_source", "repeated"), 0)
 
     def __enter__(self) -> Self:
-        self._start_ns = self._clock()
+        if not self.patient:
+            self._start_ns = self._clock()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
         pass
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that fell due since the last call; waits at most `timeout_s` for the first."""
+        """Scans that fell due since the last call; waits at most `timeout_s` for the first. If patient, the next."""
         if self._next is None:
             return []
-        latest_ns = self._clock() + int(timeout_s * NS_PER_S)
-        now_ns = sleep_until(min(self._start_ns + self._next.due_ns, latest_ns), self._clock, self._sleep)
+        if self.patient:
+            now_ns, most = self._start_ns + self._next.due_ns, 1
+        else:
+            latest_ns = self._clock() + int(timeout_s * NS_PER_S)
+            now_ns = sleep_until(min(self._start_ns + self._next.due_ns, latest_ns), self._clock, self._sleep)
+            most = math.inf
         scans: list[Scan] = []
-        while self._next is not None and self._start_ns + self._next.due_ns <= now_ns:
+        while self._next is not None and len(scans) < most and self._start_ns + self._next.due_ns <= now_ns:
             scans.append(self._close(self._next))
             self._next = next(self._timeline, None)
         self.ended = self._next is None
         return scans
+
+    def notices(self) -> list[Notice]:
+        """What is to be known of the files, once."""
+        notes, self._notes = self._notes, []
+        return [Notice(self._start_ns, "trouble", self.name, note) for note in notes]
 
     def counters(self) -> dict[str, int]:
         """Scans, and how many of them were torn or repeated, as the recording has them."""
         return dict(self._counts)
 
     def _close(self, due: _Due) -> Scan:
-        scan = self._series[due.lane].close(due.counts.copy(), self._start_ns + due.due_ns)
+        time_ns = self._start_ns + due.due_ns
+        track = self._tracks[due.lane]
+        if track.renewed is None:
+            scan = self._series[due.lane].close(track.counts[due.row].copy(), time_ns)
+        else:
+            scan = _recorded(track, track.renewed, due.row, time_ns)
         self._counts["scans"] += 1
         self._counts["torn_wire"] += not scan.complete
         self._counts["torn_source"] += scan.complete and scan.torn
@@ -100,16 +142,38 @@ class ReplayLink(Link):
         return scan
 
 
-def _lane(lane: int, track: Track, due_times_ns: NDArray[np.int64]) -> Iterator[_Due]:
-    for due_ns, counts in zip(due_times_ns.tolist(), track.counts, strict=True):
-        yield _Due(due_ns, lane, counts)
+def _recorded(track: Track, renewed: NDArray[np.bool_], row: int, time_ns: int) -> Scan:
+    """A scan as it was, however much of the recording before it is missing."""
+    counts = track.counts[row].copy()
+    fresh, new = counts[0] != ABSENT, renewed[row].copy()
+    for array in (counts, fresh, new):
+        array.setflags(write=False)
+    number = row if track.numbers is None else int(track.numbers[row])
+    device_ns = -1 if track.device_time_ns is None else int(track.device_time_ns[row])
+    moved_ns = None if track.time_ns is None or device_ns < 0 else device_ns + time_ns - int(track.time_ns[row])
+    return Scan(
+        track.sensor, number, time_ns, counts, fresh, new, moved_ns, track.vendor[row] if track.vendor else None
+    )
+
+
+def _lane(lane: int, due_times_ns: NDArray[np.int64]) -> Iterator[_Due]:
+    for row, due_ns in enumerate(due_times_ns.tolist()):
+        yield _Due(due_ns, lane, row)
+
+
+def _first_ns(recording: Recording) -> int | None:
+    return min((int(track.time_ns[0]) for track in recording.tracks if track.time_ns is not None), default=None)
 
 
 def _due_times_ns(recording: Recording, track: Track, rate_hz: float | None) -> NDArray[np.int64]:
-    if rate_hz is None and track.time_ns is not None:
-        first_ns = min(int(other.time_ns[0]) for other in recording.tracks if other.time_ns is not None)
+    first_ns = _first_ns(recording)
+    if rate_hz is None and track.time_ns is not None and first_ns is not None:
         return track.time_ns - first_ns
     rate_hz = recording.rate_hz if rate_hz is None else rate_hz
     if rate_hz is None:
         raise SourceError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
+    if (len(track.counts) - 1) / rate_hz > LAST_TIME_NS / NS_PER_S:
+        raise SourceError(
+            f"{recording.path} lasts {len(track.counts) / rate_hz:.3g} s at {rate_hz:g} Hz: give a higher rate"
+        )
     return np.rint(np.arange(len(track.counts)) * (NS_PER_S / rate_hz)).astype(np.int64)

@@ -10,47 +10,30 @@ from queue import Empty, SimpleQueue
 from typing import Final
 
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.base import Link, Notice, SourceKind
+from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.scan import Scan
 
 POLL_S: Final = 0.1
 
 
-class NamedLink(Link):
+class NamedLink(ChangedLink):
     """A link whose sensors bear its name: sensor "4" of "left" is "left/4"."""
 
     def __init__(self, name: str, link: Link) -> None:
-        self.name = link.name
-        self.kind: SourceKind = link.kind
-        self.ended = False
-        self.wrapped = link
+        super().__init__(link)
         self._prefix = name
-        self._link = link
+        self.mountings = {f"{name}/{sensor}": one for sensor, one in link.mountings.items()}
 
-    def __enter__(self) -> "NamedLink":
-        self._link.__enter__()
-        self.kind = self._link.kind
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self._link.__exit__(*exc_info)
-
-    def read(self, timeout_s: float) -> list[Scan]:
-        """Scans of the link, renamed."""
-        scans = self._link.read(timeout_s)
-        self.ended, self.trouble = self._link.ended, self._link.trouble
-        return [replace(scan, sensor=f"{self._prefix}/{scan.sensor}") for scan in scans]
+    def _change(self, scan: Scan) -> Scan:
+        return replace(scan, sensor=f"{self._prefix}/{scan.sensor}")
 
     def notices(self) -> list[Notice]:
         """The link's, under the user's name for it."""
         return [
             notice._replace(sensors=f"{self._prefix}/{notice.sensors}", text=f"{self._prefix}: {notice.text}")
-            for notice in self._link.notices()
+            for notice in super().notices()
         ]
-
-    def counters(self) -> dict[str, int]:
-        """The link's."""
-        return self._link.counters()
 
 
 class SeveralLinks(Link):
@@ -65,6 +48,8 @@ class SeveralLinks(Link):
         self.name = ", ".join(link.name for link in links)
         self.kind: SourceKind = _one_kind(links)
         self.ended = False
+        self.origin = one_origin(link.origin for link in links)
+        self.mountings = {name: one for link in links for name, one in link.mountings.items()}
         self._links = links
         self._heard: SimpleQueue[Notice | Scan | None] = SimpleQueue()
         self._open = ExitStack()
@@ -83,6 +68,9 @@ class SeveralLinks(Link):
         self._open.callback(executor.shutdown)
         self._open.callback(self._stop.set)
         self._readings = [executor.submit(self._read, link) for link in self._links]
+        for reading in self._readings:
+            # By the reading and not within it: whoever meets the marker must find how the reading ended.
+            reading.add_done_callback(lambda _: self._heard.put(None))
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -107,13 +95,18 @@ class SeveralLinks(Link):
                 elif heard is not None:
                     self._notices.append(heard)
                 else:
-                    for reading in self._readings:
-                        if reading.done():
-                            reading.result()
+                    self._raise_what_ended_one()
         self.trouble = "; ".join(link.trouble for link in self._links if link.trouble is not None) or None
-        through = all(reading.done() for reading in self._readings)  # asked first: the last act of each is to put
+        through = all(reading.done() for reading in self._readings)  # asked first: nothing is put behind the markers
         self.ended = through and not scans and not self._put_back and self._heard.empty()
+        if self.ended:
+            self._raise_what_ended_one()  # its marker may be on its way
         return scans
+
+    def _raise_what_ended_one(self) -> None:
+        for reading in self._readings:
+            if reading.done():
+                reading.result()
 
     def _next_heard(self, timeout_s: float) -> Notice | Scan | None:
         return self._put_back.pop() if self._put_back else self._heard.get(timeout=timeout_s)
@@ -132,13 +125,10 @@ class SeveralLinks(Link):
         return sums
 
     def _read(self, link: Link) -> None:
-        try:
-            while not (self._stop.is_set() or link.ended):
-                scans = link.read(POLL_S)
-                for heard in (*link.notices(), *scans):
-                    self._heard.put(heard)
-        finally:
-            self._heard.put(None)
+        while not (self._stop.is_set() or link.ended):
+            scans = link.read(POLL_S)
+            for heard in (*link.notices(), *scans):
+                self._heard.put(heard)
 
 
 def _one_kind(links: Sequence[Link]) -> SourceKind:

@@ -25,10 +25,11 @@ FORMS: Final = (
     "gs_usb[:SERIAL]",
     "can:INTERFACE:CHANNEL",
     "replay:FILE[,FILE]",
-    "demo",
+    "demo[:loop]",
 )
 
 
+DEMO_LOOP: Final = "demo:loop"
 _NAME = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
 _BAUD = re.compile(r"[1-9][0-9]{0,7}")
 _FINITE: Final = ("demo", "replay:")
@@ -89,7 +90,7 @@ def open_source(
     Args:
         text: one of FORMS.
         rate_hz: scans a second at which recordings are played; a device has its own.
-        demo_recording: what "demo" plays.
+        demo_recording: what "demo" plays, and "demo:loop" again and again.
         model: which CAN id is which taxel, for a device.
         mountings: how its sensors sit, by name. What edge-sr recorded is in place already.
 
@@ -120,13 +121,18 @@ def open_source(
 
         # A file may have a comma in its name.
         paths = [rest] if Path(rest).exists() else rest.split(",")
-        raw = {Path(path).stem for path in paths if path.lower().endswith(".csv")}
-        return _placed(ReplayLink(paths, rate_hz), {name: one for name, one in mountings.items() if name in raw})
-    if text == "demo" and demo_recording is not None:
+        return place_recordings(ReplayLink(paths, rate_hz), paths, mountings)
+    if text in ("demo", DEMO_LOOP) and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
 
-        return DemoLink(demo_recording, rate_hz)
+        return DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP)
     raise _refusal(text)
+
+
+def place_recordings(link: Link, paths: Sequence[str | Path], mountings: Mapping[str, Mounting]) -> Link:
+    """A link that plays these files, the taxels of each in place: those of a CSV lie as they are wired."""
+    raw = {path.stem for path in map(Path, paths) if path.suffix.lower() == ".csv"}
+    return _placed(link, {name: one for name, one in mountings.items() if name in raw})
 
 
 def _slcan(text: str, rest: str, model: ModelMap) -> Link:
@@ -151,14 +157,8 @@ def _slcan_link(port: str, baud: int | None, model: ModelMap) -> "SlcanSerialLin
 
 
 def _xela_server(url: str) -> Link:
-    try:
-        from firmware_bridge.links.xela_server import XelaServerLink
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "websockets":
-            raise
-        raise SourceError(
-            "xela-server needs websockets, which is not installed: pip install 'tactile-edge-sr[xela-server]'"
-        ) from error
+    from firmware_bridge.links.xela_server import XelaServerLink
+
     return XelaServerLink(url)
 
 

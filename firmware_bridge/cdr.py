@@ -1,0 +1,169 @@
+"""ROS 2 messages as bytes, driven by the text of their own definition, so that the two cannot differ. No I/O.
+
+The encoding is CDR version 1, little-endian, as every ROS 2 middleware writes it: four bytes of header, then each
+field at a multiple of its size; texts and sequences bear their length in front. Bytes are read as a stranger's: no
+length is believed that the bytes at hand do not bear out.
+"""
+
+import re
+import struct
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from firmware_bridge.errors import CdrError
+
+LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000
+"""Where times of ROS 2 end, in 2038."""
+HEADER: Final = b"\x00\x01\x00\x00"
+_NUMBERS: Final = dict(
+    (
+        *(("int8", "b"), ("uint8", "B"), ("int16", "h"), ("uint16", "H"), ("int32", "i"), ("uint32", "I")),
+        *(("int64", "q"), ("uint64", "Q"), ("float32", "f"), ("float64", "d")),
+    )
+)
+_LENGTH: Final = struct.Struct("<I")
+_FIELD = re.compile(r"([A-Za-z][A-Za-z0-9_/]*)(\[([0-9]*)\])? +([a-z][a-z0-9_]*)")
+_RULE: Final = "=" * 80
+
+
+class _Field(NamedTuple):
+    """One field: a number, a text, or a message; `length` of an array of numbers, 0 if it is open, else None."""
+
+    name: str
+    number: struct.Struct | None
+    dtype: np.dtype[Any] | None
+    length: int | None
+    message: "MessageType | None"
+
+
+class MessageType:
+    """A message: its definition, and its bytes.
+
+    Attributes:
+        name: such as "std_msgs/msg/Header".
+        definition: its text, and behind it those of the messages in it, as MCAP wants it for the encoding "ros2msg".
+    """
+
+    def __init__(self, name: str, text: str, *parts: "MessageType") -> None:
+        """Read a definition.
+
+        Args:
+            name: with its package.
+            text: of the .msg file: numbers, texts, arrays of numbers, and other messages; no constants, no defaults.
+            parts: the messages in it.
+
+        Raises:
+            ValueError: a line that is no such field.
+        """
+        self.name = name
+        self._text = text.strip()
+        self._parts = tuple(dict.fromkeys(one for part in parts for one in (part, *part._parts)))
+        known = {part.name.replace("/msg/", "/"): part for part in parts}
+        lines = (line.partition("#")[0].strip() for line in text.splitlines())
+        self._fields = tuple(_field(line, known) for line in lines if line)
+
+    @property
+    def definition(self) -> str:  # noqa: D102 - above
+        parts = (f"\n{_RULE}\nMSG: {part.name.replace('/msg/', '/')}\n{part._text}" for part in self._parts)
+        return self._text + "".join(parts) + "\n"
+
+    def encode(self, values: Mapping[str, Any]) -> bytes:
+        """The bytes of a message whose fields have these values; arrays of numbers may be of any shape.
+
+        Raises:
+            KeyError: a field has no value.
+        """
+        out = bytearray()
+        self._write(out, values)
+        return HEADER + out
+
+    def decode(self, data: bytes | memoryview) -> dict[str, Any]:
+        """The fields of a message; arrays of numbers as flat read-only arrays.
+
+        Raises:
+            CdrError: the bytes are no such message.
+        """
+        if bytes(data[: len(HEADER)]) != HEADER:
+            raise CdrError(f"a {self.name} begins with {bytes(data[:4]).hex()}, expected {HEADER.hex()}")
+        body = memoryview(data)[len(HEADER) :]
+        try:
+            values, _ = self._read(body, 0)
+        except (struct.error, ValueError) as error:
+            raise CdrError(f"{len(data)} bytes are no whole {self.name}: {error}") from error
+        return values
+
+    def _write(self, out: bytearray, values: Mapping[str, Any]) -> None:
+        for name, number, dtype, count, message in self._fields:
+            value = values[name]
+            if message is not None:
+                message._write(out, value)
+            elif number is None:
+                text = value.encode() + b"\0"
+                out += bytes(-len(out) % 4) + _LENGTH.pack(len(text)) + text
+            elif count is None:
+                out += bytes(-len(out) % number.size) + number.pack(value)
+            else:
+                array = np.asarray(value, dtype)
+                if count == 0:
+                    out += bytes(-len(out) % 4) + _LENGTH.pack(array.size)
+                elif array.size != count:
+                    raise ValueError(f"{name} has {array.size} numbers, expected {count}")
+                if array.size:  # an empty sequence is followed by no filling of its own
+                    out += bytes(-len(out) % number.size) + array.tobytes()
+
+    def _read(self, body: memoryview, at: int) -> tuple[dict[str, Any], int]:
+        values: dict[str, Any] = {}
+        for name, number, dtype, count, message in self._fields:
+            if message is not None:
+                values[name], at = message._read(body, at)
+                continue
+            if number is not None and count is None:
+                at += -at % number.size
+                (values[name],) = number.unpack_from(body, at)
+                at += number.size
+                continue
+            length = count
+            if not length:
+                at += -at % 4
+                (length,) = _LENGTH.unpack_from(body, at)
+                at += 4
+            if number is None:
+                if not 0 < length <= len(body) - at:
+                    raise ValueError(f"{name} has {length} bytes, {len(body) - at} are there")
+                values[name] = str(body[at : at + length - 1], "utf-8")
+                at += length
+                continue
+            if length:
+                at += -at % number.size
+            # Which refuses to read beyond the end.
+            values[name] = np.frombuffer(body, dtype, length, at) if length else np.empty(0, dtype)
+            at += length * number.size
+        return values, at
+
+
+def _field(line: str, known: Mapping[str, MessageType]) -> _Field:
+    match = _FIELD.fullmatch(line)
+    if match is None:
+        raise ValueError(f"{line!r} is no field of a message")
+    kind, array, length, name = match.groups()
+    count = None if array is None else int(length or 0)
+    if kind in known and count is None:
+        return _Field(name, None, None, None, known[kind])
+    if kind == "string" and count is None:
+        return _Field(name, None, None, None, None)
+    if kind in _NUMBERS:
+        number = struct.Struct("<" + _NUMBERS[kind])
+        return _Field(name, number, np.dtype("<" + _NUMBERS[kind]), count, None)
+    raise ValueError(f"{line!r}: {kind} is no known kind")
+
+
+TIME: Final = MessageType("builtin_interfaces/msg/Time", "int32 sec\nuint32 nanosec")
+STD_HEADER: Final = MessageType("std_msgs/msg/Header", "builtin_interfaces/Time stamp\nstring frame_id", TIME)
+
+
+def stamp(unix_ns: int) -> dict[str, int]:
+    """A time in [ns] since 1970 as the fields of TIME."""
+    sec, nanosec = divmod(unix_ns, 1_000_000_000)
+    return {"sec": sec, "nanosec": nanosec}

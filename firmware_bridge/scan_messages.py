@@ -1,0 +1,189 @@
+"""A scan and a baseline as messages: all that is needed to play a recording again, bit for bit. No I/O."""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.baseline import LAST_UNIX_S, Baseline
+from firmware_bridge.cdr import STD_HEADER, MessageType, stamp
+from firmware_bridge.errors import CdrError
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording import HIGHEST_COUNT, LAST_TIME_NS
+from firmware_bridge.scan import ABSENT, Scan, VendorReading, is_sensor_name
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.xela_server import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
+
+_ALL: Final = (1 << USPA44.taxel_count) - 1
+
+SCAN: Final = MessageType(
+    "tactile_edge_sr/msg/Scan",
+    """\
+# One reading of all taxels of one sensor, raw.
+std_msgs/Header header          # wall clock time of time_ns; frame_id is the sensor
+string sensor
+int64 number                    # of this sensor's scans, from 0
+int64 time_ns                   # monotonic, when its newest reading arrived
+int64 device_time_ns            # the same by the device's own time stamps; -1 without
+uint64 fresh                    # bit i: taxel i, row-major from the top left, gave a reading
+uint64 renewed                  # bit i: fresh, and another reading than before
+int32[48] counts                # [axis x, y, z][row][column]; -1 where not fresh
+float32[] vendor_newtons        # the same, by the vendor's software; empty where it tells none
+float32[] vendor_temperature_k  # [row][column], empty where it tells none
+float32[] vendor_ups_hz         # [row][column], empty where it tells none
+""",
+    STD_HEADER,
+)
+BASELINE: Final = MessageType(
+    "tactile_edge_sr/msg/Baseline",
+    """\
+# What is subtracted from a sensor's scans from the next one on, drift and all.
+std_msgs/Header header
+string sensor
+string id                       # of the baseline as it was taken
+string origin                   # start-up, demand, or file
+float64 created_unix_s          # when it was taken, since 1970
+int32 scans                     # that it is the median of
+float64 age_s                   # NaN where a clock was wrong
+float32[48] counts              # [axis x, y, z][row][column]; NaN where a taxel was not zeroed
+""",
+    STD_HEADER,
+)
+
+
+class RecordedScan(NamedTuple):
+    """What a message says of a scan, checked; numbers as `SCAN` has them."""
+
+    sensor: str
+    number: int
+    time_ns: int
+    device_time_ns: int
+    fresh: int
+    renewed: int
+    counts: NDArray[np.int32]
+    vendor: VendorReading | None
+
+
+def encode_scan(scan: Scan, unix_ns: int, fresh: int, renewed: int) -> bytes:
+    """A scan that came at `unix_ns` [ns] since 1970; `fresh` and `renewed` are its masks as numbers."""
+    vendor = VendorReading() if scan.vendor is None else scan.vendor
+    return SCAN.encode(
+        {
+            "header": {"stamp": stamp(unix_ns), "frame_id": scan.sensor},
+            "sensor": scan.sensor,
+            "number": scan.number,
+            "time_ns": scan.time_ns,
+            "device_time_ns": -1 if scan.device_ns is None else scan.device_ns,
+            "fresh": fresh,
+            "renewed": renewed,
+            "counts": scan.counts,
+            "vendor_newtons": () if vendor.newtons is None else vendor.newtons,
+            "vendor_temperature_k": () if vendor.temperature_k is None else vendor.temperature_k,
+            "vendor_ups_hz": () if vendor.ups_hz is None else vendor.ups_hz,
+        }
+    )
+
+
+def decode_scan(data: bytes | memoryview) -> RecordedScan:
+    """The scan in a message.
+
+    Raises:
+        CdrError: it is none, or says what no scan says.
+    """
+    said = SCAN.decode(data)
+    sensor, number, fresh, renewed = said["sensor"], said["number"], said["fresh"], said["renewed"]
+    _check(is_sensor_name(sensor), "sensor", sensor, "a name")
+    _check(0 <= number <= LAST_TIME_NS, "number", number, f"0..{LAST_TIME_NS}")
+    for name, least in (("time_ns", 0), ("device_time_ns", -1)):
+        _check(least <= said[name] <= LAST_TIME_NS, name, said[name], f"{least}..{LAST_TIME_NS}")
+    _check(fresh <= _ALL and renewed & ~fresh == 0, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
+    counts = said["counts"].reshape(USPA44.scan_shape)
+    low, high = int(counts.min()), int(counts.max())
+    _check(low >= ABSENT and high <= HIGHEST_COUNT, "counts", (low, high), f"{ABSENT}..{HIGHEST_COUNT}")
+    absent = counts == ABSENT
+    told = mask(fresh)
+    _check(bool((absent == ~told).all()), "counts", "readings", "one on each axis of a fresh taxel, none of others")
+    _check_vendor(said)
+    vendor = {
+        "newtons": _vendor(said, "vendor_newtons", USPA44.scan_shape),
+        "temperature_k": _vendor(said, "vendor_temperature_k", told.shape),
+        "ups_hz": _vendor(said, "vendor_ups_hz", told.shape),
+    }
+    known = any(array is not None for array in vendor.values())
+    return RecordedScan(
+        *(sensor, number, said["time_ns"], said["device_time_ns"], fresh, renewed),
+        counts,
+        VendorReading(**vendor) if known else None,
+    )
+
+
+def encode_baseline(baseline: Baseline, age_s: float | None, unix_ns: int) -> bytes:
+    """A baseline that comes into use at `unix_ns` [ns] since 1970."""
+    return BASELINE.encode(
+        {
+            "header": {"stamp": stamp(unix_ns), "frame_id": baseline.sensor},
+            "sensor": baseline.sensor,
+            "id": baseline.id,
+            "origin": baseline.origin,
+            # A recording whose clock began later does not know: its age does.
+            "created_unix_s": baseline.created_unix_s if baseline.created_unix_s > 0 else np.nan,
+            "scans": baseline.scans,
+            "age_s": np.nan if age_s is None else age_s,
+            "counts": baseline.counts,
+        }
+    )
+
+
+def decode_baseline(data: bytes | memoryview) -> Baseline:
+    """The baseline in a message, as of a file.
+
+    Raises:
+        CdrError: it is none, or says what no baseline says.
+    """
+    said = BASELINE.decode(data)
+    sensor, created_unix_s, scans = said["sensor"], said["created_unix_s"], said["scans"]
+    _check(is_sensor_name(sensor), "sensor", sensor, "a name")
+    _check(is_sensor_name(said["id"]), "id", said["id"], "a short text")
+    if np.isnan(created_unix_s):
+        age_s, at = said["age_s"], said["header"]["stamp"]
+        _check(np.isnan(age_s) or 0 <= age_s <= LAST_UNIX_S, "age_s", age_s, f"0..{LAST_UNIX_S:g} seconds, or none")
+        created_unix_s = at["sec"] + at["nanosec"] / NS_PER_S - age_s
+    else:
+        _check(0 < created_unix_s <= LAST_UNIX_S, "created_unix_s", created_unix_s, "seconds since 1970, or none")
+    _check(scans >= 1, "scans", scans, "a whole number from 1")
+    counts = np.array(said["counts"].reshape(USPA44.scan_shape))
+    inside = np.isnan(counts) | ((counts >= 0) & (counts <= HIGHEST_COUNT + 1))
+    _check(bool(inside.all()), "counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
+    counts.setflags(write=False)
+    return Baseline(sensor, counts, created_unix_s, scans, "file", said["id"])
+
+
+def mask(bits: int) -> NDArray[np.bool_]:
+    """A number as a (rows, cols) mask: bit i is taxel i, row-major from the top left."""
+    taxels = np.unpackbits(np.frombuffer(bits.to_bytes(8, "little"), np.uint8), bitorder="little")
+    return taxels[: USPA44.taxel_count].astype(bool).reshape(USPA44.rows, USPA44.cols)
+
+
+def _check_vendor(said: dict[str, Any]) -> None:
+    """Hold it to what is taken of the server itself; where there is no thermometer there is no temperature."""
+    newtons, kelvin, ups_hz = (said[name] for name in ("vendor_newtons", "vendor_temperature_k", "vendor_ups_hz"))
+    right = bool((np.abs(newtons) <= HIGHEST_NEWTONS).all())
+    _check(right, "vendor_newtons", "others", f"-{HIGHEST_NEWTONS:g}..{HIGHEST_NEWTONS:g}")
+    low, high = KELVIN
+    right = bool((np.isnan(kelvin) | ((kelvin >= low) & (kelvin <= high))).all())
+    _check(right, "vendor_temperature_k", "others", f"{low:g}..{high:g}, or none")
+    right = bool(((ups_hz >= 0) & (ups_hz <= HIGHEST_UPS_HZ)).all())
+    _check(right, "vendor_ups_hz", "others", f"0..{HIGHEST_UPS_HZ:g}")
+
+
+def _vendor(said: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+    array = said[name]
+    if not array.size:
+        return None
+    _check(array.size == int(np.prod(shape)), name, f"{array.size} numbers", f"none, or {int(np.prod(shape))}")
+    return array.reshape(shape)
+
+
+def _check(right: bool, name: str, got: object, expected: str) -> None:
+    if not right:
+        raise CdrError(f"{name}: {str(got)[:60]!r}, expected {expected}")
