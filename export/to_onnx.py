@@ -20,6 +20,7 @@ from edge.bundle import BUNDLE_DIR, INT8_SUFFIX
 from edge.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.errors import EdgeError
 from edge.frozen import FrozenSet, load_frozen_set
+from edge.progress import tracked
 from export.errors import ExportError
 from export.fine_tune import FineTuning, quantised_well
 from export.graph import outputs, to_model
@@ -125,12 +126,13 @@ def export(
     contract = contract_of(net, report, frozen, geometry, batch)
     windows = np.concatenate([read_windows(frozen, contract), *extreme_windows(contract).values()])
     writer = Writer(folder, frozen, validation, report)
-    single = to_model(net, geometry)
     if calibration is None:
-        model = single if batch == 1 else to_model(net, geometry, batch)
+        model = to_model(net, geometry, batch)
+        single = model if batch in (1, ANY_BATCH) else to_model(net, geometry)
         parity = check_parity(net, model, windows, contract.output_full_scale)
         return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
 
+    single = to_model(net, geometry)
     check_parity(net, single, windows, contract.output_full_scale)
     seen = calibration_windows(calibration, contract)
     well = quantised_well(net, geometry, seen, calibration, tuning, MOST_LOSS_DB, every=every)
@@ -207,7 +209,7 @@ def main(arguments: list[str] | None = None) -> None:
         taps = None if options.int8 is None else join([load_sequences(path) for path in options.int8])
         validation = held_out("validation")
         tuning = FineTuning(FINE_TUNE_STEPS if steps is None else steps, validation, always=steps is not None)
-        for checkpoint in options.checkpoints:
+        for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(
                 checkpoint,
                 options.out,

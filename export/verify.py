@@ -10,7 +10,7 @@ they are the integers of. That network is made again from the float32 graph's ow
 import argparse
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -26,6 +26,7 @@ from edge.contract import Contract
 from edge.errors import EdgeError, ModelError
 from edge.frozen import FrozenSet, load_frozen_set
 from edge.metrics import psnr_db
+from edge.progress import Progress
 from export.errors import ExportError, ParityError
 from export.graph import outputs
 from export.parity import LEVELS, TOLERANCE, Difference, GraphRun, differences, extreme_windows, read_windows
@@ -45,6 +46,8 @@ INT8_EXTREME: Final = 0.75
 FLOAT_EXTREME: Final = 2e-5
 """Of float32 on the same windows; measured: 1.04e-5 at the full range, negative, not optimised."""
 READINGS: Final = ("test set", "recordings")
+PASSES: Final = 1 + len(LEVELS)
+"""Over all windows of a model: by torch, and at each level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +82,12 @@ COLUMNS: Final = ("model", "level", "windows", "largest", "relative", "PSNR chan
 
 
 def verify(
-    path: Path, frozen: FrozenSet, checkpoints: Path | None = None, recordings: Path | None = None
+    path: Path,
+    frozen: FrozenSet,
+    checkpoints: Path | None = None,
+    recordings: Path | None = None,
+    *,
+    on_pass: Callable[[], object] = lambda: None,
 ) -> Iterator[Parity]:
     """Every level and every kind of windows of one model.
 
@@ -88,6 +96,7 @@ def verify(
         frozen: the test set; a model of another scale is compared with its network, but not judged.
         checkpoints: folder of NAME.pt; without, networks are made of the float32 graphs.
         recordings: folder of TRIAL/xela_SENSOR.csv; left out without.
+        on_pass: called PASSES times, each time that all windows were run.
 
     Raises:
         ModelError: no model, or its contract is broken.
@@ -108,12 +117,14 @@ def verify(
         groups["recordings"] = recorded_windows(recordings, contract)
     groups |= extreme_windows(contract)
     expected = {name: _run_torch(net, windows) for name, windows in groups.items()}
+    on_pass()
     truth = frozen.patterns() if contract.scale == frozen.scale else None
     for level in LEVELS:
         run = GraphRun(model, level)
         for name, windows in groups.items():
             given = run(windows)
             yield _judge(path.stem, level, name, contract, expected[name], given, truth if name == "test set" else None)
+        on_pass()
 
 
 def _judge(
@@ -215,7 +226,12 @@ def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os
     options = parser.parse_args(arguments)
     try:
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-        rows = [row for path in options.models for row in verify(path, frozen, options.checkpoints, options.recordings)]
+        with Progress("verifying", len(options.models) * PASSES, "pass") as bar:
+            rows = [
+                row
+                for path in options.models
+                for row in verify(path, frozen, options.checkpoints, options.recordings, on_pass=bar.advance)
+            ]
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"verify: {error}")
     sys.stdout.write(table(rows) + "\n")

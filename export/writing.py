@@ -11,6 +11,7 @@ import onnx
 from edge.contract import ANY_BATCH, Contract
 from edge.frozen import FrozenSet
 from edge.judge import judge_model, mean_error
+from edge.progress import tracked
 from edge.session import ModelSession
 from export.reference import origin
 from train.confidence import confidence_sets, fit_confidence
@@ -59,7 +60,7 @@ class Writer:
         session = self._session(name, model if contract.batch == ANY_BATCH else single, contract)
         said = [f"x{contract.scale}"]
         if contract.scale == self.frozen.scale:
-            for given in range(1, contract.taps + 1):
+            for given in tracked(range(1, contract.taps + 1), "judging", "run"):
                 contract.test_error[str(given)] = mean_error(judge_model(session, self.frozen, given))
             error = contract.test_error[str(contract.taps)]
             said.append(f"{error['psnr_db']:.2f} dB, SSIM {error['ssim']:.3f}")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install 'tactile-edge-sr[fem]'")
+pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
 
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver

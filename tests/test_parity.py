@@ -1,5 +1,6 @@
 """Every bundled model computes what its network computes, at every level, and in a second runtime."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import cache
 
@@ -21,8 +22,10 @@ from export.graph import outputs
 from export.int8 import convolutions
 from export.parity import LEVELS, GraphRun, differences, extreme_windows, read_windows
 from export.reference import network_of
-from export.verify import Parity, main, table, verify
+from export.verify import PASSES, Parity, main, table, verify
 
+passes: Counter[str] = Counter()
+"""That were told of each model in `rows`."""
 MODELS = [path.stem for path in bundled_models()]
 IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]
 IN_INTEGERS = [name for name in MODELS if name.endswith("-int8")]
@@ -35,7 +38,7 @@ def frozen():
 
 @cache
 def rows(name):
-    return list(verify(find_model(name), frozen()))
+    return list(verify(find_model(name), frozen(), on_pass=lambda: passes.update([name])))
 
 
 def graph_of(name):
@@ -134,6 +137,10 @@ def spoiled(name, factor):
     (bias,) = [weight for weight in model.graph.initializer if weight.name == "leave.0.bias"]
     bias.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(bias) * np.float32(factor), bias.name))
     return model
+
+
+def test_each_pass_over_the_windows_is_told_for_a_bar_even_where_there_is_one_model():
+    assert rows("stsr") and passes["stsr"] == PASSES > 3
 
 
 def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeypatch, capsys):

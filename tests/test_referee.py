@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install 'tactile-edge-sr[fem]'")
+pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
 
 from train.experiments import referee
 from train.experiments.referee import Mesh, press_or_recall

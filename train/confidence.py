@@ -1,6 +1,6 @@
 """What a network's deviations tell of its error, found on taps that it was not trained on: see edge.confidence."""
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Final
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from edge.confidence import doubt
 from edge.frozen import FrozenSet
+from edge.progress import tracked
 from edge.runtime import Model
 from train.dataset import Sequences
 from train.freeze import SEED, freeze
@@ -23,7 +24,7 @@ def confidence_sets(validation: Sequences, scale: int) -> list[FrozenSet]:
     return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in _SET_FORCES_N]
 
 
-def fit_confidence(model: Model, sets: Iterable[FrozenSet]) -> dict[str, dict[str, list[float]]]:
+def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
     """The table of edge.confidence for a model with deviations.
 
     Frames are sorted by their doubt into bins of equally many; a bin's gain is that of its frames together.
@@ -32,7 +33,10 @@ def fit_confidence(model: Model, sets: Iterable[FrozenSet]) -> dict[str, dict[st
         ValueError: the model gives no deviation.
     """
     taps = model.contract.taps
-    parts = [[doubts_and_errors(model, given, frozen) for given in range(1, taps + 1)] for frozen in sets]
+    parts = [
+        [doubts_and_errors(model, given, frozen) for given in range(1, taps + 1)]
+        for frozen in tracked(sets, "confidence", "set")
+    ]
     found = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
     rows = {str(given): _row(found[given - 1 : given + 1]) for given in range(1, taps + 1)}
     return {given: row for given, row in rows.items() if row["doubt"]}  # none where no pattern is more than zero

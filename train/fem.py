@@ -18,6 +18,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
+from firmware_bridge.extras import how_to_install
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.errors import TrainError
 from train.layer import Layer
@@ -26,9 +27,7 @@ from train.mooney_rivlin import C2_SHARE, MooneyRivlin
 try:
     import felupe
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "the FEM referee needs felupe (GPL): pip install 'tactile-edge-sr[fem]'", name="felupe"
-    ) from error
+    raise ModuleNotFoundError(f"the FEM referee needs felupe (GPL): {how_to_install('fem')}", name="felupe") from error
 
 _RESIDUAL: Final = 1e-6
 """Forces out of balance, as a share of the reactions, at which a step is done."""

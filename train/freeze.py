@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map
 from edge.frozen import FrozenSet
+from edge.progress import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 from train.batches import Draw, WindowBatches
@@ -91,7 +92,7 @@ def fit_taxels(sequences: Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[s
 def _drawn(sequences: Sequences, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Readings (n, 3, rows, cols) of newest taps in zeroed counts, and their patterns (n, H, W) in [mm]."""
     batches = WindowBatches(sequences.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
-    drawn = [batches.draw(number) for number in range(windows // 100)]
+    drawn = [batches.draw(number) for number in tracked(range(windows // 100), "reading", "batch")]
     return np.concatenate([readings[:, 0] for readings, _ in drawn]), np.concatenate([truth for _, truth in drawn])
 
 

@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Final, cast
 
 import joblib
-from tqdm import tqdm
 
+from edge.progress import Progress
 from train.dataset import Sequences, join, load_sequences
 from train.errors import DatasetError, TrainError
 from train.generation import FORCE_N, Generation, one_thread, random_figures, solve_chunk
@@ -47,7 +47,7 @@ _NAMED: Final = {"all": SURFACES, "plate1": PLATES[0], "plate2": PLATES[1], "non
 def generate(
     config: Generation, path: Path, jobs: int = -1, progress: Callable[[int], object] = lambda poses: None
 ) -> Sequences:
-    """Solve what a configuration asks for, and write it; called again after a kill, go on.
+    """Solve what a configuration asks for, and write it; called again after a kill, go on. A bar tells how far it is.
 
     Args:
         config: what.
@@ -72,10 +72,14 @@ def generate(
             surface_mesh(name)
     folder = path.with_name(path.name + ".parts")
     missing = _missing_chunks(config, folder, progress)
-    with one_thread():  # workers may be threads of this process
+    lacking = sum(min(config.chunk, config.sequences - chunk * config.chunk) for chunk in missing)
+    total, there = config.sequences * config.taps, (config.sequences - lacking) * config.taps
+    # Workers may be threads of this process.
+    with one_thread(), Progress("poses", total, "pose", done=there) as bar:
         for chunk, part in _solved(config, missing, jobs):
             part.save(_part_path(folder, chunk))
             progress(len(part) * part.taps)
+            bar.advance(len(part) * part.taps)
     made = join([load_sequences(_part_path(folder, chunk)) for chunk in range(config.chunks)])
     made.save(path)
     shutil.rmtree(folder)
@@ -109,6 +113,8 @@ def _missing_chunks(config: Generation, folder: Path, progress: Callable[[int], 
 def _solved(config: Generation, chunks: Sequence[int], jobs: int) -> Iterator[tuple[int, Sequences]]:
     """Chunks and their numbers, as they become ready."""
     tasks = [joblib.delayed(_numbered)(config, chunk) for chunk in chunks]
+    if len(tasks) == 1:
+        jobs = 1  # a process of its own takes seconds to begin
     try:
         pool, at_once = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered"), len(tasks)
     except ValueError:  # a backend without generators, such as Ray's: in rounds, so that parts are kept all the same
@@ -129,8 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         config = _config(options)
         total = config.sequences * config.taps
-        with tqdm(total=total, desc="poses", unit="pose", disable=not sys.stderr.isatty()) as bar:
-            made = generate(config, options.out, options.jobs, bar.update)
+        made = generate(config, options.out, options.jobs)
     except TrainError as error:
         sys.stderr.write(f"train.generate: {error}\n")
         return 1

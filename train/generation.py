@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
+from edge.progress import tracked
 from train.dataset import Sequences, join
 from train.depth import SAMPLES
 from train.errors import DatasetError, TrainError
@@ -194,7 +195,7 @@ def solve_chunk(config: Generation, chunk: int) -> Sequences:
 
 def solve_all(config: Generation) -> Sequences:
     """All chunks, one after the other: for small sets that need no file."""
-    return join([solve_chunk(config, chunk) for chunk in range(config.chunks)])
+    return join([solve_chunk(config, chunk) for chunk in tracked(range(config.chunks), "solving", "chunk")])
 
 
 @lru_cache(maxsize=1)

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from edge.progress import tracked
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.tpsf import Kernel, Plateau, tpsf
 
@@ -221,7 +222,7 @@ def fit_psf_net(
     optimizer = torch.optim.Adam(groups, rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)
     losses: list[float] = []
-    for _ in range(epochs):
+    for _ in tracked(range(epochs), "PSF network", "epoch"):
         total = 0.0
         for index in torch.randperm(len(scans), generator=order).split(batch):
             loss = net.loss(scans[index], images[index])

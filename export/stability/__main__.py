@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.errors import EdgeError
+from edge.progress import tracked
 from export.errors import ExportError
 from export.stability import pareto
 from export.stability.case import Case
@@ -52,7 +53,7 @@ def run(parts: tuple[str, ...], folder: Path, quick: bool = False) -> list[Case]
     works = {part: _cases(part) for part in parts}  # what lacks is missed before anything is worked out
     report = Report(_name(parts, quick), folder, quick=quick)
     found: dict[str, list[Case]] = {}
-    for part in parts:
+    for part in tracked(parts, "stability", "part"):
         found[part] = list(works[part](quick))
     cases = [case for same in found.values() for case in same]
     broken = [case for case in cases if not case.holds]

@@ -24,7 +24,7 @@ class Case:
         run_ms: run time, in [ms].
         guard: the error that refuses the case.
         note: steps, iterations, or why the bound is what it is.
-        limit: the value tells where something ends, as README.md or docs/log.md says.
+        limit: the value tells where something ends, as the docs say.
         least: that it has to be, of a limit or of how far a refused case has come.
     """
 

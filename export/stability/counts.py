@@ -87,7 +87,7 @@ def _fast_drift(per_minute: float) -> Case:
         after_s,
         1.1 * followed_s,
         limit=True,
-        note="faster than drift is followed (README.md, Zeroing)",
+        note="faster than drift is followed (docs/commission.md, Drift)",
         least=0.9 * unfollowed_s,
     )
 

@@ -1,0 +1,136 @@
+"""A bar with rate and remaining time on what takes longer than two seconds; on a terminal alone, and nowhere else."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, Self, TextIO, TypeVar
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+DELAY_S: Final = 2.0
+_RANK, _FIRST = "RANK", "0"
+"""Of torchrun's processes, which share a terminal, the first shows its bars."""
+_COUNTED: Final = "{desc} {percentage:3.0f}%|{bar}| {rate_fmt} {remaining} left{postfix}"
+_TIMED: Final = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
+SECONDS: Final = "s"
+"""Unit of what lasts for a set time, whose rate says nothing."""
+_Thing = TypeVar("_Thing")
+
+
+class Progress:
+    """How far something is. Whatever ends it, the line is cleared."""
+
+    def __init__(
+        self,
+        what: str,
+        total: float,
+        unit: str,
+        *,
+        done: float = 0,
+        stream: TextIO | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+        delay_s: float = DELAY_S,
+    ) -> None:
+        """Begin; nothing is shown yet.
+
+        Args:
+            what: is done, in a word or two.
+            total: of units, when it is finished.
+            unit: in the singular, such as "pose"; SECONDS for a wait.
+            done: units that were finished before, and took no time now.
+            stream: a terminal, or nothing is shown; stderr by default.
+            clock_s: monotonic, in [s].
+            delay_s: a bar is shown of what is not over by then, in [s].
+        """
+        self._what, self._total, self._unit = what, total, unit
+        self._before = self._done = done
+        self._note = ""
+        self._stream = sys.stderr if stream is None else stream
+        self._clock_s = clock_s
+        self._begun_s = clock_s()
+        self._delay_s = delay_s
+        self._bar: tqdm[Any] | None = None
+        first = os.environ.get(_RANK, _FIRST) == _FIRST
+        self._watched = first and self._stream is not None and not self._stream.closed and self._stream.isatty()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def advance(self, units: float = 1) -> None:
+        """So many more are done."""
+        self.reach(self._done + units)
+
+    def reach(self, done: float) -> None:
+        """So many are done."""
+        more, self._done = done - self._done, done
+        if self._bar is not None:
+            self._bar.update(more)
+        elif self._watched and self._clock_s() - self._begun_s >= self._delay_s:
+            self._show()
+
+    def note(self, text: str, *, at_once: bool = False) -> None:
+        """A few words behind the bar, shown with the next step, or at once where that is far off."""
+        self._note = text
+        if self._bar is not None:
+            self._bar.set_postfix_str(text, refresh=at_once)
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Room for lines of others on the same terminal."""
+        if self._bar is not None:
+            self._bar.clear()
+        yield
+        if self._bar is not None:
+            self._bar.refresh()
+
+    def close(self) -> None:
+        """Clear the line; more than once does no harm."""
+        self._watched = False
+        if self._bar is not None:
+            self._bar.close()
+
+    def _show(self) -> None:
+        from tqdm import tqdm  # here and not above, for most of what is followed is over before
+
+        waited_s = self._clock_s() - self._begun_s
+        bar = tqdm(
+            desc=self._what,
+            total=self._total,
+            initial=self._before,
+            unit=self._unit,
+            unit_scale=True,
+            file=self._stream,
+            leave=False,
+            dynamic_ncols=True,
+            miniters=0,
+            bar_format=_TIMED if self._unit == SECONDS else _COUNTED,
+            delay=1e-9,  # what it would show at once is a bar without a rate
+        )
+        bar.last_print_t -= waited_s  # it began when we did, or its rate would be that of an instant
+        bar.set_postfix_str(self._note, refresh=False)
+        bar.update(self._done - self._before)
+        self._bar = bar
+
+
+def tracked(things: Iterable[_Thing], what: str, unit: str, total: int | None = None) -> Iterator[_Thing]:
+    """The things, one after the other, followed by a bar; each counts when the next is asked for.
+
+    Args:
+        things: what is gone through.
+        what: is done, in a word or two.
+        unit: what one is called.
+        total: how many there are, where they cannot say so.
+    """
+    count = len(things) if total is None and isinstance(things, Sized) else total
+    if count is None:
+        raise TypeError("what is tracked has no length: say its total")
+    with Progress(what, count, unit) as progress:
+        for thing in things:
+            yield thing
+            progress.advance()
