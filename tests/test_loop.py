@@ -96,6 +96,24 @@ def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, monkeypatch, 
     assert torch.equal(weights(whole), weights(resumed))
 
 
+def test_figures_on_the_way_are_kept_over_a_kill(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "_KEEP_EVERY_S", -1.0)
+    recipe, asked = replace(RECIPE, steps=10), iter(range(100))
+
+    def until_killed(number):
+        if number == 7:
+            raise InterruptedError
+        return batches(number)
+
+    def judged(net):
+        return {"asked": float(next(asked))}
+
+    with pytest.raises(InterruptedError):
+        train(new_net(), RelativeError(), until_killed, recipe, tmp_path / "net.resume", validate=judged)
+    done = train(new_net(), RelativeError(), batches, recipe, tmp_path / "net.resume", validate=judged)
+    assert done.course == [{"step": step, "asked": order} for order, step in enumerate((2, 4, 6, 8, 10))]
+
+
 @pytest.mark.parametrize(("steps", "identity"), [(13, "these data"), (12, "others")])
 def test_a_run_with_another_recipe_or_on_other_data_is_not_gone_on_with(tmp_path, monkeypatch, steps, identity):
     monkeypatch.setattr(loop, "_KEEP_EVERY_S", -1.0)

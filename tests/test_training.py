@@ -46,6 +46,9 @@ def test_a_run_is_repeatable_and_its_configuration_lies_beside_the_weights(folde
     kept = json.loads((folder / "small.json").read_text())
     assert kept["training_sha256"] == report["training_sha256"] == TRAINING.sha256(data.sha256())
     assert kept["config"]["recipe"]["steps"] == 150 and kept["config"]["draw"]["nuisances"]["noise_counts"] == 2.0
+    assert [point["step"] for point in kept["course"]] == [30, 60, 90, 120, 150]
+    assert kept["course"][-1]["validation PSNR dB"] == pytest.approx(kept["validation_psnr_db"])
+    assert kept["device"]
     assert not (folder / "small.resume").exists()
 
 

@@ -18,7 +18,7 @@ from train.batches import Draw, WindowBatches, network_input
 from train.calibration import calibrate, interval_coverage
 from train.dataset import Sequences
 from train.errors import CheckpointError
-from train.loop import Objective, Recipe, device_of_rank, rank_and_world, train, wait_for_all
+from train.loop import Objective, Recipe, device_name, device_of_rank, rank_and_world, train, wait_for_all
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.registry import build, grown
@@ -87,12 +87,13 @@ def fit_network(training: Training, data: Sequences, validation: FrozenSet, fold
     torch.manual_seed(training.seed)
     net = _first_weights(training, folder)
     rank, world = rank_and_world()
+    device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
     batches = WindowBatches(data.at_scale(training.scale), training.draw, recipe.given, recipe.batch, seed)
     done = train(
         net,
-        _objective(net, device_of_rank(rank), seed),
+        _objective(net, device, seed),
         batches,
         recipe,
         (resume_path := folder / f"{training.name}.resume"),
@@ -112,6 +113,8 @@ def fit_network(training: Training, data: Sequences, validation: FrozenSet, fold
         **made_of,
         "steps": done.steps,
         "elapsed_s": round(done.elapsed_s, 1),
+        "course": done.course,
+        "device": device_name(device),
         "processes": world,
         "threads": torch.get_num_threads(),
         **_judged(net, validation),
