@@ -1,14 +1,22 @@
 """Every experiment runs, in miniature, and leaves a page, a table and a plot."""
 
 import csv
+import json
+import re
+from dataclasses import replace
 
 import pytest
+from edge_samples import ROOT
 
+from train.errors import CheckpointError
+from train.experiments import workbench
 from train.experiments.__main__ import EXPERIMENTS, main
+from train.experiments.trainings import OUT
 from train.experiments.workbench import Workbench
 
 COLUMNS = {
     "table3": {"method", "validation PSNR dB", "test PSNR dB", "test SSIM", "parameters", "MMAC", "run time ms"},
+    "trained_out": {"network", "epochs", "test PSNR dB", "MMAC", "run time ms", "its own min", "trained on"},
     "table4": {"scale", "test PSNR dB", "paper's test PSNR dB", "MMAC", "run time ms"},
     "angle": {"network", "angle deg", "test PSNR dB", "over STSR dB", "run time ms"},
     "taps": {"network", "taps given", "test PSNR dB", "over STSR dB", "run time ms"},
@@ -19,15 +27,24 @@ COLUMNS = {
 }
 
 
+@pytest.fixture(autouse=True)
+def timed_once(monkeypatch):
+    """What a network of the paper's size costs takes seconds to measure, and is asserted nowhere."""
+    monkeypatch.setattr(workbench, "_TIMED_MS", 0.001)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("experiments")
 
 
-def run(folder, name):
-    places = [f"--{place}={folder / place}" for place in ("reports", "data", "checkpoints")]
-    main([name, "--quick", *places])
-    return folder / "reports" / name
+def run(folder, name, *options, again=False):
+    """The report's files without their endings; made once, unless asked for again."""
+    report = folder / "reports" / name
+    if again or not report.with_suffix(".md").exists():
+        places = (f"--{place}={folder / place}" for place in ("reports", "data", "checkpoints"))
+        main([name, "--quick", *options, *places])
+    return report
 
 
 @pytest.mark.parametrize("name", COLUMNS)
@@ -51,8 +68,32 @@ def test_table3_has_every_method_and_the_papers_figures(folder):
     assert float(rows["stsr"]["MMAC"]) == pytest.approx(7321, abs=1)
 
 
+def test_networks_brought_from_elsewhere_are_judged_as_they_are(folder, tmp_path):
+    """Whatever data they were trained on, and without any here; what is not there is named."""
+    run(folder, "trained_out")
+    (tmp_path / "checkpoints").mkdir()
+    names = ("quick-out-compact-stsr-40", "quick-out-compact-mtsr2-40+20")
+    for name in names:
+        weights, report = ((folder / "checkpoints" / f"{name}{suffix}").read_bytes() for suffix in (".pt", ".json"))
+        (tmp_path / "checkpoints" / f"{name}.pt").write_bytes(weights)
+        told = json.loads(report) | {"training_sha256": "of other data", "device": "a faster one"}
+        (tmp_path / "checkpoints" / f"{name}.json").write_text(json.dumps(told))
+    page = run(tmp_path, "trained_out", "--found").with_suffix(".md").read_text()
+    with (tmp_path / "reports" / "trained_out.csv").open() as file:
+        rows = {row["network"]: row for row in csv.DictReader(file)}
+    assert list(rows) == ["compact stsr 40", "compact mtsr2 40+20"]
+    assert rows["compact mtsr2 40+20"]["epochs"] == "60.0"
+    assert rows["compact mtsr2 40+20"]["trained on"] == "a faster one"
+    assert "Not there, so not judged: stsr 10, stsr 40," in page
+    assert "compact mtsr2 40+20 over compact mtsr2 40+20, one tap given" in page
+    assert not list((tmp_path / "data").glob("quick-seen*"))
+    stale = replace(OUT[0], name=names[0].removeprefix("quick-"))
+    with pytest.raises(CheckpointError, match="another recipe"):
+        Workbench(tmp_path / "data", tmp_path / "checkpoints", quick=True).brought(stale)
+
+
 def test_networks_and_data_are_made_once(folder, capsys):
-    run(folder, "taps")
+    run(folder, "taps", again=True)
     assert "steps in" not in capsys.readouterr().out
 
 
@@ -61,6 +102,15 @@ def test_every_experiment_is_a_file_that_can_be_run():
 
     for name in EXPERIMENTS:
         assert callable(importlib.import_module(f"train.experiments.{name.replace('-', '_')}").run), name
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_its_own_steps_are_followed_by_a_bar(name):
+    """For one of a single page never moves; that of its training is another."""
+    source = {"real": "train/experiments/hidden_taxel.py", "fig5": "train/psf_net.py"}.get(
+        name, f"train/experiments/{name.replace('-', '_')}.py"
+    )
+    assert re.search(r"\bfor .* in .*tracked\(", (ROOT / source).read_text())
 
 
 def test_a_quick_bench_keeps_apart_from_a_real_one(folder):

@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from edge.progress import tracked
 from train.errors import TrainError
 from train.experiments.workbench import Workbench
 
 EXPERIMENTS: Final = {
     "table3": "all methods at x10 on the same targets",
+    "trained_out": "the paper's networks and compact ones, trained alike for many epochs",
     "table4": "STSR at five scales",
     "angle": "MTSR-2 by angle between its taps",
     "taps": "one to seven taps",
@@ -49,10 +51,15 @@ def main(arguments: list[str] | None = None) -> None:
         "--checkpoints", type=Path, default=Path("checkpoints"), help="networks, trained where they lack"
     )
     parser.add_argument("--quick", action="store_true", help="everything tiny, to see that it runs")
+    parser.add_argument(
+        "--found",
+        action="store_true",
+        help="trained_out: judge the networks that are there, trained on any machine, and leave out the others",
+    )
     options = parser.parse_args(arguments)
-    bench = Workbench(options.data, options.checkpoints, options.quick)
+    bench = Workbench(options.data, options.checkpoints, options.quick, options.found)
     try:
-        for name in options.names:
+        for name in tracked(options.names, "experiments", "page"):
             page = importlib.import_module(f"train.experiments.{name.replace('-', '_')}").run(bench, options.reports)
             sys.stdout.write(f"{page}\n")
     except TrainError as error:

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 
 from edge.judge import judge
+from edge.progress import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import at_angle, by_angle, compact, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
@@ -22,7 +23,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     alone = judge(infer(stsr, test.windows(1))[0], test, stsr_told["contact_level"])
     rows: list[Row] = [{"network": "STSR", "angle deg": None} | error_cells(alone, test, "test") | cost_cells(stsr)]
     gains = []
-    for angle_deg in ANGLES_DEG:
+    for angle_deg in tracked(ANGLES_DEG, "angles", "angle"):
         sets = {split: bench.frozen(split, angle_step_deg=angle_deg) for split in ("validation", "test")}
         net, told = bench.network(at_angle(angle_deg), by_angle(bench, angle_deg), sets["validation"])
         figures = judge(infer(net, sets["test"].windows(2))[0], sets["test"], told["contact_level"])

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db
+from edge.progress import tracked
 from firmware_bridge.geometry import AXES
 from train.experiments.report import Report, Row, with_interval
 from train.experiments.trainings import compact, mixed, trained
@@ -138,7 +139,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         taps = nudged(surfaces, given[-1], angle_deg)
         for label, nuisances in (("all", plain), ("no gain spread", plain.without("gain_spread"))):
             name = f"bound at {angle_deg:g} deg, nuisances: {label}"
-            for count in given:
+            for count in tracked(given, name, "number of taps"):
                 psnr = 10 * np.log10(MAX_INDENTATION_MM**2 / least_mse(taps, count, nuisances))
                 rows.append(
                     {"what": name, "taps": count, "PSNR dB": with_interval(psnr, np.arange(len(psnr))), "MMAC": None}

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db
+from edge.progress import tracked
 from firmware_bridge.geometry import USPA44
 from train.calibration import LEVEL
 from train.experiments.band_limit import WAVELENGTHS_MM, edge_distance_mm, gratings, kept_back, let_through
@@ -43,7 +44,11 @@ def run(bench: Workbench, folder: Path) -> Path:
     data, validation = mixed(bench), bench.frozen("validation")
     nets = {name: trained(bench, compact(name), data, validation) for name in NAMES}
     sets = {_TEST: bench.frozen("test"), _GLYPHS: bench.frozen("test", random_figures(TEST_FIGURES, 0, TEST_SEED))}
-    found = {(name, tested): intervals(nets[name][0], frozen) for name in NAMES for tested, frozen in sets.items()}
+    found = {
+        (name, tested): intervals(nets[name][0], frozen)
+        for name in tracked(NAMES, "judging", "network")
+        for tested, frozen in sets.items()
+    }
     striped = gratings(bench)
     by_wave = {name: grating_rows(intervals(nets[name][0], striped)) for name in NAMES}
     distance_mm = {tested: edge_distance_mm(frozen.touched, frozen.scale) for tested, frozen in sets.items()}

@@ -16,6 +16,7 @@ from edge.bundle import bundled_models
 from edge.confidence import WORTH_A_TAP, expect_of
 from edge.contract import Contract
 from edge.frozen import FrozenSet
+from edge.progress import tracked
 from edge.runtime import Model
 from edge.session import ModelSession
 from train.confidence import doubts_and_errors
@@ -48,7 +49,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     sets = _sets(bench)
     found = {
         (model.name, name, given): judged(model, given, frozen)
-        for model in models
+        for model in tracked(models, "judging", "model")
         for name, frozen in sets.items()
         for given in range(1, model.contract.taps + 1)
     }

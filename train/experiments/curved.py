@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db, rmse_percent
+from edge.progress import tracked
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
 from train.depth import depth_image
@@ -66,7 +67,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     )
     rows: list[Row] = []
     with report.figure(size=(11, 4.5)) as figure:
-        for axes, surface in zip(figure.subplots(1, len(SURFACES)), SURFACES, strict=True):
+        for axes, surface in zip(figure.subplots(1, len(SURFACES)), tracked(SURFACES, "FEM", "surface"), strict=True):
             truth, *coarser = [press_or_recall(surface, mesh, indentation_mm, bench.data_folder) for mesh in meshes]
             press = _press(surface, indentation_mm.astype(np.float32))
             found = _patterns(press)

@@ -23,6 +23,7 @@ from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import FrozenSet, load_frozen_set
 from edge.judge import judge
 from edge.metrics import interval_coverage
+from edge.progress import tracked
 from edge.runtime import Runtime
 from edge.session import ModelSession
 from edge.taxels import STUCK_SCANS, TaxelWatch
@@ -88,7 +89,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     rows: list[Row] = []
     for name in MODELS:
         model = ModelSession(find_model(name))
-        for dead in (0, 1, MOST_DEAD) if bench.quick else range(MOST_DEAD + 1):
+        counts = (0, 1, MOST_DEAD) if bench.quick else range(MOST_DEAD + 1)
+        for dead in tracked(counts, name, "count"):
             for fault in FAULTS if dead in (1, 4, 8) else ("stuck at random",):
                 rows.append(_row(model, frozen, play(model, frozen, estimator, dead, fault), dead, fault, "found"))
             for fault in ("stuck at rest", "stuck at random") if dead else ():

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db, rmse_percent
+from edge.progress import tracked
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
 from train.depth import depth_image
@@ -76,7 +77,11 @@ def run(bench: Workbench, folder: Path) -> Path:
     steps = 2 if bench.quick else STEPS
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
     verdicts = {
-        mesh: [press_or_recall(name, mesh, indentation_mm, bench.data_folder) for name in surfaces] for mesh in meshes
+        mesh: [
+            press_or_recall(name, mesh, indentation_mm, bench.data_folder)
+            for name in tracked(surfaces, f"FEM {mesh}", "surface")
+        ]
+        for mesh in meshes
     }
     finest = verdicts[meshes[0]]
     truth = np.stack([verdict.patterns_mm for verdict in finest])

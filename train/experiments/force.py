@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.metrics import contact_iou, psnr_db, ssim
+from edge.progress import tracked
 from train.dataset import Sequences, windows
 from train.experiments.methods import Method, classical_methods, compact_methods
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
@@ -66,7 +67,9 @@ def run(bench: Workbench, folder: Path) -> Path:
         for number, bounds in enumerate(pairwise(EDGES_N))
         if (scans := scans_between(sequences, bounds, draws, [SEED, number]))
     ]
-    figures = {method.name: [errors(method, scans) for scans in bins] for method in methods}
+    figures = {
+        method.name: [errors(method, scans) for scans in bins] for method in tracked(methods, "forces", "method")
+    }
     report = Report("force", folder, quick=bench.quick)
     report.say(
         f"The {len(sequences)} test taps, newest scan somewhere on its press, earlier taps at their ends of "

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.classical import fit_gain
+from edge.progress import tracked
 from edge.taps import ON_COUNTS
 from train.dataset import Sequences, windows
 from train.experiments.course import (
@@ -83,7 +84,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     shown: dict[str, tuple[Scans, list[NDArray[np.floating]]]] = {}
     for condition, nuisances in CONDITIONS.items():
         figures: dict[str, list[dict[str, float]]] = {gauge.name: [] for gauge in gauges}
-        for number in range(len(sequences)):
+        for number in tracked(range(len(sequences)), condition, "press"):
             scans = pressed(sequences, number, course, nuisances)
             gate = contact(scans, course)
             found_n = [gauge.force_n(scans) for gauge in gauges]

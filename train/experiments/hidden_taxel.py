@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edge.classical import fit_gain, fit_linear_map
 from edge.frozen import FrozenSet
+from edge.progress import tracked
 from firmware_bridge.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import AXES, USPA44
@@ -162,7 +163,7 @@ def hidden_taxels(
         simulated: (m, 3, rows, cols) zeroed counts of simulated taps.
     """
     told: Told = {name: [] for name in nets}
-    for name, net in nets.items():
+    for name, net in tracked(nets.items(), "hidden taxels", "network"):
         for scans in sets:
             said = np.empty_like(scans.z)
             for taxel in range(_TAXELS):

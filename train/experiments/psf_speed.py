@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from edge.progress import tracked
 from firmware_bridge.geometry import USPA44
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
@@ -114,7 +115,7 @@ def _contacts(count: int) -> tuple[Tensor, Tensor]:
 def _best_of(rounds: int, timed: dict[str, Callable[[], object]]) -> dict[str, float]:
     """Shortest time of each, in [s]; in turns, so that a busy machine meets all of them."""
     best = dict.fromkeys(timed, float("inf"))
-    for _ in range(rounds):
+    for _ in tracked(range(rounds), "routes", "round"):
         for name, work in timed.items():
             start = time.perf_counter()
             work()

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from edge.progress import tracked
 from train.experiments.methods import Method, classical_methods, compact_methods
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.sweeps import Sweep, all_sweeps, plain_set
@@ -38,7 +39,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     rows: list[Row] = []
     curves: Curves = {}
     gains: dict[str, NDArray[np.float64]] = {}
-    for sweep in sweeps:
+    for sweep in tracked(sweeps, "nuisances", "sweep"):
         curve = curves[sweep.name] = {method.name: [] for method in methods}
         for severity in sweep.severities:
             frozen = sweep.frozen(severity)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.judge import judge
+from edge.progress import tracked
 from train.dataset import Sequences
 from train.experiments.methods import classical_methods
 from train.experiments.report import Report, Row, bootstrap_interval
@@ -43,7 +44,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Train what lacks, judge everything, write table and plot."""
     data = mixed(bench)
     sets = {split: bench.frozen(split) for split in ("validation", "test")}
-    judged = sets if bench.quick else {split: thinned(frozen, ONE_IN) for split, frozen in sets.items()}
+    judged = {split: thinned(frozen, ONE_IN) for split, frozen in sets.items()}
     rows, test_psnr = [], {}
     for row, figures in (*_classical(bench, data, judged), *_networks(bench, data, sets["validation"], judged)):
         rows.append(row)
@@ -82,7 +83,7 @@ def _networks(bench: Workbench, data: Sequences, validation: FrozenSet, judged: 
     seed_networks = [seed_size(name) for name in (SEED_NETWORKS[1:4] if bench.quick else SEED_NETWORKS)]
     networks = [(training.network, training, judged["validation"]) for training in (*seed_networks, SEED_STSR_LONGER)]
     networks += [(name, compact(name), validation) for name in COMPACT_NETWORKS]
-    for network, training, calibrated_on in networks:
+    for network, training, calibrated_on in tracked(networks, "networks", "network"):
         net, told = trained(bench, training, data, calibrated_on)
         name = training.name.removeprefix("seed-") if training.network == network else f"compact {network}"
         patterns = {split: infer(net, frozen.windows(net.taps))[0] for split, frozen in judged.items()}

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.judge import judge
+from edge.progress import tracked
 from train.experiments.report import Report, Row
 from train.experiments.trainings import at_scale, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
@@ -18,7 +19,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     data = mixed(bench)
     rows: list[Row] = []
     means = []
-    for scale, (paper_db, paper_ssim) in PAPER.items():
+    for scale, (paper_db, paper_ssim) in tracked(PAPER.items(), "scales", "scale"):
         validation, test = (bench.frozen(split, scale=scale) for split in ("validation", "test"))
         if scale != 10:  # the base is judged at its own scale
             trained(bench, at_scale(10), data, bench.frozen("validation"))

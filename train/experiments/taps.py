@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.judge import judge
+from edge.progress import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import alike, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
@@ -28,7 +29,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         gains["a network for each"].append(gain)
         rows.append(row | _cell(gain) | cost_cells(net) | bench.training_cells(told))
     net, told = networks[-1]
-    for given in range(1, MAX_TAPS + 1):
+    for given in tracked(range(1, MAX_TAPS + 1), "taps", "run"):
         found = judge(infer(net, test.windows(MAX_TAPS, given))[0], test, told["contact_level"])
         row = {"network": names[-1], "taps given": given} | error_cells(found, test, "test")
         gain = _gain(found, figures[0], test.tap)

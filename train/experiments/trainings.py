@@ -17,6 +17,8 @@ SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
 """The 18 surfaces."""
 FIGURES: Final = Generation(surfaces=random_figures(4500, 4500, seed=2), taps=MAX_TAPS, seed=2)
 """Random figures, each once."""
+SEQUENCES: Final = SEEN.count + FIGURES.count
+"""Of both together: a pass over the mixed data."""
 
 _SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
 """The STSR as long as the compact one from nothing; srgan on top of srcnn."""
@@ -101,6 +103,62 @@ SEED_STSR_LONGER: Final = replace(
 )
 """The STSR trained on for as long as MTSR-2 is from it: what is between the two is the second tap alone."""
 
+OUT_EPOCHS: Final = 40
+"""Passes over the mixed data of an STSR trained out from nothing."""
+OUT_EPOCHS_MORE: Final = 20
+"""Of each network that goes on from it."""
+_OUT_BATCH: Final = 64
+_OUT_RATES: Final = {"paper": (1e-3, 5e-4), "compact": (2e-3, 5e-4)}
+"""Highest learning rate from nothing, and of what goes on. Of the paper's, 5e-4, 1e-3 and 2e-3 were tried."""
+
+
+def from_nothing(network: str, epochs: int) -> Training:
+    """A network of either kind, by the epoch."""
+    return Training(f"out-{network}-{epochs}", network, _out_recipe(network, epochs, goes_on=False))
+
+
+def gone_on(network: str, start: Training, epochs: int) -> Training:
+    """A network of the start's kind, trained on from it."""
+    name = f"out-{network}-{start.name.rpartition('-')[2]}+{epochs}"
+    return Training(name, network, _out_recipe(network, epochs, goes_on=True), start=start.name)
+
+
+def epochs(training: Training) -> float:
+    """Passes over the mixed data, those included that its start has made."""
+    own = training.recipe.steps * training.recipe.batch / SEQUENCES
+    return own + (epochs(_STARTS[training.start]) if training.start else 0.0)
+
+
+def _out_recipe(network: str, epochs: int, *, goes_on: bool) -> Recipe:
+    kind, _, name = network.rpartition("-")
+    return Recipe(
+        steps=epochs * SEQUENCES // _OUT_BATCH,
+        batch=_OUT_BATCH,
+        learning_rate=_OUT_RATES[kind or "paper"][goes_on],
+        weight_decay=0.0 if kind else _SEED_DECAY,
+        given=given_taps(int(name.removeprefix("mtsr")) if name.startswith("mtsr") else 1),
+        bf16=True,
+    )
+
+
+_OUT_STARTS: Final = tuple(from_nothing(network, OUT_EPOCHS) for network in ("stsr", "compact-stsr"))
+OUT: Final = (
+    *(
+        training
+        for start in _OUT_STARTS
+        for training in (
+            from_nothing(start.network, OUT_EPOCHS // 4),
+            start,
+            *(
+                gone_on(start.network.replace("stsr", name), start, OUT_EPOCHS_MORE)
+                for name in ("stsr", "mtsr2", "mtsr4")
+            ),
+        )
+    ),
+    from_nothing("compact-stsr", 4 * OUT_EPOCHS),
+)
+"""The paper's networks and compact ones, trained alike; the compact STSR until it gains little more."""
+
 
 def trained(
     bench: Workbench, training: Training, data: Sequences, validation: FrozenSet
@@ -111,4 +169,6 @@ def trained(
     return bench.network(training, data, validation)
 
 
-_STARTS: Final = {start.name: start for start in (BASE, compact("stsr"), seed_size("stsr"), seed_size("srcnn"))}
+_STARTS: Final = {
+    start.name: start for start in (BASE, compact("stsr"), seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)
+}

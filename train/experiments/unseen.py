@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.judge import judge
+from edge.progress import tracked
 from train.dataset import Sequences, join
 from train.experiments.intervals import intervals
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
@@ -80,7 +81,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     nets = _networks(bench)
     rows: list[Row] = []
     scores: _Scores = {}
-    for trained, (net, made) in nets.items():
+    for trained, (net, made) in tracked(nets.items(), "judging", "network"):
         cost = cost_cells(net) | bench.training_cells(made)
         for tested, frozen in tests.items():
             for given in GIVEN:

@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edge.frozen import FrozenSet
 from firmware_bridge.geometry import USPA44
 from train.dataset import Sequences
+from train.errors import CheckpointError
 from train.experiments.report import Row, with_interval
 from train.freeze import SEED, freeze
 from train.generate import generate
@@ -43,11 +44,13 @@ class Workbench:
         data_folder: datasets, by name.
         checkpoints: trained networks, by name.
         quick: everything tiny, to see that it runs.
+        found: networks brought from another machine are judged as they are, and those that are not there left out.
     """
 
     data_folder: Path = Path("data")
     checkpoints: Path = Path("checkpoints")
     quick: bool = False
+    found: bool = False
 
     def data(self, name: str, config: Generation) -> Sequences:
         """A dataset: read if it is there, else made."""
@@ -65,6 +68,18 @@ class Workbench:
         net, report = load_network(path)
         if path.stat().st_mtime_ns != before:
             sys.stdout.write(f"{training.name}: {report['steps']} steps in {report['elapsed_s']:.0f} s\n")
+        return net, report
+
+    def brought(self, training: Training) -> tuple[PatternNet, dict[str, Any]] | None:
+        """A network trained alike on any machine, where data differ in the last bits and so in their hash; or None."""
+        if self.quick:
+            training = _quick(training)
+        path = self.checkpoints / f"{training.name}.pt"
+        if not path.exists():
+            return None
+        net, report = load_network(path)
+        if report["config"] != json.loads(json.dumps(asdict(training))):
+            raise CheckpointError(f"{path} was trained by another recipe than '{training.name}' has now: delete it")
         return net, report
 
     def training_cells(self, report: Mapping[str, Any]) -> Row:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from edge.bundle import BUNDLE_DIR, find_model
 from edge.frozen import load_frozen_set
+from edge.progress import tracked
 from edge.runtime import Runtime
 from edge.session import ModelSession
 from edge.taps import OFF_COUNTS, ON_COUNTS
@@ -150,7 +151,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     rows: list[Row] = []
     traces: dict[str, dict[str, list[float]]] = {}
     found = recording_paths(recordings_folder())
-    for scene in [*scenes(), *(recorded_scenes(found) if found else [])]:
+    played = [*scenes(), *(recorded_scenes(found) if found else [])]
+    for scene in tracked(played, "scenes", "scene"):
         seconds = scene.seconds / (_QUICK if bench.quick else 1)
         tallies = play(scene, seconds, model)
         rows += [tally.row(scene.name, method) for method, tally in tallies.items()]
