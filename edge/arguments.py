@@ -9,6 +9,7 @@ from typing import Any, Final, NoReturn
 from firmware_bridge.xela import ID_MAPS, USPA44_MAP
 
 EXIT_USAGE: Final = 2
+MOST_PORT: Final = 65535
 
 
 class Parser(argparse.ArgumentParser):
@@ -73,3 +74,12 @@ def whole(least: int) -> Callable[[str], int]:
         return int(text)
 
     return whole_number
+
+
+def port(text: str) -> int:
+    """A port of this machine; 0 stands for any free one."""
+    if not (text.isascii() and text.isdigit()) or int(text) > MOST_PORT:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no port: expected 0 to {MOST_PORT}, or none; write FILE or command before it"
+        )
+    return int(text)

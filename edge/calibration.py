@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.progress import Progress
 from edge.runtime import Model
 from firmware_bridge.schedule import Clock, Ticker
 
@@ -63,17 +64,19 @@ def calibrate(
     """
     rng = np.random.default_rng(SEED)
     took_us = np.zeros((len(models), ROUNDS, ROUND_TICKS))
-    for round_ in range(ROUNDS):
-        for index, model in enumerate(models):
-            contract = model.contract
-            shape = (WINDOWS, contract.taps, 3, contract.rows, contract.cols)
-            windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
-            ticker = ticker_of(max(rate_hz, LEAST_RATE_HZ))
-            for tick in range(ROUND_TICKS):
-                if stop.is_set():
-                    return None
-                ticker.wait()
-                start_ns = clock_ns()
-                model.run(contract.scale_window(windows[tick % WINDOWS]))
-                took_us[index, round_, tick] = (clock_ns() - start_ns) / 1e3
+    with Progress("run times", len(models) * ROUNDS * ROUND_TICKS, "run") as bar:
+        for round_ in range(ROUNDS):
+            for index, model in enumerate(models):
+                contract = model.contract
+                shape = (WINDOWS, contract.taps, 3, contract.rows, contract.cols)
+                windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
+                ticker = ticker_of(max(rate_hz, LEAST_RATE_HZ))
+                for tick in range(ROUND_TICKS):
+                    if stop.is_set():
+                        return None
+                    ticker.wait()
+                    start_ns = clock_ns()
+                    model.run(contract.scale_window(windows[tick % WINDOWS]))
+                    took_us[index, round_, tick] = (clock_ns() - start_ns) / 1e3
+                bar.advance(ROUND_TICKS)  # not while it measures
     return [RunTime.of(took) for took in took_us.reshape(len(models), -1)]

@@ -8,13 +8,33 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
+from edge.api import (
+    DEMO_LOOP,
+    BaselineRefusedError,
+    BridgeError,
+    DeviceError,
+    EdgeError,
+    ModelError,
+    SinkError,
+    Source,
+    Statistics,
+    UsageError,
+    bundled_models,
+    load_model,
+    open_source,
+    save_baselines,
+    take_baselines,
+)
 from edge.arguments import EXIT_USAGE
-from edge.bundle import bundled_models, demo_recording
-from edge.commissioned import use_sensor_file
-from edge.errors import EdgeError, ModelError, SinkError, UsageError
-from edge.options import baseline_parser, devices_parser, models_parser, run_parser
-from firmware_bridge.errors import BaselineRefusedError, BridgeError, DeviceError
-from firmware_bridge.links.base import Link
+from edge.options import (
+    baseline_parser,
+    devices_parser,
+    models_parser,
+    record_parser,
+    replay_parser,
+    run_parser,
+    understood,
+)
 
 STDOUT: Final = 1
 EXIT_DEVICE: Final = 3
@@ -50,29 +70,67 @@ def _exit_code(error: BridgeError | EdgeError) -> int:
     return EXIT_USAGE
 
 
+def _demo(arguments: Sequence[str]) -> int:
+    options = understood(run_parser(), arguments)
+    if options.source:
+        raise UsageError(f"the demo is a source itself: leave out --source {options.source[0]}")
+    # Whoever looks at a page may look for long; a program that reads our output waits for its end.
+    options.source = [DEMO_LOOP if options.view is not None and sys.stdout.isatty() else "demo"]
+    _follow(options)
+    return 0
+
+
 def _run(arguments: Sequence[str]) -> int:
-    options = run_parser().parse_args(arguments)
-    use_sensor_file(options)
+    _follow(understood(run_parser(), arguments))
+    return 0
+
+
+def _follow(options: argparse.Namespace, statistics: Statistics | None = None) -> None:
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate measures for --budget-us, which is not there: add it, or leave both")
-    # Here and not above, so that --help does not wait for onnxruntime.
+    source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
     from edge.run import run
 
-    run(options, _open_sources(options, math.inf if options.give_up_s is None else options.give_up_s))
+    run(options, source, statistics)
+
+
+def _record(arguments: Sequence[str]) -> int:
+    options = understood(record_parser(), arguments)
+    from edge.recordings import new_recording
+
+    with new_recording(options) as statistics:
+        _follow(options, statistics)
+    return 0
+
+
+def _replay(arguments: Sequence[str]) -> int:
+    options = understood(replay_parser(), arguments)
+    from edge.recordings import open_recording
+    from edge.run import run
+
+    paced = options.paced or options.view is not None  # else it is over before a browser has come
+    source = open_recording(
+        options.file,
+        sensor=options.sensor,
+        zero=options.zero,
+        paced=paced,
+        rate_hz=options.rate_hz,
+        bar=not paced and "status" not in options.sink,
+    )
+
+    run(options, source)
     return 0
 
 
 def _models(arguments: Sequence[str]) -> int:
     models_parser().parse_args(arguments)
-    from edge.session import ModelSession
-
     models = bundled_models()
     if not models:
         raise ModelError("no models are bundled with this installation")
     widest = max(len(path.stem) for path in models)
     print(f"{'model':{widest}s} taps scale    size arithmetic  error on the frozen test set, all taps given")
     for path in models:
-        contract = ModelSession(path).contract
+        contract = load_model(path).contract
         error = contract.test_error.get(str(contract.taps), {})
         figures = ", ".join(f"{name} {value:.3g}" for name, value in error.items())
         size_mb = path.stat().st_size / 1e6
@@ -85,17 +143,13 @@ def _models(arguments: Sequence[str]) -> int:
 
 def _baseline(arguments: Sequence[str]) -> int:
     options = baseline_parser().parse_args(arguments)
-    use_sensor_file(options)
     from edge.signals import stop_on_signals
-    from edge.zeroing import take_baselines
-    from firmware_bridge.baseline import save_baselines
 
-    with stop_on_signals() as stop, _open_sources(options, give_up_s=None) as link:
-        kind = link.kind
-        baselines = take_baselines(link, scans=options.scans, skip=options.skip, stop=stop)
-    save_baselines(options.out, baselines.values(), options.orders)
+    with stop_on_signals() as stop, _open_source(options, give_up_s=0) as source:
+        baselines = take_baselines(source, scans=options.scans, skip=options.skip, stop=stop)
+    save_baselines(options.out, baselines.values(), source.sensor_file.orders)
     for name, baseline in sorted(baselines.items()):
-        emulated = "" if kind == "device" else f" ({kind.upper()})"
+        emulated = "" if source.kind == "device" else f" ({source.kind.upper()})"
         print(f"sensor {name}: baseline {baseline.id} of {baseline.scans} scans{emulated} -> {options.out}")
     return 0
 
@@ -137,24 +191,26 @@ def _doctor(arguments: Sequence[str]) -> int:
     from edge.doctor.options import doctor_parser
 
     options = doctor_parser().parse_args(arguments)
-    if len(options.source) > 1:
-        raise UsageError(f"{len(options.source)} sources, expected one: examine them one after the other")
-    use_sensor_file(options)
     from edge.doctor.command import run
 
-    return run(options, lambda asked: _open_sources(asked, give_up_s=None), sys.stdout, sys.stderr)
+    return run(options, sys.stdout, sys.stderr)
 
 
-COMMANDS: Final = {"models": _models, "baseline": _baseline, "bench": _bench, "devices": _devices, "doctor": _doctor}
+COMMANDS: Final = {
+    "demo": _demo,
+    "record": _record,
+    "replay": _replay,
+    "models": _models,
+    "baseline": _baseline,
+    "bench": _bench,
+    "devices": _devices,
+    "doctor": _doctor,
+}
 
 
-def _open_sources(options: argparse.Namespace, give_up_s: float | None) -> Link:
-    from firmware_bridge.links.source import open_sources
-
-    demo = any(text.rpartition("=")[2] == "demo" for text in options.source)
-    recording = demo_recording() if demo else None
-    return open_sources(
-        options.source, options.rate_hz, recording, options.model_map, give_up_s, mountings=options.mountings
+def _open_source(options: argparse.Namespace, give_up_s: float) -> Source:
+    return open_source(
+        *options.source, sensor=options.sensor, id_map=options.id_map, rate_hz=options.rate_hz, give_up_s=give_up_s
     )
 
 

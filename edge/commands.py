@@ -7,10 +7,12 @@ import json
 import os
 import select
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
+
+from firmware_bridge.scan import is_sensor_name
 
 READ_BYTES: Final = 4096
 LONGEST_LINE_BYTES: Final = 4096
@@ -21,14 +23,16 @@ class Command:
     """What a user asks for between two scans.
 
     Attributes:
-        name: "reset" forgets earlier taps, "zero" zeroes again.
+        name: "reset" forgets earlier taps, "zero" zeroes again, "record" begins or ends a recording.
         sensor: which one to zero; None for all.
         force: zero it even if it is in contact.
+        on: begin a recording, or else end it.
     """
 
-    name: Literal["reset", "zero"]
+    name: Literal["reset", "zero", "record"]
     sensor: str | None = None
     force: bool = False
+    on: bool = False
 
 
 RESET: Final = Command("reset")
@@ -65,7 +69,7 @@ def obey(commands: Commands, runtime: Obedient) -> None:
     for command in commands.poll():
         if command.name == "reset":
             runtime.reset()
-        else:
+        elif command.name == "zero":
             runtime.zero(command.sensor, force=command.force)
 
 
@@ -102,19 +106,21 @@ class LineCommands:
             parsed = json.loads(line) if len(line) <= LONGEST_LINE_BYTES else None
         except (ValueError, RecursionError):
             parsed = None
-        command = _command(parsed) if isinstance(parsed, dict) else None
+        command = runtime_command(parsed) if isinstance(parsed, dict) else None
         self.refused += command is None
         return command
 
 
-def _command(parsed: dict[str, Any]) -> Command | None:
+def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
+    """The command to the runtime that parsed JSON is; None if it is none."""
     if parsed.get("cmd") == "reset":
         return RESET
     sensor, force = parsed.get("sensor"), parsed.get("force", False)
     # A misspelt key must not turn "zero sensor 4" into "zero all": unlike a reset, a zeroing cannot be undone.
     if parsed.get("cmd") != "zero" or parsed.keys() - {"cmd", "sensor", "force"}:
         return None
-    if not (sensor is None or isinstance(sensor, str)) or not isinstance(force, bool):
+    # A name that no sensor can have is not looked for, and not told of, either: who wrote it may be a stranger.
+    if not (sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))) or not isinstance(force, bool):
         return None
     return Command("zero", sensor, force)
 

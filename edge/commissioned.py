@@ -1,43 +1,86 @@
-"""What a sensor file and the options beside it come to, for every command that opens a source."""
+"""What a sensor file and what is asked for beside it come to."""
 
-import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
+from edge.bundle import demo_recording
 from edge.errors import UsageError
-from firmware_bridge.baseline import load_baselines
-from firmware_bridge.sensor_file import SensorFile, load_sensor_file
-from firmware_bridge.xela import ID_MAPS, USPA44_MAP
+from firmware_bridge.baseline import Baseline, load_baselines
+from firmware_bridge.links.base import Link
+from firmware_bridge.links.source import DEMO_LOOP, open_sources
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.xela import ID_MAPS, USPA44_MAP, ModelMap
 
 
-def use_sensor_file(options: argparse.Namespace) -> None:
-    """Settle source, id map, mountings, baselines and counts per newton.
-
-    What the command line says goes before the file, since a baseline may be newer than it. Only another id map is
-    refused: the order and the baseline in the file are those of its own.
+def settled(sensor: str | Path | None, id_map: str | None) -> SensorFile:
+    """What is known of the sensors.
 
     Args:
-        options: with `sensor`, `source` and `id_map`, and where the command has them `baseline` and
-            `counts_per_newton`. Set are `sensor_file`, `model_map`, `mountings`, `orders` and `baselines`; `source` and
-            `counts_per_newton` where they were not given.
+        sensor: what edge-sr doctor wrote, if there is one.
+        id_map: name of an id map, if one was asked for.
 
     Raises:
         SensorFileError: the sensor file cannot be used.
-        RecordingError: the baseline file cannot be used, or is of another order.
-        UsageError: the file is for another id map than was asked for.
+        UsageError: no such id map; or the file is of another, and so would be its order and its baseline.
     """
-    asked = options.id_map
-    known = SensorFile(asked or USPA44_MAP.name) if options.sensor is None else load_sensor_file(options.sensor)
-    if asked not in (None, known.model):
+    if id_map not in (None, *ID_MAPS):
+        raise UsageError(f"id map is {id_map!r}, expected one of: {', '.join(ID_MAPS)}")
+    known = SensorFile(id_map or USPA44_MAP.name) if sensor is None else load_sensor_file(sensor)
+    if id_map not in (None, known.model):
         raise UsageError(
-            f"--id-map {asked}, but {options.sensor} is of a {known.model}, and so are its order and baseline: "
+            f"id map {id_map}, but {sensor} is of a {known.model}, and so are its order and baseline: "
             "leave one of them out"
         )
-    options.sensor_file = known
-    options.mountings = known.mountings
-    options.model_map = ID_MAPS[known.model]
-    if not options.source and known.adapter is not None:
-        options.source = [f"slcan:serial={known.adapter}"]
-    stored = getattr(options, "baseline", None)
-    options.orders = {name: one.order for name, one in known.mountings.items() if one.moves_taxels}
-    options.baselines = (known.baselines or None) if stored is None else load_baselines(stored, options.orders)
-    if getattr(options, "counts_per_newton", None) is None:
-        options.counts_per_newton = known.counts_per_newton or None
+    return known
+
+
+def link_to(
+    texts: Sequence[str],
+    known: SensorFile,
+    *,
+    model: ModelMap | None = None,
+    rate_hz: float | None = None,
+    give_up_s: float | None = math.inf,
+) -> Link:
+    """The link to what was asked for, not yet entered.
+
+    Args:
+        texts: as in firmware_bridge.links.source; without any, the adapter of the sensor file or the one there is.
+        known: of the sensors.
+        model: which CAN id is which taxel, instead of the id map that is known.
+        rate_hz: at which recordings are played, in [Hz].
+        give_up_s: how long a lost source may be away, in [s]; None leaves its loss to the caller.
+
+    Raises:
+        SourceError: as in open_sources; NoDeviceError and RecordingError as well.
+        UsageError: a source that is no text; the demo's recording is not installed.
+    """
+    for text in texts:
+        if not isinstance(text, str):
+            raise UsageError(f"source is {text!r}, expected text, as behind --source; of several each by itself")
+    if not texts and known.adapter is not None:
+        texts = [f"slcan:serial={known.adapter}"]
+    demo = any(text.rpartition("=")[2] in ("demo", DEMO_LOOP) for text in texts)
+    recording = demo_recording() if demo else None
+    return open_sources(
+        texts, rate_hz, recording, known.model_map if model is None else model, give_up_s, mountings=known.mountings
+    )
+
+
+def with_recorded(known: SensorFile, link: Link) -> SensorFile:
+    """What is known, and of sensors that it does not name how they sat when they were recorded."""
+    recorded = {name: SensorEntry(mounting) for name, mounting in link.mountings.items()}
+    return replace(known, sensors=recorded | dict(known.sensors))
+
+
+def references(baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile) -> Mapping[str, Baseline]:
+    """What the free pads read before: stored baselines, or their file, go before those of the sensor file.
+
+    Raises:
+        RecordingError: the baseline file cannot be used, or is of another order.
+    """
+    if isinstance(baselines, (str, Path)):
+        return load_baselines(baselines, known.orders)
+    return known.baselines if baselines is None else baselines

@@ -1,6 +1,6 @@
 """The demo's score: what the runtime made of a tap whose truth is known."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -43,9 +43,15 @@ class DemoScore(Sink):
     """Keeps of each tap the result with the largest force.
 
     A result finds its truth by its raw counts, not by its number: a lost scan shifts nothing.
+
+    Attributes:
+        surface: that is tapped.
+        complete: the last tap is over.
     """
 
-    def __init__(self, recording: Path, contract: Contract) -> None:
+    def __init__(
+        self, recording: Path, contract: Contract, on_complete: Callable[["DemoScore"], object] = lambda score: None
+    ) -> None:
         """Load the truth.
 
         Args:
@@ -53,6 +59,7 @@ class DemoScore(Sink):
                 contact; `indentation_mm` (n,); `unit_patterns` (taps, H, W), the truth per
                 indentation; `angles_deg` (taps,); `surface`.
             contract: of the model that is scored.
+            on_complete: called with this, once, when the last tap is over; what comes then is not scored.
         """
         self._full_scale = contract.output_full_scale
         with np.load(recording, allow_pickle=False) as data:
@@ -65,6 +72,8 @@ class DemoScore(Sink):
                 if tap >= 0
             }
         self._peaks: dict[int, _Peak] = {}
+        self._on_complete = on_complete
+        self.complete = False
 
     @property
     def taps(self) -> int:
@@ -73,6 +82,12 @@ class DemoScore(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Keep the result if it is the strongest of its tap."""
+        if self.complete:
+            return
+        if result.contact is False and self.taps - 1 in self._peaks:
+            self.complete = True
+            self._on_complete(self)
+            return
         frame = self._frames.get(result.scan.counts.tobytes())
         if frame is None or result.pattern is None or result.force_counts is None:
             return

@@ -4,6 +4,7 @@ EdgeError
 +-- ModelError (ValueError)   a model that is missing, unreadable or breaks the contract
 +-- WindowError (ValueError)  an input that cannot be inferred from: shape, type, not finite
 +-- UsageError (ValueError)   what the caller asked for cannot be done as asked
++-- MessageError (ValueError) bytes that are no packed message
 +-- SinkError (OSError)       a sink that cannot be opened or written
     +-- SinkClosedError       whoever read the sink has gone
 """
@@ -23,6 +24,10 @@ class WindowError(EdgeError, ValueError):
 
 class UsageError(EdgeError, ValueError):
     """What the caller asked for cannot be done as asked."""
+
+
+class MessageError(EdgeError, ValueError):
+    """Bytes that are no packed message."""
 
 
 class SinkError(EdgeError, OSError):

@@ -5,7 +5,7 @@ from typing import Final
 
 from firmware_bridge.links.base import Notice
 
-KINDS: Final = ("lost", "silent", "back", "trouble", "well", "sink")
+KINDS: Final = ("lost", "silent", "back", "trouble", "well", "sink", "note", "refused")
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +15,8 @@ class Event:
     Attributes:
         time_ns: monotonic time, in [ns].
         kind: one of KINDS: the link's ("lost", "silent", "back", "trouble", "well"), of one sensor's silence while
-            others go on ("silent", "back"), or "sink", one was given up.
+            others go on ("silent", "back"), "sink", one was given up, or what is told to those who look alone:
+            "refused", what was asked for and is not done, and "note", all else.
         sensor: of which sensor, or None.
         text: in a user's words.
     """

@@ -49,6 +49,10 @@ class Ladder:
         """Taps that the largest of them takes."""
         return max(model.contract.taps for model in self.models.values())
 
+    def steps(self, runtime: Runtime) -> Sink:
+        """What changes the runtime's model between results; give it every one."""
+        return ModelSteps(self, runtime)
+
 
 class ModelSteps(Sink):
     """Hears of every pattern, and changes the runtime's model when the governor says so.

@@ -4,13 +4,17 @@ Bench and doctor have options of their own: edge.bench.options, edge.doctor.opti
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from edge.arguments import Parser, add_source, not_negative, positive, whole
+from edge.arguments import Parser, add_source, not_negative, port, positive, whole
 from edge.bundle import DEFAULT_MODEL, DEMO_MODEL
-from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
+from edge.sinks.forms import check_sink
+from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, check_thresholds
 from firmware_bridge.baseline import FEWEST_SCANS
+
+VIEW_PORT: Final = 8077
 
 RUN_HELP: Final = """\
 sources:
@@ -21,8 +25,8 @@ sources:
   gs_usb[:SERIAL]     candleLight
   can:socketcan:can0  by python-can
   can:pcan:PCAN_USBBUS1, kvaser, ...
-  replay:FILE[,FILE]  CSV, or npz
-  demo                emulated sensor
+  replay:FILE[,FILE]  mcap, npz, CSV
+  demo[:loop]         emulated sensor
 
 sinks:
   status      live line (default on a
@@ -30,6 +34,13 @@ sinks:
   jsonl:FILE  one JSON record a line
   jsonl:-     the same on stdout
   npz:FILE.npz  for replay and numpy
+  mcap:FILE.mcap  for replay, Foxglove
+              and ros2 bag
+  shm:NAME      latest values, shared
+                memory
+  zenoh:KEY[?connect=tcp/HOST:7447]
+  ros2:TOPIC  ROS 2 messages over DDS
+--view shows it in a browser as well
 
 While it runs, these lines on stdin:
   {"cmd": "reset"}  forget earlier taps,
@@ -41,6 +52,10 @@ On a terminal: r resets, z zeroes, Z
 does even in contact. SIGUSR1 is z.
 
 other commands:
+  edge-sr demo      no hardware; with
+                    --view it goes on
+  edge-sr record FILE  the same, kept
+  edge-sr replay FILE  made anew
   edge-sr models    bundled models
   edge-sr baseline  zero, and keep it
   edge-sr bench     error and run time
@@ -67,15 +82,100 @@ example:
 """
 
 
+RECORD_HELP: Final = """\
+example:
+  edge-sr record press.mcap
+  edge-sr replay press.mcap \\
+          --model mtsr4-int8 \\
+          --sink jsonl:-
+"""
+
+REPLAY_HELP: Final = """\
+Every scan gets its result, as fast as
+the machine goes, with the time of the
+recording; begins with the baseline
+that was in use at its first scan.
+
+example:
+  edge-sr replay press.mcap \\
+          --model mtsr4-int8 \\
+          --sink mcap:again.mcap
+"""
+
+
 def run_parser() -> argparse.ArgumentParser:
     """Options of `edge-sr`."""
     parser = Parser(
         prog="edge-sr",
-        usage="edge-sr [options]\n       edge-sr models\n       edge-sr baseline --out FILE\n       edge-sr bench\n"
+        usage="edge-sr [options]\n       edge-sr demo [options]\n"
+        "       edge-sr record FILE [options]\n       edge-sr replay FILE [options]\n"
+        "       edge-sr models\n       edge-sr baseline --out FILE\n       edge-sr bench\n"
         "       edge-sr devices\n       edge-sr doctor",
         description="Reads tactile scans and\nsuper-resolves them at sensor rate.",
         epilog=RUN_HELP,
     )
+    _add_run(parser)
+    return parser
+
+
+def record_parser() -> argparse.ArgumentParser:
+    """Options of `edge-sr record`: a file, and those of `edge-sr`."""
+    parser = Parser(
+        prog="edge-sr record",
+        usage="edge-sr record FILE [options]",
+        description="Runs as edge-sr does, and records\nscans, patterns and events.",
+        epilog=RECORD_HELP,
+    )
+    parser.add_argument("file", metavar="FILE", help="new file: .npz, else .mcap")
+    _add_run(parser)
+    return parser
+
+
+def replay_parser() -> argparse.ArgumentParser:
+    """Options of `edge-sr replay`; those of a live run have the values that a recording wants."""
+    parser = Parser(
+        prog="edge-sr replay",
+        usage="edge-sr replay FILE [options]",
+        description="Makes patterns of a recording anew.",
+        epilog=REPLAY_HELP,
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help=".mcap, .npz or .csv")
+    parser.add_argument("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL})")
+    zeroing = parser.add_mutually_exclusive_group()
+    zeroing.add_argument("--baseline", metavar="FILE", type=Path, help="another baseline")
+    zeroing.add_argument("--zero", action="store_true", help="zero from the first 100 scans that are free and still")
+    parser.add_argument("--sink", metavar="S", action="append", default=[], help="where results go; may be repeated")
+    parser.add_argument(
+        "--paced", action="store_true", help="at the speed it was made, in time of now; --view implies it"
+    )
+    parser.add_argument("--sensor", metavar="FILE", type=Path, help="of edge-sr doctor, instead of what was recorded")
+    parser.add_argument(
+        "--rate-hz",
+        metavar="R",
+        type=positive,
+        help="scans a second: where the file does not tell, or with --paced",
+    )
+    parser.add_argument("--duration-s", metavar="T", type=positive, help="stop after so much of the recording")
+    _add_results(parser)
+    _add_view(parser)
+    parser.set_defaults(source=[], id_map=None, budget_us=None, recalibrate=False, give_up_s=None, realtime=False)
+    return parser
+
+
+def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    """Options of a run, and of them all that can be wrong before anything is opened.
+
+    Raises:
+        UsageError: no such sink, or thresholds that cannot be.
+    """
+    options = parser.parse_args(arguments)
+    for text in options.sink:
+        check_sink(text)
+    check_thresholds(options.contact_on_counts, options.contact_off_counts)
+    return options
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL}; for the demo {DEMO_MODEL})")
     add(
@@ -95,6 +195,14 @@ def run_parser() -> argparse.ArgumentParser:
         help="end when a lost source is away for so long; 0 at once (default: wait for ever)",
     )
     add("--baseline", metavar="FILE", type=Path, help="stored baseline, instead of zeroing at the start")
+    _add_results(parser)
+    add("--realtime", action="store_true", help="SCHED_FIFO, a processor of its own, locked memory; as permitted")
+    _add_view(parser)
+
+
+def _add_results(parser: argparse.ArgumentParser) -> None:
+    """What is made of scans, wherever they come from."""
+    add = parser.add_argument
     add("--counts-per-newton", metavar="C", type=positive, help="summed z per newton; gives forces in N")
     add(
         "--contact-on-counts",
@@ -119,8 +227,21 @@ def run_parser() -> argparse.ArgumentParser:
     )
     add("--every-scan", action="store_true", help="infer also where nothing has changed since the pattern before")
     add("--every-tap", action="store_true", help="use also taps that are not expected to help")
-    add("--realtime", action="store_true", help="SCHED_FIFO, a processor of its own, locked memory; as permitted")
-    return parser
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--view",
+        metavar="PORT",
+        nargs="?",
+        type=port,
+        const=VIEW_PORT,
+        help=f"live page for a browser, at this port (default {VIEW_PORT}; 0: any free one)",
+    )
+    add("--view-host", metavar="H", help="address it listens at, instead of this machine's own alone; needs a token")
+    add("--view-token", metavar="T", help="the token (default: one is made, and printed)")
+    add("--view-record-dir", metavar="DIR", type=Path, help="where its button records into (default: here)")
 
 
 def baseline_parser() -> argparse.ArgumentParser:

@@ -1,16 +1,17 @@
 """The scheduling that `--realtime` asks the system for: each part on its own, and in one line what was refused.
 
-SCHED_FIFO lets the process run before every ordinary one; threads that it starts inherit it, so the reader stands no
-lower than the loop. The pin keeps its caches warm, on the last of the processors it may use, since interrupts and
-everything else tend to the first. Locked memory cannot be paged out. The kernel still takes back 5 % of each second
-from threads that never rest (/proc/sys/kernel/sched_rt_runtime_us); these rest between scans.
+SCHED_FIFO lets the loop, and the thread that reads for it, run before every ordinary process. The pin keeps their
+caches warm, on the last of the processors they may use, since interrupts and everything else tend to the first. Locked
+memory cannot be paged out. The kernel still takes back 5 % of each second from threads that never rest
+(/proc/sys/kernel/sched_rt_runtime_us); these rest between scans.
 """
 
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from typing import Final
 
 PRIORITY: Final = 20
@@ -25,20 +26,23 @@ _MEMORY_REMEDY: Final = "'ulimit -l unlimited', a line '@GROUP - memlock unlimit
 
 
 @contextmanager
-def realtime(tell: Callable[[str], object]) -> Iterator[None]:
-    """Run in real time as far as is permitted, and as before afterwards; call it before threads are started.
+def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> Iterator[None]:
+    """Run in real time as far as is permitted, and as before afterwards.
 
     Args:
         tell: gets one line for each part that is not to be had; the run goes on without it.
+        thread_ids: of the threads that the caller's waits for, by the system's numbers: they stand no lower. Threads
+            started before stay as they are; one begun meanwhile is an ordinary one, but on the caller's processor.
     """
     if sys.platform != "linux":
         tell(f"--realtime: not on {sys.platform}, only on Linux; going on without")
         yield
         return
+    threads = (0, *thread_ids)  # 0 is the caller's own
     with ExitStack() as undo:
         for name, remedy, begin in (
-            ("SCHED_FIFO", _SCHEDULER_REMEDY, _schedule),
-            ("one processor of its own", "the container or cgroup must permit it", _pin),
+            ("SCHED_FIFO", _SCHEDULER_REMEDY, partial(_schedule, threads)),
+            ("one processor of its own", "the container or cgroup must permit it", partial(_pin, threads)),
             ("locked memory", _MEMORY_REMEDY, _lock_memory),
         ):
             try:
@@ -48,17 +52,31 @@ def realtime(tell: Callable[[str], object]) -> Iterator[None]:
         yield
 
 
-def _schedule() -> Callable[[], object]:
+def _schedule(threads: Sequence[int]) -> Callable[[], object]:
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    return lambda: os.sched_setscheduler(0, policy, parameters)
+
+    def schedule(policy: int, parameters: os.sched_param) -> None:
+        for thread in threads:
+            with suppress(ProcessLookupError):  # it has ended, and its link with it
+                # What these threads begin is not of them, and begins as an ordinary thread. The flag stays afterwards:
+                # to take it back is a privilege of its own.
+                os.sched_setscheduler(thread, policy | os.SCHED_RESET_ON_FORK, parameters)
+
+    schedule(os.SCHED_FIFO, os.sched_param(PRIORITY))
+    return lambda: schedule(policy, parameters)
 
 
-def _pin() -> Callable[[], object]:
+def _pin(threads: Sequence[int]) -> Callable[[], object]:
     allowed = os.sched_getaffinity(0)
+
+    def pin(processors: set[int]) -> None:
+        for thread in threads:
+            with suppress(ProcessLookupError):
+                os.sched_setaffinity(thread, processors)
+
     if len(allowed) > 1:  # nothing is gained on the only one
-        os.sched_setaffinity(0, {max(allowed)})
-    return lambda: os.sched_setaffinity(0, allowed)
+        pin({max(allowed)})
+    return lambda: pin(allowed)
 
 
 def _lock_memory() -> Callable[[], object]:

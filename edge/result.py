@@ -40,6 +40,10 @@ class Result:
         pattern_unit: unit of the pattern.
         deviation: (H, W) float32, standard deviation of each pixel of the pattern, in `pattern_unit`; None without a
             pattern, or where the model gives none.
+        zeroed: (3, rows, cols) float32, each taxel's newest reading over the baseline in counts, along the pad's axes,
+            NaN where it was not zeroed; those of dead taxels as they read. None without a baseline.
+        window: (taps, 3, rows, cols) float32, the taps that the pattern is made from, newest first, as `zeroed` with
+            something for dead taxels; None without contact.
         force_counts: summed z over the baseline, or None while it cannot be known.
         force_n: the same in [N], if a calibration was given; else the vendor's z force, where the scan has one.
         area_mm2: touched area of the pattern, in [mm2].
@@ -77,6 +81,8 @@ class Result:
     pattern: NDArray[np.float32] | None = None
     pattern_unit: str = ""
     deviation: NDArray[np.float32] | None = None
+    zeroed: NDArray[np.float32] | None = None
+    window: NDArray[np.float32] | None = None
     force_counts: float | None = None
     force_n: float | None = None
     area_mm2: float | None = None

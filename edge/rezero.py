@@ -1,5 +1,7 @@
 """Zeroing again while a sensor runs; the old baseline stays in use until there is a new one."""
 
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -10,8 +12,16 @@ from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.scan import Scan
 
+REFUSED: Final = "zeroing refused"
+GIVEN_UP: Final = "zeroing given up"
+"""What an event says of a zeroing that was asked for and is not done."""
 GIVE_UP_NS: Final = 15_000_000_000
 """Of scan time: ten tries at 100 Hz, and four at 30."""
+
+
+def in_contact(sensor: str) -> str:
+    """What an event says of a zeroing that is refused, and may be forced."""
+    return f"{REFUSED}: sensor {sensor} is in contact"
 
 
 class Rezeroing:
@@ -21,18 +31,22 @@ class Rezeroing:
         note: how it stands.
     """
 
-    def __init__(self, sensor: str, old: Baseline, *, force: bool) -> None:
+    def __init__(
+        self, sensor: str, old: Baseline, *, force: bool, unix_time_s: Callable[[], float] = time.time
+    ) -> None:
         """Start with the next scan.
 
         Args:
             sensor: name of the sensor.
             old: the baseline so far; against it a load is seen.
             force: zero away a contact or a load.
+            unix_time_s: dates the new one, in [s] since 1970.
         """
         self.note = "zeroing: keep the pad still and free"
         self._sensor = sensor
         self._old = old
         self._force = force
+        self._unix_time_s = unix_time_s
         self._end_ns: int | None = None
         self._why = f"fewer than {FEWEST_SCANS} whole scans"
         self._estimator = self._new_estimator()
@@ -51,7 +65,7 @@ class Rezeroing:
         if self._end_ns is None:
             self._end_ns = scan.time_ns + GIVE_UP_NS
         if scan.time_ns >= self._end_ns:
-            name = f"sensor {self._sensor}: zeroing given up after {GIVE_UP_NS / 1e9:.0f} s, the old baseline stays"
+            name = f"sensor {self._sensor}: {GIVEN_UP} after {GIVE_UP_NS / 1e9:.0f} s, the old baseline stays"
             raise BaselineRefusedError(f"{name}: {self._why}")
         try:
             if contact and not self._force:
@@ -66,4 +80,4 @@ class Rezeroing:
         return None if taken is None else replace(taken, origin="demand")
 
     def _new_estimator(self) -> BaselineEstimator:
-        return BaselineEstimator(reference=None if self._force else self._old)
+        return BaselineEstimator(reference=None if self._force else self._old, clock=self._unix_time_s)

@@ -8,89 +8,116 @@ import contextlib
 import os
 import shutil
 import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Final, TextIO
 
-from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, TAXELS, demo_recording, find_model
+from edge.api import (
+    DEFAULT_MODEL,
+    DEMO_LOOP,
+    DEMO_MODEL,
+    Contract,
+    Fan,
+    Sink,
+    SinkClosedError,
+    Source,
+    Statistics,
+    UsageError,
+    demo_recording,
+    load_baselines,
+    load_model,
+    open_ladder,
+    open_runtime,
+    open_sink,
+    pump,
+)
 from edge.commands import user_commands
-from edge.errors import SinkClosedError
-from edge.estimate import load_estimator
-from edge.pump import pump
-from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.signals import stop_on_signals
-from edge.sinks.base import Sink
-from edge.sinks.fan import Fan
-from edge.sinks.forms import open_sink
 from edge.sinks.messages import MessageSink
-from edge.statistics import Statistics
-from firmware_bridge.geometry import USPA44
-from firmware_bridge.links.base import Link
 
 if TYPE_CHECKING:
-    from edge.contract import Contract
     from edge.demo import DemoScore
-    from edge.ladder import Ladder
+    from edge.view.live import LiveView
+
+DEMO_HZ: Final = 100.0
+DEMO_REST_SCANS: Final = 100
+"""After so many without contact a demo that begins again is at its first tap: 174 lie between, and 24 between taps."""
 
 
-def run(options: argparse.Namespace, link: Link) -> None:
+def run(options: argparse.Namespace, source: Source, statistics: Statistics | None = None) -> None:
     """Do what `edge-sr` without a command is asked for.
 
     Args:
         options: of edge.options.run_parser.
-        link: not open yet.
+        source: not open yet.
+        statistics: filled on the way, so that they are there however the run ends.
 
     Raises:
         EdgeError: something cannot be used.
         BridgeError: of the source.
     """
     stdout_taken = "jsonl:-" in options.sink
+    baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
     with stop_on_signals() as stop, user_commands() as commands:
-        demo = options.source == ["demo"]
+        loops = options.source == [DEMO_LOOP]
+        demo = loops or options.source == ["demo"]
         default = DEMO_MODEL if demo else DEFAULT_MODEL
-        path = find_model(options.model or default)
-        ladder = None if options.budget_us is None else _open_ladder(options, path, stop)
+        name = options.model or default
+        ladder = None
+        if options.budget_us is not None:
+            ladder = open_ladder(
+                name,
+                options.budget_us,
+                rate_hz=options.rate_hz,
+                recalibrate=options.recalibrate,
+                stop=stop,
+                tell=lambda line: print(line, file=sys.stderr),
+            )
         if stop.is_set():
             return
-        model = ModelSession(path) if ladder is None else ladder.model
-        score = _open_score(model.contract) if demo else None
-        statistics = Statistics()
-        if score is not None:
-            print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
-        with link, _summary(statistics, link, options.rate_hz), contextlib.ExitStack() as closing:
-            if options.realtime:
-                from edge.realtime import realtime
-
-                closing.enter_context(realtime(_tell))
-            runtime = Runtime(
+        model = load_model(name) if ladder is None else ladder.model
+        scores = sys.stderr if stdout_taken else sys.stdout
+        score = None
+        statistics = Statistics() if statistics is None else statistics
+        with (
+            _open_view(options, model.contract) as view,
+            _summary(statistics, source),
+            source,
+            contextlib.ExitStack() as closing,
+        ):
+            messages = MessageSink(said=None if ladder is None else ladder.choice.why)
+            opener = partial(open_sink, contract=model.contract, source=source)
+            if view is not None:
+                view.begin(source.name, source.kind, model.name, opener, messages.say)
+                commands = view.commands(commands)
+                print(f"live page: {view.url}", file=sys.stderr, flush=True)
+            if demo:
+                score = _open_score(model.contract, partial(_go_on, scores, view) if loops else lambda score: None)
+            runtime = open_runtime(
                 model,
-                source=link.kind,  # known once the link is open
-                estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)),
-                baselines=options.baselines,
-                mountings=options.mountings,
+                source,
+                baselines=baselines,
                 counts_per_newton=options.counts_per_newton,
-                on_counts=options.contact_on_counts,
-                off_counts=options.contact_off_counts,
-                idle_timeout_s=options.idle_reset_s,
+                contact_on_counts=options.contact_on_counts,
+                contact_off_counts=options.contact_off_counts,
+                idle_reset_s=min(DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ), options.idle_reset_s)
+                if loops
+                else options.idle_reset_s,
                 # The demo is there to show what every scan takes, and what every tap gives.
-                reuse=not options.every_scan and score is None,
+                every_scan=options.every_scan or score is not None,
                 every_tap=options.every_tap or score is not None,
                 most_taps=1 if ladder is None else ladder.most_taps,
             )
             sinks: list[Sink] = [] if score is None else [score]
             if ladder is not None:
-                from edge.ladder import ModelSteps
-
-                sinks.append(ModelSteps(ladder, runtime))
-            messages = MessageSink()
+                sinks.append(ladder.steps(runtime))
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)
-            for text in with_status(options.sink):
-                sink = open_sink(text, model.contract, patient=link.kind == "replay")
+            for text in _with_status(options.sink, source):
+                sink = opener(text)
                 if text != "status":
                     fan.add(sink)
                     continue
@@ -98,54 +125,68 @@ def run(options: argparse.Namespace, link: Link) -> None:
                 sinks.append(sink)
             if set(options.sink) - {"status"}:
                 sinks.append(fan)
+            if view is not None:
+                sinks += view.sinks
+            if options.realtime:  # last: what the page and the sinks have started has no part in it
+                from edge.realtime import realtime
+
+                closing.enter_context(realtime(_tell, source.thread_ids))
             pump(
-                link,
+                source,
                 runtime,
                 sinks,
                 statistics,
                 stop=stop,
                 duration_s=options.duration_s,
                 commands=commands,
-                rate_hz=options.rate_hz,
-                expected=options.baselines or (),
             )
-        if score is not None:
-            _print_score(score, sys.stderr if stdout_taken else sys.stdout)
+        if score is not None and not (loops and score.complete):
+            _print_score(score, scores)
 
 
-def _open_ladder(options: argparse.Namespace, model: Path, stop: threading.Event) -> "Ladder | None":
-    from edge.calibration_cache import cache_path
-    from edge.ladder import USUAL_RATE_HZ, open_ladder
+def _open_view(options: argparse.Namespace, contract: Contract) -> "contextlib.AbstractContextManager[LiveView | None]":
+    if options.view is None:
+        for name in ("view_host", "view_token", "view_record_dir"):
+            if getattr(options, name) is not None:
+                option = f"--{name.replace('_', '-')}"
+                raise UsageError(f"{option} is of the live page, which was not asked for: add --view")
+        return contextlib.nullcontext()
+    from edge.view.live import LOOPBACK, LiveView
 
-    return open_ladder(
-        model,
-        options.budget_us,
-        rate_hz=options.rate_hz or USUAL_RATE_HZ,
-        cache=cache_path(),
-        recalibrate=options.recalibrate,
-        stop=stop,
-        tell=lambda line: print(line, file=sys.stderr),
-    )
+    directory = options.view_record_dir or Path()
+    if options.view_record_dir is not None and not os.access(f"{directory}/", os.W_OK | os.X_OK):
+        expected = "expected a folder that may be written into"
+        raise UsageError(f"--view-record-dir {directory}: {expected}; make it, or leave it out for the current folder")
+    return LiveView(options.view_host or LOOPBACK, options.view, options.view_token, directory, contract)
 
 
-def _open_score(contract: "Contract") -> "DemoScore":
+def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]") -> "DemoScore":
     from edge.demo import DemoScore
 
-    return DemoScore(demo_recording(), contract)
+    score = DemoScore(demo_recording(), contract, on_complete)
+    print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
+    return score
+
+
+def _go_on(stream: TextIO, view: "LiveView | None", score: "DemoScore") -> None:
+    """Tell what the demo is there to show while it goes on, and where else to look."""
+    _print_score(score, stream)
+    page = "" if view is None else f"live page: {view.url}; "
+    print(f"\n{page}the demo goes on until Ctrl-C", file=sys.stderr)
 
 
 @contextlib.contextmanager
-def _summary(statistics: Statistics, link: Link, rate_hz: float | None) -> Iterator[None]:
+def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
     """Tells at the end what the run did; a reader that has gone is an ordinary end, like Ctrl-C."""
     try:
         with contextlib.suppress(SinkClosedError):
             yield
     finally:
         if statistics.scans or sys.exception() is None:
-            source = link.name if link.kind == "device" else f"{link.kind.upper()} {link.name}"
+            name = source.name if source.kind == "device" else f"{source.kind.upper()} {source.name}"
             with contextlib.suppress(OSError):  # the terminal may have gone, which must not spoil a clean end
-                print(statistics.summary(source=source, wanted_rate_hz=rate_hz), file=sys.stderr)
-                received = ", ".join(f"{name} {count}" for name, count in link.counters().items() if count)
+                print(statistics.summary(source=name, wanted_rate_hz=source.rate_hz), file=sys.stderr)
+                received = ", ".join(f"{name} {count}" for name, count in source.counters().items() if count)
                 print(f"received: {received or 'nothing'}", file=sys.stderr)
 
 
@@ -153,9 +194,9 @@ def _tell(line: str) -> None:
     print(f"edge-sr: {line}", file=sys.stderr)
 
 
-def with_status(sinks: Sequence[str]) -> list[str]:
-    """The sinks asked for, and the live line, unless records may go to the same terminal."""
-    return list(sinks) if {"status", "jsonl:-"} & set(sinks) else [*sinks, "status"]
+def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
+    """The sinks asked for, and the live line; not where records may go to the same terminal, or it is over at once."""
+    return list(sinks) if {"status", "jsonl:-"} & set(sinks) or source.patient else [*sinks, "status"]
 
 
 def _print_score(score: "DemoScore", stream: TextIO) -> None:
@@ -163,9 +204,10 @@ def _print_score(score: "DemoScore", stream: TextIO) -> None:
     from edge.draw import choose_palette
 
     scores = score.scores()
-    print(f"\n{len(scores)} of {score.taps} taps scored at their peak, against the known truth:", file=stream)
     if not scores:
+        print(f"\nnone of {score.taps} taps scored: the run ended before a tap had a pattern", file=stream)
         return
+    print(f"\n{len(scores)} of {score.taps} taps scored at their peak, against the known truth:", file=stream)
     palette = choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)
     columns = shutil.get_terminal_size().columns
     print(score_table(scores), file=stream)

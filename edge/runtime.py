@@ -8,12 +8,14 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.asked import check_baselines, check_positive, check_whole
 from edge.confidence import expect
-from edge.contract import Contract
-from edge.errors import ModelError, UsageError, WindowError
+from edge.contract import MOST, Contract
+from edge.errors import ModelError, WindowError
 from edge.estimate import WIDENING, TaxelEstimator
 from edge.metrics import touched, touched_patch
 from edge.result import MADE, Result
+from edge.rezero import REFUSED
 from edge.sensor import Sensor
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
 from firmware_bridge.baseline import Baseline
@@ -24,6 +26,8 @@ from firmware_bridge.scan import Scan
 
 OLD_NS: Final = 50_000_000
 """Later by the device's own time stamps than its fastest reading of late: three times what a slow adapter keeps."""
+TAPS_FORGOTTEN: Final = "earlier taps forgotten"
+"""What is told of `reset`."""
 
 
 class Model(Protocol):
@@ -67,11 +71,13 @@ class Runtime:
         follow_drift: let the rest level follow what a free pad reads.
         most_taps: taps to remember for a model that may take over; the model's own if it takes more.
         clock_ns: measures run time.
-        unix_time_s: tells how old a stored baseline is when its sensor is first heard; ages go on by scan time.
+        unix_time_s: dates baselines that are taken, and tells how old a stored one is when its sensor is first heard;
+            ages go on by scan time.
 
     Raises:
         ModelError: the model is for another sensor.
-        UsageError: contact thresholds or an idle time-out that cannot be, or a baseline of another grid.
+        UsageError: contact thresholds, an idle time-out, counts per newton or a number of taps that cannot be, or a
+            baseline of another grid.
     """
 
     def __init__(
@@ -95,10 +101,13 @@ class Runtime:
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
         model.contract.check_sensor(geometry)
-        for baseline in (baselines or {}).values():
-            if baseline.counts.shape != geometry.scan_shape:
-                got = f"baseline of sensor {baseline.sensor} has shape {baseline.counts.shape}"
-                raise UsageError(f"{got}, expected {geometry.scan_shape}: zero again")
+        check_baselines(baselines or {}, geometry)
+        if isinstance(counts_per_newton, Mapping):
+            for name, counts in counts_per_newton.items():
+                check_positive(f"counts_per_newton of sensor {name}", counts)
+        elif counts_per_newton is not None:
+            check_positive("counts_per_newton", counts_per_newton)
+        check_whole("most_taps", most_taps, 1, MOST["taps"])
         self._model = model
         self._most_taps = max(most_taps, model.contract.taps)
         self._event: str | None = None
@@ -118,10 +127,17 @@ class Runtime:
         self._sensors: dict[str, Sensor] = {}
         self._new_tracker()
 
+    @property
+    def expected(self) -> frozenset[str]:
+        """Names of the sensors that there are stored baselines of, or counts per newton."""
+        per_newton = self._counts_per_newton
+        return frozenset({*self._baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
+
     def reset(self) -> None:
-        """Forget the taps of every sensor, as when the robot moves to another object; zeroing stays."""
+        """Forget the taps of every sensor, as when the robot moves to another object; an event tells. Zeroing stays."""
         for sensor in self._sensors.values():
             sensor.taps.reset()
+        self._tell(TAPS_FORGOTTEN)
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
         """Zero again from the next scans; the old baselines stay in use until then, and an event tells what came of it.
@@ -131,10 +147,10 @@ class Runtime:
             force: also in contact.
         """
         if not self._sensors:
-            self._tell("zeroing refused: no sensor was heard yet")
+            self._tell(f"{REFUSED}: no sensor was heard yet")
         elif name is not None and name not in self._sensors:
             known = ", ".join(sorted(self._sensors)) or "none yet"
-            self._tell(f"zeroing refused: no sensor {name}, there are {known}")
+            self._tell(f"{REFUSED}: no sensor {name}, there are {known}")
         for sensor in self._sensors.values() if name is None else filter(None, [self._sensors.get(name)]):
             sensor.zero_again(force=force)
 
@@ -216,6 +232,7 @@ class Runtime:
             return Result(scan, self._source, self._model.name, "zeroing", **known), None
         age_s = sensor.age_s(scan.time_ns)
         known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "drift": sensor.drift, "filled": filled}
+        known["zeroed"] = zeroed
         if sensor.watch.waiting or (dead and readings is None):
             return Result(scan, self._source, self._model.name, "incomplete", **known), None
 
@@ -231,6 +248,8 @@ class Runtime:
             force_n = force_counts / sensor.counts_per_newton
         else:
             force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
+        # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
+        window = tap.window.copy() if tap.contact else None
         result = Result(
             scan,
             self._source,
@@ -238,13 +257,13 @@ class Runtime:
             "idle",
             contact=tap.contact,
             taps_used=taps_used,
+            window=None if window is None else window[:taps_used],
             force_counts=force_counts,
             force_n=force_n,
             **known,
         )
         made_by = (self._model.name, tap.tap, taps_used, filled)
-        # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
-        return result, _Due(sensor, tap.window.copy(), made_by) if tap.contact else None
+        return result, None if window is None else _Due(sensor, window, made_by)
 
     def _unchanged(self, result: Result, due: "_Due") -> Result | None:
         """The result with the pattern before, where there is no need of another."""
@@ -314,7 +333,7 @@ class Runtime:
             )
         mounting = self._mountings.get(name)
         self._sensors[name] = sensor = Sensor(
-            name, self._geometry, self._new_tracker(), self._estimator, note, mounting
+            name, self._geometry, self._new_tracker(), self._estimator, note, mounting, self._unix_time_s
         )
         per_newton = self._counts_per_newton
         sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton

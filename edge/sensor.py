@@ -1,6 +1,7 @@
 """What is remembered of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
 
-from collections.abc import Hashable
+import time
+from collections.abc import Callable, Hashable
 from typing import Final
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge.estimate import Filler, Readings, TaxelEstimator
 from edge.result import Result
-from edge.rezero import Rezeroing
+from edge.rezero import GIVEN_UP, Rezeroing, in_contact
 from edge.scene import LastReading, TapsThatMatter
 from edge.taps import TapTracker
 from edge.taxels import TaxelWatch
@@ -43,6 +44,7 @@ class Sensor:
         estimator: TaxelEstimator | None,
         note: str | None,
         mounting: Mounting | None = None,
+        unix_time_s: Callable[[], float] = time.time,
     ) -> None:
         self.taps = taps
         self.taps_that_matter = TapsThatMatter()
@@ -61,7 +63,8 @@ class Sensor:
         self._filler: Filler | None = None
         self._heard_ns: int | None = None
         self._estimator = estimator
-        self._zeroing = BaselineEstimator()
+        self._unix_time_s = unix_time_s
+        self._zeroing = BaselineEstimator(clock=unix_time_s)
         self._rezeroing: Rezeroing | None = None
         self._taken: Baseline | None = None
         self._taken_ns: int | None = None
@@ -98,12 +101,12 @@ class Sensor:
         self.taps.reset()
         self.last = None
         self.watch.forget()
-        self._zeroing = BaselineEstimator()
+        self._zeroing = BaselineEstimator(clock=self._unix_time_s)
         if self._tracker is not None:
             self._tracker.forget()
         if self._rezeroing is not None:
             self._rezeroing = self.note = None
-            self.events.append(f"zeroing given up: sensor {self._name} was away, the old baseline stays; ask again")
+            self.events.append(f"{GIVEN_UP}: sensor {self._name} was away, the old baseline stays; ask again")
 
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
         """The newest reading of every taxel over the baseline (3, rows, cols); None without a baseline."""
@@ -145,9 +148,9 @@ class Sensor:
             self.events.append(f"sensor {self._name}: no baseline yet, zeroing since the start")
         elif self._touched and not force:
             remedy = f"free the pad, or force it ({HOW_TO_FORCE})"
-            self.events.append(f"zeroing refused: sensor {self._name} is in contact: {remedy}")
+            self.events.append(f"{in_contact(self._name)}: {remedy}")
         else:
-            self._rezeroing = Rezeroing(self._name, self.baseline, force=force)
+            self._rezeroing = Rezeroing(self._name, self.baseline, force=force, unix_time_s=self._unix_time_s)
             self.note = self._rezeroing.note
 
     @property

@@ -42,6 +42,7 @@ class Statistics:
     """What a run did, for its summary.
 
     Attributes:
+        source: what kind of source the last scan came from; empty before the first.
         scans: results made, one for every scan.
         patterns: of these, with a pattern.
         reused: of these, with the pattern before, since nothing had changed.
@@ -56,12 +57,13 @@ class Statistics:
         repeated: complete scans with nothing renewed.
         run_time_us: histogram of the inference's run time.
         latency_us: histogram of the time from scan to pattern.
-        commands_refused: lines on stdin that were no command.
+        commands_refused: lines on stdin, and messages of viewers, that were no command.
         model_patterns: of the patterns, how many each model made.
         model_changes: how often the model was another than before.
     """
 
     def __init__(self) -> None:
+        self.source = ""
         self.scans = 0
         self.patterns = 0
         self.reused = 0
@@ -87,6 +89,7 @@ class Statistics:
     def add(self, result: Result) -> None:
         """Count one result."""
         scan = result.scan
+        self.source = result.source
         self.scans += 1
         self.dropped += result.state == "dropped"
         if not scan.whole:
@@ -118,6 +121,10 @@ class Statistics:
     def rate_hz(self) -> dict[str, float]:
         """Scans a second of each sensor over the whole run, where there were two or more."""
         return {name: rate_hz for name, span in self._spans.items() if (rate_hz := span.rate_hz()) is not None}
+
+    def duration_s(self) -> float:
+        """From first scan to last of the sensor that was heard for the longest, in [s]."""
+        return max((span.duration_ns for span in self._spans.values()), default=0) / 1e9
 
     def summary(self, *, source: str, wanted_rate_hz: float | None = None) -> str:
         """The run in a few lines of text.
@@ -154,7 +161,7 @@ class Statistics:
             counts = ", ".join(f"{kind} {count}" for kind, count in self.events.items())
             lines.append(f"events: {counts}")
         if self.commands_refused:
-            lines.append(f"stdin: {self.commands_refused} lines were no command")
+            lines.append(f"refused: {self.commands_refused} lines or messages were no command")
         return "\n".join(lines)
 
 
@@ -176,6 +183,9 @@ class _Span:
         self._last_ns = time_ns
         self._scans += 1
 
+    @property
+    def duration_ns(self) -> int:
+        return self._last_ns - self._first_ns
+
     def rate_hz(self) -> float | None:
-        duration_ns = self._last_ns - self._first_ns
-        return (self._scans - 1) * 1e9 / duration_ns if duration_ns > 0 else None
+        return (self._scans - 1) * 1e9 / self.duration_ns if self.duration_ns > 0 else None

@@ -40,6 +40,16 @@ class TapState:
     window: NDArray[np.float32]
 
 
+def check_thresholds(on_counts: float, off_counts: float) -> None:
+    """Of contact, by summed z.
+
+    Raises:
+        UsageError: they cannot be.
+    """
+    if not 0 < off_counts <= on_counts < math.inf:
+        raise UsageError(f"contact thresholds are on {on_counts}, off {off_counts}: expected 0 < off <= on")
+
+
 class TapTracker:
     """Follows the taps of one sensor; allocates no array after construction."""
 
@@ -65,8 +75,7 @@ class TapTracker:
         """
         if taps < 1:
             raise UsageError(f"taps is {taps}, expected at least 1")
-        if not 0 < off_counts <= on_counts < math.inf:
-            raise UsageError(f"contact thresholds are on {on_counts}, off {off_counts}: expected 0 < off <= on")
+        check_thresholds(on_counts, off_counts)
         if not idle_timeout_s > 0:
             raise UsageError(f"idle time-out is {idle_timeout_s} s, expected more than 0")
         self._on_counts = on_counts

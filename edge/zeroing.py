@@ -5,27 +5,29 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from firmware_bridge.baseline import Baseline, BaselineEstimator
+from edge.asked import check_whole
+from edge.progress import Progress
+from edge.source import Arrival, Source
+from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
-from firmware_bridge.links.base import Link
 
 READ_TIMEOUT_S: Final = 0.1
 SILENCE_S: Final = 10.0
 
 
 def take_baselines(
-    link: Link,
+    source: Source,
     *,
-    scans: int,
+    scans: int = FEWEST_SCANS,
     skip: int = 0,
-    stop: threading.Event,
+    stop: threading.Event | None = None,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> dict[str, Baseline]:
-    """Baselines of all sensors on a link, by name; gives up at the first refusal.
+    """Baselines of all sensors of a source, by name, their pads free and still; gives up at the first refusal.
 
     Args:
-        link: open.
-        scans: complete ones to take the median of.
+        source: open; what it gives meanwhile goes nowhere else.
+        scans: complete ones to take the median of, 100 or more.
         skip: scans of each sensor to leave out first.
         stop: gives up early.
         clock_s: monotonic, in [s].
@@ -34,31 +36,41 @@ def take_baselines(
         BaselineRefusedError: a pad moved or was loaded, or the end came too soon.
         DeviceError: no scan came for a long time.
         LinkLostError: the link is gone.
+        UsageError: a number of scans that cannot be.
     """
+    check_whole("scans", scans, FEWEST_SCANS)
+    check_whole("skip", skip, 0)
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}
     heard_s = clock_s()
-    while not (baselines and baselines.keys() == skipped.keys()):
-        if stop.is_set():
-            raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
-        arrived = link.read(READ_TIMEOUT_S)
-        if arrived:
-            heard_s = clock_s()
-        elif link.ended:
-            raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor were heard")
-        elif clock_s() - heard_s > SILENCE_S:
-            raise DeviceError(f"no scan from {link.name} for {SILENCE_S:.0f} s: is the sensor powered?")
-        for scan in arrived:
-            name = scan.sensor
-            skipped[name] = skipped.get(name, -1) + 1
-            if skipped[name] < skip or name in baselines:
-                continue
-            estimator = estimators.setdefault(name, BaselineEstimator(scans))
-            try:
-                baseline = estimator.push(scan)
-            except BaselineRefusedError as refusal:
-                raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
-            if baseline is not None:
-                baselines[name] = baseline
+    with Progress("zeroing", skip + scans, "scan") as bar:
+        while not (baselines and baselines.keys() == skipped.keys()):
+            if stop is not None and stop.is_set():
+                raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
+            taken = source.take(READ_TIMEOUT_S)
+            if taken is None:
+                raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor were heard")
+            if any(isinstance(heard, Arrival) for heard in taken):
+                heard_s = clock_s()
+            elif clock_s() - heard_s > SILENCE_S:
+                raise DeviceError(f"no scan from {source.name} for {SILENCE_S:.0f} s: is the sensor powered?")
+            for heard in taken:
+                if not isinstance(heard, Arrival):
+                    if heard.kind in ("lost", "silent"):
+                        estimators.clear()  # nobody knows whether the sensor behind the gap reads as before
+                    continue
+                scan = heard.scan
+                name = scan.sensor
+                skipped[name] = skipped.get(name, -1) + 1
+                if skipped[name] < skip or name in baselines:
+                    continue
+                estimator = estimators.setdefault(name, BaselineEstimator(scans))
+                try:
+                    baseline = estimator.push(scan)
+                except BaselineRefusedError as refusal:
+                    raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
+                if baseline is not None:
+                    baselines[name] = baseline
+            bar.reach(min(skip + scans, 1 + min(skipped.values(), default=-1)))
     return baselines

@@ -1,7 +1,10 @@
 """What the runtime's tests share: a tiny real model, a sensor at rest and under load, links that are scripts."""
 
+import subprocess
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +140,19 @@ def make_scan(
     return Scan(sensor, number, time_ns, counts, fresh, renewed)
 
 
+@contextmanager
+def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subprocess.Popen]:
+    """Kills what is not over when the block is, or, so that nobody reads for ever, by then."""
+    alarm = threading.Timer(within_s, process.kill)
+    alarm.start()
+    with process:
+        try:
+            yield process
+        finally:
+            alarm.cancel()
+            process.kill()
+
+
 class FakeModel:
     """The tiny model without onnxruntime; `on_run` is called before each run."""
 
@@ -213,6 +229,7 @@ class ListSink(Sink):
         self.results = []
         self.counters = []
         self.events = []
+        self.told_counters = []
         self.waits = 0
         self.closed = False
         self._on_write = on_write
@@ -224,6 +241,7 @@ class ListSink(Sink):
 
     def tell(self, event, counters) -> None:
         self.events.append(event)
+        self.told_counters.append(dict(counters))
 
     def wait(self) -> None:
         self.waits += 1

@@ -19,7 +19,6 @@ import pytest
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 
 from edge import bundle, cli
-from edge.run import with_status
 from firmware_bridge.baseline import load_baselines, save_baselines
 from firmware_bridge.links import source
 from firmware_bridge.links.ports import Port
@@ -101,7 +100,7 @@ def test_one_tap_is_what_a_sensor_gets_unless_asked_and_the_demo_gets_four(tmp_p
 
 
 class TestHelp:
-    @pytest.mark.parametrize("command", [[], ["models"], ["baseline"], ["bench"], ["doctor"]])
+    @pytest.mark.parametrize("command", [[], ["record"], ["replay"], ["models"], ["baseline"], ["bench"], ["doctor"]])
     def test_help_fits_40_columns(self, command):
         done = run(*command, "--help", env=os.environ | {"COLUMNS": "40"})
         assert done.returncode == 0 and done.stderr == ""
@@ -139,6 +138,9 @@ class TestRefusals:
             (["baseline"], ["--out"]),
             (["baseline", "--out", "x", "--scans", "99"], ["'99' is not a whole number from 100"]),
             (["baseline", "--out", "x", "--skip", "-1"], ["--skip"]),
+            (["replay", "--view", "a.mcap"], ["'a.mcap' is no port", "write FILE or command before it"]),
+            (["--view", "demo"], ["'demo' is no port"]),
+            (["--view", "65536"], ["'65536' is no port: expected 0 to 65535"]),
             (["--source", "serial:x"], ["'serial:x'", "slcan:/dev/ttyUSB0", "replay:FILE", "demo"]),
             (["--source", "replay:none\nsuch.npz"], ["none such.npz"]),
             (["--source", "replay:none.npz"], ["none.npz", "No such file"]),
@@ -152,10 +154,19 @@ class TestRefusals:
             code = end.code
         assert_refused(subprocess.CompletedProcess(arguments, code, *capsys.readouterr()), 2, *words)
 
-    def test_thresholds_and_sinks_that_cannot_be_are_2(self, files):
-        replay = [*base_options(files), "--source", f"replay:{files}/rest.npz"]
-        assert_refused(run(*replay, "--contact-on-counts", "10"), 2, "on 10", "off 750")
-        assert_refused(run(*replay, "--sink", "csv:x"), 2, "'csv:x'", "jsonl:FILE", "npz:FILE")
+    @pytest.mark.parametrize("command", [[], ["demo"], ["record", "new"], ["replay", "none.npz"]])
+    @pytest.mark.parametrize(
+        ("wrong", "words"),
+        [
+            (["--contact-on-counts", "10"], ["on 10", "off 750"]),
+            (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "npz:FILE"]),
+            (["--sink", "ros2:4fingers"], ["'4fingers'", "no digit first"]),
+            (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
+        ],
+    )
+    def test_thresholds_and_sinks_that_cannot_be_are_2_before_anything_is_opened(self, command, wrong, words, capsys):
+        code = cli.main([*command, "--model", "none", *wrong])
+        assert_refused(subprocess.CompletedProcess(command, code, *capsys.readouterr()), 2, *words)
 
     def test_a_port_that_cannot_be_used_is_3(self, files):
         assert_refused(run(*base_options(files), "--source", "slcan:/dev/none"), 3, "/dev/none", "no such port")
@@ -303,7 +314,7 @@ class TestReplay:
         assert process.wait(TIMEOUT_S) == 0
         after = used[used.index(4) :]
         assert 1 in after and after.index(1) < 30
-        assert process.stderr is not None and "stdin: 1 lines were no command" in process.stderr.read()
+        assert process.stderr is not None and "refused: 1 lines or messages were no command" in process.stderr.read()
 
 
 class TestEnds:
@@ -430,8 +441,13 @@ class TestTerminal:
         assert live and live[-1].startswith("REPLAY | 4 contact tap 4 ") and output == ""
         assert max(map(len, live)) <= 119
 
-    def test_asked_for_it_is_there_once(self):
-        assert with_status(["status", "npz:a.npz"]) == ["status", "npz:a.npz"]
+    @pytest.mark.parametrize("words", ["--source replay:taps.npz", "replay taps.npz"])
+    def test_asked_for_it_is_there_once(self, files, tmp_path, words):
+        """Also of a file at full speed, which has a bar else."""
+        replay = words.replace("taps.npz", f"{files}/taps.npz").split(" ")
+        model = ["--model", str(files / "tiny.onnx")]
+        shown, _ = self.on_terminal(tmp_path, *replay, *model, "--sink", "status", columns=80)
+        assert len(re.findall(r"\rREPLAY [^\r\n]*\x1b\[K\r\n", shown)) == 1
 
     def test_it_gives_way_to_records_on_stdout(self, files, tmp_path):
         replay = ["--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
@@ -489,6 +505,10 @@ class TestBaseline:
 
 
 class TestDemo:
+    def test_a_demo_that_ends_before_its_first_tap_says_so(self, files, capsys):
+        assert cli.main(["demo", "--model", f"{files}/tiny.onnx", "--duration-s", "0.2"]) == 0
+        assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
+
     def test_the_demo_scores_its_taps_and_draws_the_last(self, files):
         done = run(
             "--source", "demo", "--model", files / "tiny.onnx", "--rate-hz", "300", env=os.environ | {"COLUMNS": "80"}

@@ -107,7 +107,13 @@ def test_zeroing_names_a_sensor_or_all_and_may_be_forced(pipe, line, command):
     assert lines.poll() == [command] and lines.refused == 0
 
 
-@pytest.mark.parametrize("more", [b'"sensor": 4', b'"force": 1', b'"force": "no"', b'"sensors": "4"', b'"sensor": []'])
+@pytest.mark.parametrize(
+    "more",
+    [
+        *(b'"sensor": 4', b'"force": 1', b'"force": "no"', b'"sensors": "4"', b'"sensor": []', b'"sensor": ""'),
+        *(rb'"sensor": "\ud800"', rb'"sensor": "\u001b[2J"', b'"sensor": "' + b"4" * 65 + b'"'),
+    ],
+)
 def test_a_zeroing_that_is_not_understood_is_none(pipe, more):
     """Least of all one of every sensor."""
     lines = LineCommands(pipe[0])

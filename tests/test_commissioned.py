@@ -7,18 +7,20 @@ import pytest
 from edge_samples import BASELINE, REST, FakeModel, make_scan, write_model
 from test_cli import assert_refused, records, run, write_recording
 
-from edge.commissioned import use_sensor_file
+from edge.api import Stream, open_runtime, open_source
+from edge.commissioned import references, settled
 from edge.doctor.options import doctor_parser
 from edge.errors import UsageError
-from edge.options import baseline_parser, run_parser
 from edge.runtime import Runtime
 from edge.taxels import TaxelWatch
 from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
+from firmware_bridge.links.ports import Port
 from firmware_bridge.links.source import open_sources
 from firmware_bridge.mounting import AS_MAPPED, Mounting
 from firmware_bridge.sensor_file import SensorEntry, SensorFile
 from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.xela import USPA44_MAP
 
 TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, -1))
 
@@ -30,46 +32,71 @@ def file(tmp_path):
     return tmp_path / "s.toml"
 
 
-def settled(parser, *arguments):
-    options = parser.parse_args(list(map(str, arguments)))
-    use_sensor_file(options)
-    return options
+@pytest.fixture
+def pressed(tmp_path):
+    """What replays a press of 1800 counts, recorded in place."""
+    write_recording(tmp_path / "taps.npz", [1800] * 3)
+    return f"replay:{tmp_path}/taps.npz"
 
 
-@pytest.mark.parametrize("parser", [run_parser, baseline_parser, doctor_parser])
-def test_without_a_file_everything_is_as_it_was(parser):
-    options = settled(parser(), *(["--out", "x"] if parser is baseline_parser else []))
-    assert options.model_map.name == "uSPa44" and not options.mountings and options.source == []
-    assert options.baselines is None and options.counts_per_newton is None
+def first(pressed, sensor=None, id_map=None, **settings):
+    """The first result of the press."""
+    with open_source(pressed, sensor=sensor, id_map=id_map) as source:
+        return next(iter(Stream(source, open_runtime(FakeModel(), source, **settings))))
 
 
-def test_a_file_gives_map_mounting_baseline_force_and_adapter(file):
-    options = settled(run_parser(), "--sensor", file)
-    assert options.model_map.name == "XR1944" and options.mountings["4"] == TURNED
-    assert options.baselines["4"].id == BASELINE.id and "6" not in options.baselines
-    assert options.counts_per_newton == {"4": 1180.0} and options.source == ["slcan:serial=D30BL366"]
+def test_without_a_file_everything_is_as_it_was(pressed):
+    assert open_source(pressed).sensor_file == SensorFile(USPA44_MAP.name)
+    result = first(pressed)
+    assert result.state == "zeroing" and result.note is None
 
 
-def test_a_baseline_of_another_order_is_refused(file, tmp_path):
+def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, monkeypatch):
+    adapter = Port("/dev/ttyUSB5", (0x0403, 0x6015), "D30BL366", "VScom")
+    monkeypatch.setattr("firmware_bridge.links.source.serial_ports", lambda: [adapter])
+    source = open_source(sensor=file)
+    assert source.name == "slcan:serial=D30BL366" and source.sensor_file.model_map.name == "XR1944"
+    result = first(pressed, file)
+    assert result.baseline.id == BASELINE.id and result.zeroed[2].min() == pytest.approx(-1800, abs=5)
+    assert result.force_n == pytest.approx(result.force_counts / 1180)
+
+
+def test_a_baseline_of_another_order_is_refused(file, pressed, tmp_path):
     """Each taxel would get another one's rest."""
     save_baselines(tmp_path / "wired.json", [BASELINE])
     with pytest.raises(RecordingError, match=r"wired\.json: the taxels of sensor 4 lay in another order: zero again"):
-        settled(run_parser(), "--sensor", file, "--baseline", tmp_path / "wired.json")
+        first(pressed, file, baselines=tmp_path / "wired.json")
     save_baselines(tmp_path / "placed.json", [BASELINE], {"4": TURNED.order})
-    assert settled(run_parser(), "--sensor", file, "--baseline", tmp_path / "placed.json").baselines
+    assert first(pressed, file, baselines=tmp_path / "placed.json").baseline
     with pytest.raises(RecordingError, match="another order"):
-        settled(run_parser(), "--baseline", tmp_path / "placed.json")
+        first(pressed, baselines=tmp_path / "placed.json")
 
 
-def test_what_is_typed_goes_before_the_file_but_for_another_id_map(file, tmp_path):
+def test_what_is_asked_for_goes_before_the_file_but_for_another_id_map(file, pressed, tmp_path):
     newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
     save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
-    typed = ("--baseline", tmp_path / "zero.json", "--counts-per-newton", 900, "--source", "slcan:/dev/ttyUSB3")
-    options = settled(run_parser(), "--sensor", file, "--id-map", "XR1944", *typed)
-    assert options.baselines["4"].id == newer.id and options.counts_per_newton == 900
-    assert options.source == ["slcan:/dev/ttyUSB3"]
-    with pytest.raises(UsageError, match=r"--id-map A, but .*s\.toml is of a XR1944"):
-        settled(run_parser(), "--sensor", file, "--id-map", "A")
+    result = first(pressed, file, "XR1944", baselines=tmp_path / "zero.json", counts_per_newton=900)
+    assert result.baseline.id == newer.id and result.force_n == pytest.approx(result.force_counts / 900)
+    assert first(pressed, file, baselines={"4": newer}).baseline.id == newer.id
+    assert first(pressed, file, baselines={}).state == "zeroing"
+    assert open_source(pressed, sensor=file).name.endswith("taps.npz")
+    with pytest.raises(UsageError, match=r"id map A, but .*s\.toml is of a XR1944"):
+        open_source(pressed, sensor=file, id_map="A")
+    with pytest.raises(UsageError, match=r"id map is 'C', expected one of: uSPa44, "):
+        open_source(pressed, id_map="C")
+
+
+@pytest.mark.parametrize("command", [[], ["baseline", "--out", "x"], ["doctor"]])
+def test_every_command_goes_by_the_file(command, file):
+    assert_refused(run(*command, "--sensor", file, "--id-map", "A"), 2, "is of a XR1944")
+
+
+def test_the_doctor_compares_with_the_baseline_of_the_file_or_with_a_newer_one(file, tmp_path):
+    newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
+    save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
+    for arguments, expected in (([], BASELINE), (["--baseline", str(tmp_path / "zero.json")], newer)):
+        options = doctor_parser().parse_args(["--sensor", str(file), *arguments])
+        assert references(options.baseline, settled(options.sensor, None))["4"].id == expected.id
 
 
 def test_a_file_that_cannot_be_used_is_2(tmp_path):
@@ -77,7 +104,7 @@ def test_a_file_that_cannot_be_used_is_2(tmp_path):
     done = run("--sensor", tmp_path / "s.toml", "--source", "demo")
     assert_refused(done, 2, "'format': 1, expected 'tactile-sensor'")
     with pytest.raises(SensorFileError):
-        settled(doctor_parser(), "--sensor", tmp_path / "none.toml")
+        open_source("demo", sensor=tmp_path / "none.toml")
 
 
 def turned_rest():

@@ -2,11 +2,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_contract, make_scan
 
+from edge import cli, run
+from edge.bundle import demo_recording
 from edge.demo import DemoScore, score_picture, score_table
+from edge.errors import UsageError
 from edge.metrics import psnr_db, rmse_percent, ssim
 from edge.runtime import Runtime
+from edge.source import Source
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ScanSeries
 
@@ -74,6 +78,21 @@ def test_a_tap_without_any_pattern_has_no_score(recording):
     assert play(recording, lost=range(9)).scores() == []
 
 
+def test_when_the_last_tap_is_over_it_says_so_once_and_a_second_pass_changes_nothing(recording):
+    told = []
+    score = DemoScore(
+        recording, make_contract(), lambda score: told.append([one.result.scan.number for one in score.scores()])
+    )
+    runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
+    series = ScanSeries("4", USPA44)
+    with np.load(recording) as data:
+        for index, counts in enumerate([*data["counts"]] * 2):
+            assert score.complete == (index >= len(PRESSES))
+            score.write(runtime.push(series.close(counts.copy(), index * 10_000_000)), {})
+    assert told == [[3, 7]]
+    assert [one.result.scan.number for one in score.scores()] == [3, 7]
+
+
 def test_rest_and_foreign_scans_are_not_scored(recording):
     score = DemoScore(recording, make_contract())
     runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
@@ -106,3 +125,45 @@ def test_the_picture_shows_taxels_result_and_truth_on_their_scales(recording):
     assert louder.splitlines()[-1].count(f" {score.truth.max() * 100:.3g} mm") == 2
     taxels_z = score.result.scan.counts[2] - REST[2]
     assert f" {taxels_z.max():.0f} counts" in scale
+
+
+def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(monkeypatch, capfd):
+    """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
+    with np.load(demo_recording()) as demo:
+        tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
+    series, sink = ScanSeries("4", USPA44), ListSink()
+    link = FakeLink([[series.close(one, n * 10_000_000)] for n, one in enumerate([*counts, *counts])], kind="emulated")
+    link.patient = True
+    monkeypatch.setattr(cli, "_open_source", lambda options, give_up_s: Source(link))
+    monkeypatch.setattr(run, "open_sink", lambda text, **facts: sink)
+    assert cli.main(["--source", "demo:loop", "--sink", "status"]) == 0
+    out, err = capfd.readouterr()
+    assert out.count("4 of 4 taps scored") == 1 and err.count("goes on until Ctrl-C") == 1
+    used: dict[tuple[int, int], set[int]] = {}
+    for result in sink.results:
+        if result.pattern is not None:
+            again, frame = divmod(result.scan.number, len(tap_of))
+            used.setdefault((again, int(tap_of[frame])), set()).add(result.taps_used)
+    assert max(used[0, 3]) > 1 and used[1, 0] == {1}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "terminal", "source"),
+    [(["--view"], True, "demo:loop"), (["--view"], False, "demo"), ([], True, "demo")],
+)
+def test_only_who_looks_at_the_page_from_a_terminal_gets_a_demo_without_end(monkeypatch, arguments, terminal, source):
+    class AskedError(UsageError):
+        pass
+
+    def ask(options, give_up_s):
+        raise AskedError(*options.source)
+
+    monkeypatch.setattr(cli, "_open_source", ask)
+    monkeypatch.setattr(cli.sys.stdout, "isatty", lambda: terminal)
+    monkeypatch.setattr(cli, "_exit_code", lambda error: str(error))
+    assert cli.main(["demo", *arguments]) == source
+
+
+def test_the_demo_takes_no_other_source(capsys):
+    assert cli.main(["demo", "--source", "gs_usb"]) == 2
+    assert "leave out --source gs_usb" in capsys.readouterr().err

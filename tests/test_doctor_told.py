@@ -8,8 +8,7 @@ import pytest
 from doctor_samples import as_scans, healthy_counts
 from edge_samples import FakeLink
 
-from edge.commissioned import use_sensor_file
-from edge.doctor import command
+from edge.doctor import command, watch
 from edge.doctor.findings import Finding, summary
 from edge.doctor.options import doctor_parser
 from firmware_bridge.errors import SensorFileError
@@ -23,9 +22,10 @@ WELL = as_scans(healthy_counts(200))
 def told(*arguments, link=None, out=None):
     """The exit code, and what the doctor printed of a link that is well."""
     options = doctor_parser().parse_args(["--no-press", *map(str, arguments)])
-    use_sensor_file(options)
     out = io.StringIO() if out is None else out
-    return command.run(options, link or (lambda _: FakeLink([WELL], kind="replay")), out, io.StringIO()), out.getvalue()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watch, "link_to", lambda *_, **__: FakeLink([WELL], kind="replay") if link is None else link())
+        return command.run(options, out, io.StringIO()), out.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def stopping(monkeypatch):
             return self._context.__exit__(*exc_info)
 
     monkeypatch.setattr(command, "stop_on_signals", Kept)
-    return lambda _: StoppedLink(stops[-1])
+    return lambda: StoppedLink(stops[-1])
 
 
 def test_a_stopped_look_says_so(stopping):
@@ -88,7 +88,7 @@ def test_a_stopped_look_says_so(stopping):
 
 @pytest.mark.parametrize("name", ["no/such/s.toml", "", "/proc/s.toml"])
 def test_a_file_that_cannot_be_written_is_refused_before_anything_is_opened(tmp_path, name):
-    def open_link(_):
+    def open_link():
         raise AssertionError("opened")
 
     with pytest.raises(SensorFileError, match=r"cannot be written: .*: give --out a file"):
@@ -101,7 +101,7 @@ def test_what_was_found_is_told_though_the_file_cannot_be_written_any_more(tmp_p
     folder.mkdir()
     out = io.StringIO()
 
-    def open_link(_):
+    def open_link():
         folder.rmdir()
         return FakeLink([WELL], kind="replay")
 
@@ -120,6 +120,6 @@ def test_a_load_is_told_by_the_z_of_the_sensor_file(tmp_path):
     for sign, remedy in ((1, "the baseline was taken of a loaded pad"), (-1, "something presses: free the pad")):
         sensors = {"4": SensorEntry(Mounting(signs=(1, 1, sign)), None, baseline)}
         save_sensor_file(path, SensorFile("uSPa44", sensors=sensors))
-        _, document = told("--json", "--sensor", path, link=lambda _: FakeLink([as_scans(pressed)], kind="replay"))
+        _, document = told("--json", "--sensor", path, link=lambda: FakeLink([as_scans(pressed)], kind="replay"))
         load = next(one for one in json.loads(document)["findings"] if one["name"] == "load")
         assert load["verdict"] == "wrong" and load["remedy"].startswith(remedy)

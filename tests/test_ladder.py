@@ -284,7 +284,7 @@ class TestCommandLine:
             assert done.returncode == 0 and done.stderr.startswith(words), done.stderr
             got = [json.loads(line) for line in done.stdout.splitlines()]
             assert len(got) == 20 and {record["model"] for record in got} == {model}
-            assert got[0]["event"].startswith(f"budget {budget} us: ") and got[0]["event"] in done.stderr
+            assert got[0]["event"].startswith(f"budget {budget} us: ") and done.stderr.count(got[0]["event"]) == 1
             assert {record["event"] for record in got[1:]} == {None}
 
     def test_what_is_not_known_is_measured_and_a_cache_that_cannot_be_is_one_line(self, rest, tmp_path):

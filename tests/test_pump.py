@@ -1,3 +1,4 @@
+import contextlib
 import itertools
 import threading
 import time
@@ -8,8 +9,8 @@ from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_sca
 from edge.commands import RESET
 from edge.errors import SinkClosedError
 from edge.pump import pump
-from edge.reader import ScanReader
 from edge.runtime import Runtime
+from edge.source import CAPACITY_SCANS, Source
 from edge.statistics import Statistics
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import LinkLostError
@@ -26,7 +27,9 @@ def run(link, *sinks, model=None, statistics=None, **settings):
     runtime = settings.pop("runtime", None) or Runtime(model or FakeModel(), source=link.kind, baselines=BASELINES)
     settings.setdefault("stop", threading.Event())
     statistics = statistics or Statistics()
-    pump(link, runtime, sinks, statistics, **settings)
+    capacity_scans, rate_hz = settings.pop("capacity_scans", CAPACITY_SCANS), settings.pop("rate_hz", None)
+    with Source(link, capacity_scans, rate_hz=rate_hz) as source:
+        pump(source, runtime, sinks, statistics, **settings)
     return statistics
 
 
@@ -160,6 +163,22 @@ def test_records_carry_the_links_counters_as_they_were():
     assert [counters["scans"] for counters in sink.counters] == [1, 3, 3]
 
 
+@pytest.mark.parametrize("error", [None, LinkLostError("gone")])
+def test_a_record_tells_what_was_left_out_before_it_and_the_run_all_of_it(error):
+    class Slow(ListSink):
+        unwritten = 0
+
+        def write(self, result, counters):
+            super().write(result, counters)
+            self.unwritten += 1
+
+    sink, statistics = Slow(), Statistics()
+    with contextlib.suppress(LinkLostError):
+        run(FakeLink([scans([0]), scans([1, 2])], error=error), sink, statistics=statistics)
+    assert [counters["unwritten"] for counters in sink.counters] == [0, 1, 2]
+    assert statistics.unwritten == 3
+
+
 class Script:
     """Commands that come before the given polls."""
 
@@ -182,7 +201,7 @@ def test_a_reset_command_resets_the_runtime():
 
 
 def test_reader_takes_all_that_waits_and_says_when_it_is_through():
-    with ScanReader(FakeLink([scans([0]), scans([1, 2])])) as reader:
+    with Source(FakeLink([scans([0]), scans([1, 2])])) as reader:
         taken = []
         while (arrivals := reader.take(10)) is not None:
             taken += [arrival.scan.number for arrival in arrivals]
@@ -193,14 +212,14 @@ def test_reader_takes_all_that_waits_and_says_when_it_is_through():
 def test_a_scan_wakes_who_waits_for_it():
     gate = threading.Event()
     link = FakeLink([gate, scans([0])], endless=True)
-    with ScanReader(link) as reader:
+    with Source(link) as reader:
         threading.Timer(0.1, gate.set).start()
         assert reader.take(10) != []
         assert link.reads < 100, "it slept through some thousand more reads"
 
 
 def test_reader_gives_nothing_after_the_timeout():
-    with ScanReader(FakeLink([], endless=True)) as reader:
+    with Source(FakeLink([], endless=True)) as reader:
         assert reader.take(0.01) == []
 
 
@@ -229,13 +248,15 @@ def test_what_a_link_tells_reaches_runtime_and_sinks_in_its_place(kind):
     assert statistics.events == {kind: 1}
 
 
-def test_a_notice_is_not_thrown_away_with_scans_that_nobody_took():
-    link = Telling([[scan] for scan in scans(range(9))], 1, "lost")
-    with ScanReader(link, capacity_scans=4) as reader:
+@pytest.mark.parametrize("at", [1, 5, 9])
+def test_a_notice_keeps_its_place_where_scans_are_thrown_away_that_nobody_took(at):
+    link = Telling([[scan] for scan in scans(range(9))], at, "lost")
+    with Source(link, capacity_scans=4) as reader:
         while not link.ended:
             time.sleep(0.001)
         taken = []
         while (some := reader.take(10)) is not None:
             taken += some
-    assert [heard.kind for heard in taken if isinstance(heard, Notice)] == ["lost"]
+    numbers = ["lost" if isinstance(heard, Notice) else heard.scan.number for heard in taken]
+    assert numbers == {1: ["lost", 6, 7, 8], 5: ["lost", 5, 6, 7, 8], 9: [5, 6, 7, "lost", 8]}[at]
     assert reader.overruns + len(taken) - 1 == 9

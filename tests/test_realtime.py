@@ -14,22 +14,44 @@ linux_only = pytest.mark.skipif(sys.platform != "linux", reason="these calls are
 
 SCRIPT = """
 import os, threading
+import sys, tempfile
+from functools import partial
 from pathlib import Path
+sys.path.insert(0, "tests")
+from edge_samples import make_contract
+from edge.mcap_file import McapFile
 from edge.realtime import realtime
+from edge.sinks.forms import open_sink
+from edge.view.recorder import Recorder
 
 def state():
     locked = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if line[:6] == "VmLck:"]
-    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+    policy, priority = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(0).sched_priority
     return policy, priority, sorted(os.sched_getaffinity(0)), locked != ["0"]
 
-told = []
+told, thread = [], []
 before = state()
-with realtime(told.append):
-    within, thread = state(), []
-    reader = threading.Thread(target=lambda: thread.append(state()))
-    reader.start()
-    reader.join()
-print([before, within, thread[0], state(), told])
+asked, other = threading.Event(), threading.Event()
+started = threading.Thread(target=lambda: (asked.wait(), thread.append(state())))
+bystander = threading.Thread(target=lambda: (other.wait(), thread.append(state())))
+started.start(), bystander.start()
+folder = Path(tempfile.mkdtemp())
+recorder = Recorder(folder, lambda event: None)
+recorder.open_sink = partial(open_sink, contract=make_contract())
+writing, put = [], McapFile._put
+McapFile._put = lambda file, data: (writing.append(state()), put(file, data))
+with realtime(told.append, [started.native_id]):
+    within = state()
+    begun = threading.Thread(target=lambda: writing.append((*state()[:2], before[2])))  # by whatever the loop calls
+    begun.start()
+    begun.join()
+    recorder.record(True)
+    recorder.close()
+    asked.set()
+    started.join()
+    other.set()
+    bystander.join()
+print([before, within, thread, state(), told, writing])
 """
 
 
@@ -43,8 +65,10 @@ def test_what_is_permitted_is_had_by_every_thread_and_given_back():
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    before, within, thread, after, told = eval(done.stdout)
-    assert before == after and within == thread
+    before, within, thread, after, told, writing = eval(done.stdout)
+    assert before == after and within == thread[0]
+    assert thread[1][:3] == before[:3], "a thread that was not named stays as it was"
+    assert len(writing) > 1 and all(state[:3] == before[:3] for state in writing), "a recording has no part in it"
     refused = " ".join(told)
     if "SCHED_FIFO" not in refused:
         assert within[:2] == (os.SCHED_FIFO, PRIORITY)
@@ -89,7 +113,7 @@ def test_the_only_processor_is_not_pinned(monkeypatch):
     calls = []
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: calls.append(cpus))
-    module._pin()
+    module._pin((0,))
     assert calls == []
 
 

@@ -87,7 +87,7 @@ def test_summary_tells_all_of_it():
         "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
         f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
         "events: lost 2, back 1",
-        "stdin: 2 lines were no command",
+        "refused: 2 lines or messages were no command",
     ]
 
 

@@ -4,32 +4,32 @@ import numpy as np
 import pytest
 from edge_samples import REST, FakeLink, make_scan
 
+from edge.source import Arrival, Source
 from edge.zeroing import take_baselines
 from firmware_bridge.errors import BaselineRefusedError, DeviceError, LinkLostError
+from firmware_bridge.links.base import Notice
 
 
 def rest_scans(count, *sensors, start=0):
     return [[make_scan(n, sensor=sensor, noise=3) for sensor in sensors or ("4",)] for n in range(start, start + count)]
 
 
-def take(link, scans=100, **settings):
-    settings.setdefault("stop", threading.Event())
-    return take_baselines(link, scans=scans, **settings)
+def take(link, **settings):
+    with Source(link) as source:
+        return take_baselines(source, **settings)
 
 
-def test_every_sensor_heard_gets_its_baseline_and_no_more_is_read():
-    link = FakeLink(rest_scans(150, "4", "6"), endless=True)
-    baselines = take(link)
+def test_every_sensor_heard_gets_its_baseline():
+    baselines = take(FakeLink(rest_scans(150, "4", "6"), endless=True))
     assert sorted(baselines) == ["4", "6"]
     assert np.abs(baselines["6"].counts - REST).max() <= 2 and baselines["6"].sensor == "6"
-    assert link.reads == 100
+    assert baselines["6"].scans == 100
 
 
 def test_the_first_scans_can_be_left_out():
     touched = [[make_scan(n, press_counts=5000)] for n in range(20)]
     link = FakeLink(touched + rest_scans(120, start=20), endless=True)
     assert np.abs(take(link, skip=20)["4"].counts - REST).max() <= 2
-    assert link.reads == 120
 
 
 def test_a_refusal_names_the_sensor():
@@ -44,10 +44,19 @@ def test_a_source_that_ends_too_soon_is_told():
 
 
 def test_silence_is_told_and_measured_from_the_last_scan():
-    link = FakeLink(rest_scans(30), endless=True)
+    class Script:
+        """Gives 30 scans, then nothing; every take takes a second."""
+
+        name, taken = "fake", 0
+
+        def take(self, timeout_s):
+            self.taken += 1
+            return [Arrival(make_scan(self.taken, noise=3), {})] if self.taken <= 30 else []
+
+    source = Script()
     with pytest.raises(DeviceError, match=r"no scan from fake for 10 s"):
-        take(link, clock_s=lambda: float(link.reads))
-    assert link.reads == 30 + 11
+        take_baselines(source, clock_s=lambda: float(source.taken))
+    assert source.taken == 30 + 11
 
 
 def test_a_sensor_that_is_done_may_move_while_another_is_not():
@@ -58,15 +67,27 @@ def test_a_sensor_that_is_done_may_move_while_another_is_not():
         ]
         for n in range(300)
     ]
-    link = FakeLink(scans)
-    baselines = take(link)
-    assert sorted(baselines) == ["4", "6"] and link.reads == 250
+    baselines = take(FakeLink(scans))
+    assert sorted(baselines) == ["4", "6"]
     assert np.abs(baselines["4"].counts - REST).max() <= 2
 
 
 def test_a_lost_link_is_told():
     with pytest.raises(LinkLostError):
         take(FakeLink(rest_scans(5), error=LinkLostError("gone")))
+
+
+def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it():
+    """Powered anew, a sensor rests elsewhere: half of each would be nobody's rest."""
+
+    class Lost(FakeLink):
+        def notices(self):
+            return [Notice(0, "lost", "fake", "gone")] if self.reads == 90 else []
+
+    before = [[make_scan(n, press_counts=9)] for n in range(89)]
+    assert np.abs(take(Lost(before + rest_scans(100, start=89)))["4"].counts - REST).max() <= 2
+    with pytest.raises(BaselineRefusedError, match="ended before 100"):
+        take(Lost(rest_scans(188)))
 
 
 def test_stopped_half_way_it_keeps_nothing():

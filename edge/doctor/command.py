@@ -6,15 +6,15 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
+from edge.commissioned import references, settled
 from edge.doctor.examine import examine
 from edge.doctor.findings import Finding, page, summary, worst
-from edge.doctor.heard import HeardIds
 from edge.doctor.keep import check_writable, keep
 from edge.doctor.visit import Visit
+from edge.doctor.watch import Watch
 from edge.signals import stop_on_signals
 from edge.wrapping import columns, wrapped
 from firmware_bridge.errors import LinkLostError, SensorFileError
-from firmware_bridge.links.base import Link
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.sensor_file import SensorFile
 
@@ -24,7 +24,6 @@ EXIT_STOPPED: Final = 130
 
 def run(
     options: argparse.Namespace,
-    open_link: Callable[[argparse.Namespace], Link],
     out: TextIO,
     err: TextIO,
     *,
@@ -34,8 +33,7 @@ def run(
     """Do what `edge-sr doctor` is asked for; returns the exit code.
 
     Args:
-        options: of edge.doctor.options.doctor_parser, through edge.commissioned.use_sensor_file.
-        open_link: the link that options ask for, not yet entered.
+        options: of edge.doctor.options.doctor_parser.
         out: for the findings.
         err: for what is asked of a person; no press is asked for where it is no terminal.
         clock_s: the clock of the scans, monotonic, in [s].
@@ -44,28 +42,31 @@ def run(
     Raises:
         LinkLostError: after what was found until then was told.
         BridgeError: of the source.
-        SensorFileError: the sensor file cannot be written; if that turns out at the end, after what was found was told.
+        RecordingError: the baseline file cannot be used, or is of another order.
+        UsageError: several sources; the sensor file is for another id map than was asked for.
+        SensorFileError: the sensor file cannot be used; or not written, and if that turns out at the end, after what
+            was found was told.
     """
     if options.out is not None:
         check_writable(options.out)
-    heard = HeardIds(options.model_map.taxels)
-    options.model_map = heard.listening(options.model_map)
+    known = settled(options.sensor, options.id_map)
+    before = references(options.baseline, known)
     with stop_on_signals() as stop:
-        link = open_link(options)
-        visit = Visit(options, err, stop, clock_s)
+        watch = Watch(options.source, known, references=before, rate_hz=options.rate_hz, stop=stop, clock_s=clock_s)
+        visit = Visit(options, watch, err, stop, clock_s)
         start_s = clock_s()
         lost = None
-        with link:
+        with watch.link:
             try:
-                watched = visit.watch(link, heard)
+                visit.watch()
             except LinkLostError as error:
                 lost = error
-                watched = visit.watched(link, heard)
+            watched = watch.watched()
             examined = examine(watched, unix_time_s())
             mountings: dict[str, Mounting] = {}
             if lost is None and not stop.is_set():
                 try:
-                    mountings = visit.press(link, examined)
+                    mountings = visit.press(examined)
                 except LinkLostError as error:
                     lost = error
         if lost is not None:
@@ -73,11 +74,11 @@ def run(
         kept = unwritten = None
         if options.out is not None and lost is None and not stop.is_set():
             try:
-                kept = keep(options.out, options.sensor_file, visit.port, examined.baselines, mountings, visit.newtons)
+                kept = keep(options.out, known, watched.facts.port, examined.baselines, mountings, visit.newtons)
             except SensorFileError as error:
                 unwritten = error
         stopped_s = clock_s() - start_s if stop.is_set() else None
-        _tell(options, link, visit.duration_s, stopped_s, examined.findings, kept, out)
+        _tell(options, watch, stopped_s, examined.findings, kept, out)
         if lost is not None:
             raise lost
         if unwritten is not None:
@@ -89,19 +90,19 @@ def run(
 
 def _tell(
     options: argparse.Namespace,
-    link: Link,
-    duration_s: float,
+    watch: Watch,
     stopped_s: float | None,
     findings: list[Finding],
     kept: SensorFile | None,
     out: TextIO,
 ) -> None:
+    link = watch.link
     if options.json:
         document = {
             "source": link.name,
             "kind": link.kind,
-            "id_map": options.model_map.name,
-            "duration_s": round(duration_s, 3),
+            "id_map": watch.known.model,
+            "duration_s": round(watch.duration_s, 3),
             "stopped": stopped_s is not None,
             "verdict": worst(findings),
             "findings": [finding.document() for finding in findings],

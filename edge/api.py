@@ -1,0 +1,375 @@
+"""The runtime as a library: open a source, make a runtime, iterate over results.
+
+    with open_source("slcan:serial=D30BL366") as source:
+        for result in Stream(source, open_runtime("stsr-int8", source)):
+            print(result.force_counts)
+
+A source reads in a thread of its own; everything else happens in the thread that iterates, which is the one to make the
+runtime in. Whatever is wrong with what was asked for is a BridgeError or an EdgeError with one clear line.
+
+`edge-sr` opens, runs, records, replays and zeroes with nothing else. Its doctor watches and judges as `examine` does,
+and asks a person for presses beside; its bench and its live page look inside.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edge.asked import check_positive, check_whole
+from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
+from edge.commands import Command, Commands
+from edge.commissioned import link_to, references, settled, with_recorded
+from edge.contract import Contract
+from edge.errors import (
+    EdgeError,
+    MessageError,
+    ModelError,
+    SinkClosedError,
+    SinkError,
+    UsageError,
+    WindowError,
+)
+from edge.estimate import load_estimator
+from edge.event import Event
+from edge.pump import pump
+from edge.result import Result
+from edge.runtime import Model, Runtime
+from edge.sinks import forms
+from edge.sinks.base import Sink
+from edge.sinks.fan import Fan
+from edge.source import Source
+from edge.statistics import Statistics
+from edge.stream import Stream
+from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
+from edge.zeroing import take_baselines
+from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
+from firmware_bridge.errors import (
+    BaselineRefusedError,
+    BridgeError,
+    DeviceError,
+    LinkLostError,
+    NoDeviceError,
+    RecordingError,
+    SensorFileError,
+    SourceError,
+)
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.source import DEMO_LOOP
+from firmware_bridge.scan import Scan
+from firmware_bridge.sensor_file import SensorFile, load_sensor_file
+from firmware_bridge.xela import ID_MAPS
+
+if TYPE_CHECKING:
+    from edge.doctor.findings import Finding
+    from edge.ladder import Ladder
+    from edge.session import ModelSession
+    from firmware_bridge.links.devices import Found
+
+# What only some need, onnxruntime before all, is imported where it is needed: start-up time and memory are promises.
+
+__all__ = [
+    "DEFAULT_MODEL",
+    "DEMO_LOOP",
+    "DEMO_MODEL",
+    "ID_MAPS",
+    "Baseline",
+    "BaselineRefusedError",
+    "BridgeError",
+    "Command",
+    "Commands",
+    "Contract",
+    "DeviceError",
+    "EdgeError",
+    "Event",
+    "Fan",
+    "LinkLostError",
+    "MessageError",
+    "Model",
+    "ModelError",
+    "NoDeviceError",
+    "RecordingError",
+    "Result",
+    "Runtime",
+    "Scan",
+    "SensorFile",
+    "SensorFileError",
+    "Sink",
+    "SinkClosedError",
+    "SinkError",
+    "Source",
+    "SourceError",
+    "SourceKind",
+    "Statistics",
+    "Stream",
+    "UsageError",
+    "WindowError",
+    "bundled_models",
+    "demo_recording",
+    "devices",
+    "examine",
+    "load_baselines",
+    "load_model",
+    "load_sensor_file",
+    "open_ladder",
+    "open_recording",
+    "open_runtime",
+    "open_sink",
+    "open_source",
+    "pump",
+    "save_baselines",
+    "take_baselines",
+]
+
+
+def open_source(
+    *texts: str,
+    sensor: str | Path | None = None,
+    id_map: str | None = None,
+    rate_hz: float | None = None,
+    give_up_s: float = math.inf,
+) -> Source:
+    """A source of scans, opened and closed by a with statement; what is lost meanwhile is opened again.
+
+    Args:
+        texts: what `edge-sr --source` takes: "slcan:serial=D30BL366", "replay:FILE", "demo", ...; several with names,
+            "left=slcan:...". Without any, the adapter of the sensor file, or the one that is plugged in.
+        sensor: file that `edge-sr doctor` wrote. How its sensors sit, their baselines and their counts per newton hold
+            for every runtime of this source; it goes before what a recording tells.
+        id_map: which CAN id is which taxel, one of ID_MAPS.
+        rate_hz: plays a recording at this rate; of a device, what its patterns' deadlines are by, in [Hz].
+        give_up_s: how long a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
+
+    Raises:
+        SourceError: no such form, one name twice, or sources of several kinds.
+        NoDeviceError: no adapter, or several, and none was named.
+        RecordingError: a recording that cannot be used.
+        SensorFileError: a sensor file that cannot be used.
+        UsageError: no such id map, or it is not that of the sensor file; a rate or a time that cannot be; a source
+            that is no text.
+    """
+    if rate_hz is not None:
+        check_positive("rate_hz", rate_hz)
+    if not give_up_s >= 0:
+        raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
+    known = settled(sensor, id_map)
+    link = link_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
+    return Source(link, sensor_file=with_recorded(known, link), rate_hz=rate_hz)
+
+
+def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
+    """A model ready to run, and what it is for, its contract; do it in the thread that is to run it.
+
+    Args:
+        model: a file, or the name of a bundled one.
+        threads: that share the work of one run.
+
+    Raises:
+        ModelError: no such model, or one that cannot be used; the bundled ones, or what is wrong, are named.
+        UsageError: a number of threads that cannot be.
+    """
+    check_whole("threads", threads, 1)
+    from edge.session import ModelSession
+
+    return ModelSession(find_model(model), threads)
+
+
+def open_runtime(
+    model: str | Path | Model,
+    source: Source,
+    *,
+    baselines: Mapping[str, Baseline] | str | Path | None = None,
+    counts_per_newton: float | Mapping[str, float] | None = None,
+    contact_on_counts: float = ON_COUNTS,
+    contact_off_counts: float = OFF_COUNTS,
+    idle_reset_s: float = IDLE_TIMEOUT_S,
+    every_scan: bool = False,
+    every_tap: bool = False,
+    follow_drift: bool = True,
+    most_taps: int = 1,
+) -> Runtime:
+    """What makes results of a source's scans; its defaults are those of `edge-sr`.
+
+    Args:
+        model: name of a bundled one, a file, or one that `load_model` gave.
+        source: open.
+        baselines: stored ones, or their file; they go before those of the source's sensor file. A sensor without one is
+            zeroed from its first 100 scans, its pad still and free meanwhile.
+        counts_per_newton: summed z per [N], of all sensors or by name; by default as the sensor file says. A name that
+            is never heard is told as an event.
+        contact_on_counts: summed z at which a tap begins.
+        contact_off_counts: summed z at which it ends.
+        idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
+        every_scan: infer also where nothing has changed since the pattern before.
+        every_tap: use also taps that are not expected to help.
+        follow_drift: let the rest level follow what a free pad reads.
+        most_taps: taps to remember for a model that may take over.
+
+    Raises:
+        ModelError: no such model, one that cannot be used, or of another sensor.
+        RecordingError: the baseline file cannot be used, or is of another order than the sensor file's.
+        UsageError: the source is not open; a baseline of another grid; a number that cannot be.
+    """
+    kind, known = source.kind, source.sensor_file
+    return Runtime(
+        load_model(model) if isinstance(model, (str, Path)) else model,
+        source=kind,
+        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)),
+        baselines=references(baselines, known),
+        counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
+        mountings=known.mountings,
+        on_counts=contact_on_counts,
+        off_counts=contact_off_counts,
+        idle_timeout_s=idle_reset_s,
+        reuse=not every_scan,
+        every_tap=every_tap,
+        follow_drift=follow_drift,
+        most_taps=most_taps,
+        unix_time_s=source.unix_time_s,
+    )
+
+
+def open_recording(
+    path: str | Path,
+    *,
+    sensor: str | Path | None = None,
+    zero: bool = False,
+    paced: bool = False,
+    rate_hz: float | None = None,
+) -> Source:
+    """A recording as a source, to make its results anew: `edge-sr replay`.
+
+    Every scan gets its result however slow the loop is, of the time when it was made. What was in use then is known of
+    its sensors: how they sat, and their baselines.
+
+    Args:
+        path: .mcap, .npz or .csv.
+        sensor: file that `edge-sr doctor` wrote, instead of what was recorded.
+        zero: zero from the first 100 scans, instead of the baselines of then.
+        paced: at the speed it was made, as if it were now; a loop that is too slow loses scans, as with a sensor.
+        rate_hz: scans a second of each sensor, in [Hz]: where the file does not tell, or to play it faster or slower.
+
+    Raises:
+        RecordingError: the recording cannot be used.
+        SourceError: its rate is not known, or cannot be.
+        SensorFileError: the sensor file cannot be used.
+    """
+    from edge import recordings
+
+    return recordings.open_recording(path, sensor=sensor, zero=zero, paced=paced, rate_hz=rate_hz)
+
+
+def open_sink(text: str, contract: Contract, source: Source) -> Sink:
+    """Where results go, as `edge-sr --sink` names it; close it when the last is written.
+
+    Args:
+        text: "jsonl:FILE", "npz:FILE.npz", "mcap:FILE.mcap", ...
+        contract: of the model that makes the results.
+        source: open. Of a sensor, records are left out for readers that are too slow; of a recording none is.
+
+    Raises:
+        UsageError: no such form; the forms are listed. Or the source is not open.
+        SinkError: it cannot be opened.
+    """
+    return forms.open_sink(
+        text,
+        contract,
+        patient=source.kind == "replay",
+        mountings=source.sensor_file.mountings,
+        unix_offset_ns=source.unix_offset_ns,
+        source=source.kind,
+        origin=source.origin,
+    )
+
+
+def open_ladder(
+    model: str | Path,
+    budget_us: float,
+    *,
+    rate_hz: float | None = None,
+    recalibrate: bool = False,
+    stop: threading.Event | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> "Ladder | None":
+    """Models that take turns, so that a pattern is made within a budget: `edge-sr --budget-us`.
+
+    Run times are measured here and kept for later starts. Make the runtime of `ladder.model` with `ladder.most_taps`,
+    and give every result to `ladder.steps(runtime)`.
+
+    Args:
+        model: the best that may be used: a file, or the name of a bundled one.
+        budget_us: longest run time of a pattern, in [us].
+        rate_hz: of the sensor, in [Hz]; 100 unless given.
+        recalibrate: measure anew what is kept.
+        stop: gives up early.
+        tell: hears, a line each, what is done, what is wrong and what was chosen.
+
+    Returns:
+        The ladder, or None if it was stopped.
+
+    Raises:
+        ModelError: the model cannot be used, or does not tell its error.
+        UsageError: a budget or a rate that cannot be.
+    """
+    check_positive("budget_us", budget_us)
+    if rate_hz is not None:
+        check_positive("rate_hz", rate_hz)
+    from edge import ladder
+    from edge.calibration_cache import cache_path
+
+    return ladder.open_ladder(
+        find_model(model),
+        budget_us,
+        rate_hz=ladder.USUAL_RATE_HZ if rate_hz is None else rate_hz,
+        cache=cache_path(),
+        recalibrate=recalibrate,
+        stop=threading.Event() if stop is None else stop,
+        tell=tell,
+    )
+
+
+def devices() -> "tuple[list[Found], list[str]]":
+    """What is plugged in and what is in its way; and what could not be looked at, and why. Opens nothing."""
+    from firmware_bridge.links import devices
+
+    return devices.devices()
+
+
+def examine(
+    *texts: str,
+    sensor: str | Path | None = None,
+    id_map: str | None = None,
+    rate_hz: float | None = None,
+    baselines: Mapping[str, Baseline] | str | Path | None = None,
+    duration_s: float = 60.0,
+    stop: threading.Event | None = None,
+) -> "list[Finding]":
+    """Watch free, still pads and say what is wrong with sensor and adapter, as `edge-sr doctor` does without a person.
+
+    Args:
+        texts: as of `open_source`, but one at most; nothing else may read it meanwhile.
+        sensor: as of `open_source`.
+        id_map: as of `open_source`.
+        rate_hz: to be expected of each sensor, in [Hz].
+        baselines: of the free pads, or their file; by default those of the sensor file.
+        duration_s: how long to watch, in [s].
+        stop: ends it early.
+
+    Raises:
+        BridgeError: as of `open_source`; LinkLostError if the link is lost meanwhile.
+        UsageError: as of `open_source`; several sources, baselines or a duration that cannot be.
+    """
+    from edge.doctor.examine import examine as judge
+    from edge.doctor.watch import Watch
+
+    check_positive("duration_s", duration_s)
+    known = settled(sensor, id_map)
+    stop = threading.Event() if stop is None else stop
+    watch = Watch(texts, known, references=references(baselines, known), rate_hz=rate_hz, stop=stop)
+    with watch.link:
+        watch.run(duration_s)
+        watched = watch.watched()
+    return judge(watched, time.time()).findings

@@ -1,0 +1,49 @@
+"""What a caller of the library asked for, refused in one line where it cannot be."""
+
+import math
+from collections.abc import Mapping
+from numbers import Integral, Real
+from typing import Any
+
+from edge.errors import UsageError
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.geometry import SensorGeometry
+
+
+def check_positive(name: str, number: Any) -> None:
+    """A finite number above 0, called `name`.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not isinstance(number, Real) or not 0 < float(number) < math.inf:
+        raise UsageError(f"{name} is {number!r}, expected a positive number")
+
+
+def check_whole(name: str, number: Any, least: int, most: float = math.inf) -> None:
+    """A whole number from `least` to `most`, called `name`.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not isinstance(number, Integral) or not least <= int(number) <= most:
+        to = "" if most == math.inf else f" to {most:.0f}"
+        raise UsageError(f"{name} is {number!r}, expected a whole number from {least}{to}")
+
+
+def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
+    """Baselines by the names of their sensors, of one grid.
+
+    Raises:
+        UsageError: they are none, or of another grid.
+    """
+    if not isinstance(baselines, Mapping):
+        raise UsageError(
+            f"baselines are a {type(baselines).__name__}, expected their file, or each by its sensor's name"
+        )
+    for name, baseline in baselines.items():
+        if not isinstance(baseline, Baseline):
+            raise UsageError(f"baseline of sensor {name} is a {type(baseline).__name__}, expected a Baseline")
+        if baseline.counts.shape != geometry.scan_shape:
+            got = f"baseline of sensor {name} has shape {baseline.counts.shape}"
+            raise UsageError(f"{got}, expected {geometry.scan_shape}: zero again")

@@ -1,0 +1,109 @@
+"""What comes from a link while its pads are free."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from edge.asked import check_baselines, check_positive
+from edge.commissioned import link_to, with_recorded
+from edge.doctor.examine import Watched
+from edge.doctor.heard import HeardIds
+from edge.doctor.line_checks import line_facts
+from edge.errors import UsageError
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.scan import Scan
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.sensor_file import SensorFile
+
+READ_TIMEOUT_S: Final = 0.1
+SILENCE_S: Final = 10.0
+
+
+class Watch:
+    """Watches a link.
+
+    Attributes:
+        link: is watched; whoever watches opens and closes it.
+        known: of its sensors.
+        scans: of each sensor, in their order.
+        duration_s: for how long it watched, in [s].
+    """
+
+    def __init__(
+        self,
+        texts: Sequence[str],
+        known: SensorFile,
+        *,
+        references: Mapping[str, Baseline],
+        rate_hz: float | None,
+        stop: threading.Event,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare to watch.
+
+        Args:
+            texts: the source, as in edge.commissioned.link_to; one at most.
+            known: of the sensors.
+            references: what the free pads read before, by sensor.
+            rate_hz: to be expected of each sensor, in [Hz].
+            stop: ends it when it is set.
+            clock_s: the clock of the scans, monotonic, in [s].
+
+        Raises:
+            BridgeError: as in edge.commissioned.link_to.
+            UsageError: several sources; a rate or references that cannot be.
+        """
+        if len(texts) > 1:
+            raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
+        if rate_hz is not None:
+            check_positive("rate_hz", rate_hz)
+        check_baselines(references, known.model_map.geometry)
+        self._heard = HeardIds(known.model_map.taxels)
+        self._model = self._heard.listening(known.model_map)
+        self.link = link_to(texts, known, model=self._model, rate_hz=rate_hz, give_up_s=None)
+        self.known = with_recorded(known, self.link)
+        self.scans: dict[str, list[Scan]] = {}
+        self.duration_s = 0.0
+        self._references = references
+        self._rate_hz = rate_hz
+        self._stop = stop
+        self._clock_s = clock_s
+
+    def run(self, length_s: float, tell: Callable[[int, float], object] = lambda scans, passed_s: None) -> None:
+        """Watch the open link for so long, or until nothing comes any more.
+
+        Args:
+            length_s: in [s].
+            tell: is told after each read how many scans came and how much of it has passed, in [s].
+
+        Raises:
+            LinkLostError: the link is gone.
+        """
+        start_s = now_s = heard_s = self._clock_s()
+        scans = 0
+        while now_s - start_s < length_s and not (self._stop.is_set() or self.link.ended):
+            if now_s - heard_s > SILENCE_S:
+                break
+            for scan in self.link.read(READ_TIMEOUT_S):
+                self.scans.setdefault(scan.sensor, []).append(scan)
+                heard_s = now_s
+                scans += 1
+            now_s = self._clock_s()
+            self.duration_s = now_s - start_s
+            tell(scans, self.duration_s)
+
+    def watched(self) -> Watched:
+        """What has come so far; the link is still open."""
+        return Watched(
+            self.scans,
+            self.link.counters(),
+            self.duration_s,
+            line_facts(self.link),
+            self._heard.ids,
+            self._model,
+            self._rate_hz,
+            self._references,
+            None if self.link.kind == "replay" else int(self._clock_s() * NS_PER_S),
+            self.known.mountings,
+        )

@@ -1,0 +1,184 @@
+"""Results of a source, one for every scan, as they come."""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Self
+
+from edge.asked import check_positive
+from edge.commands import Commands, obey
+from edge.deadline import Deadline
+from edge.event import Event
+from edge.result import Result
+from edge.runtime import Runtime
+from edge.silence import Silence
+from edge.source import POLL_S, Arrival, Source
+from edge.statistics import Statistics
+from firmware_bridge.links.base import Notice
+
+
+class Stream:
+    """Iterates over the results of a source, until it ends, `stop` is set or `duration_s` is over.
+
+    Of the scans that wait, the newest of each sensor gets a pattern; the older ones get their result without one.
+    Everything happens in the thread that iterates: between two results the runtime may be told to zero or to reset. A
+    sensor that a baseline or counts per newton are given of, and that is never heard, is told as an event. A loop that
+    was left may go on in another, with the next result.
+
+    Attributes:
+        counters: up to the last result: the source's, `dropped`, `overruns`, `late` and `missed`.
+        statistics: of the results so far.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        runtime: Runtime,
+        *,
+        on_event: Callable[[Event], object] = lambda event: None,
+        on_wait: Callable[[], object] = lambda: None,
+        stop: threading.Event | None = None,
+        duration_s: float | None = None,
+        commands: Commands | None = None,
+        statistics: Statistics | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Prepare to iterate.
+
+        Args:
+            source: open.
+            runtime: makes the results.
+            on_event: is told what happens beside scans, in its place between results.
+            on_wait: called several times a second while no scan comes.
+            stop: ends the stream after the scans in hand.
+            duration_s: longest time to run, from the first step on, in [s]; of a recording that is read as fast as
+                results are made, so much of its own time.
+            commands: asked between scans.
+            statistics: filled on the way, so that they are there however the stream ends.
+            clock_s: monotonic, in [s].
+            clock_ns: the clock of the scans, in [ns].
+
+        Raises:
+            UsageError: a duration that cannot be.
+        """
+        if duration_s is not None:
+            check_positive("duration_s", duration_s)
+        self.counters: Mapping[str, int] = source.counters()
+        self.statistics = Statistics() if statistics is None else statistics
+        self._source = source
+        self._runtime = runtime
+        self._on_event = on_event
+        self._on_wait = on_wait
+        self._stop = threading.Event() if stop is None else stop
+        self._duration_s = duration_s
+        self._commands = commands
+        self._silence = Silence(runtime.expected)
+        self._deadlines: dict[str, Deadline] = {}
+        self._clock_s = clock_s
+        self._clock_ns = clock_ns
+        self._running = self._run()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Result:
+        """The next result, as it comes.
+
+        Raises:
+            LinkLostError: after every scan before it got its result.
+            ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
+        """
+        return next(self._running)
+
+    def _run(self) -> Iterator[Result]:
+        for taken in self._taken():
+            if self._commands is not None:
+                obey(self._commands, self._runtime)
+                self.statistics.commands_refused = self._commands.refused
+            for notice, arrivals in _between_notices(taken):
+                if notice is not None:
+                    self._heed(notice)
+                yield from self._results(arrivals)
+            for event in self._silence.look():
+                self._tell(event)
+            if not taken:
+                self._on_wait()
+
+    def _taken(self) -> Iterator[list[Arrival | Notice]]:
+        """What the source gives, until it ends, `stop` is set, or the time is over: that of scans, where they wait."""
+        length_s = math.inf if self._duration_s is None else self._duration_s
+        begun_s = self._clock_s()
+        first_ns: int | None = None
+        while not self._stop.is_set() and (self._source.patient or self._clock_s() - begun_s < length_s):
+            taken = self._source.take(POLL_S)
+            self.statistics.overruns = self._source.overruns
+            if taken is None:
+                return
+            for heard in taken if self._source.patient else ():  # one scan at most
+                if isinstance(heard, Arrival):
+                    first_ns = heard.scan.time_ns if first_ns is None else first_ns
+                    if heard.scan.time_ns - first_ns >= length_s * 1e9:
+                        return
+            yield taken
+
+    def _results(self, arrivals: Sequence[Arrival]) -> Iterator[Result]:
+        newest = {arrival.scan.sensor: index for index, arrival in enumerate(arrivals)}
+        scans = [(a.scan, newest[a.scan.sensor] == index) for index, a in enumerate(arrivals)]
+        results = self._runtime.push_together(scans)
+        done_ns = self._clock_ns()
+        for arrival, result in zip(arrivals, results, strict=True):
+            yield self._follow(arrival, result, done_ns)
+
+    def _follow(self, arrival: Arrival, result: Result, done_ns: int) -> Result:
+        """Count a result that was ready at `done_ns`."""
+        scan, statistics = arrival.scan, self.statistics
+        deadline = self._deadlines.get(scan.sensor)
+        if deadline is None:
+            deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
+        deadline.follow(scan.time_ns)
+        heard_again = self._silence.follow(scan, deadline.period_ns)
+        if result.pattern is not None and not self._source.patient:  # whose scans are of another time than the clock's
+            statistics.late += deadline.check(scan.time_ns, done_ns)
+            result = replace(result, latency_us=(done_ns - scan.time_ns) / 1e3)
+        statistics.add(result)
+        statistics.missed = self._silence.missed
+        self.counters = {
+            **arrival.counters,
+            "dropped": statistics.dropped,
+            "overruns": statistics.overruns,
+            "late": statistics.late,
+            "missed": statistics.missed,
+        }
+        if heard_again is not None:
+            self._tell(heard_again)
+        return result
+
+    def _heed(self, notice: Notice) -> None:
+        """What was known before an outage is worth nothing behind it."""
+        if notice.kind in ("lost", "silent", "back"):
+            self._runtime.lose_touch(notice.sensors)
+            self._silence.begin_anew(notice.time_ns, notice.sensors)
+        self._tell(Event.of(notice))
+
+    def _tell(self, event: Event) -> None:
+        self.statistics.tell(event)
+        self._on_event(event)
+
+
+def _between_notices(
+    taken: Sequence[Arrival | Notice],
+) -> Iterator[tuple[Notice | None, list[Arrival]]]:
+    """Cut what was taken at its notices: each, and the scans behind it."""
+    notice, arrivals = None, []
+    for heard in taken:
+        if isinstance(heard, Arrival):
+            arrivals.append(heard)
+            continue
+        if notice is not None or arrivals:
+            yield notice, arrivals
+        notice, arrivals = heard, []
+    if notice is not None or arrivals:
+        yield notice, arrivals

@@ -1,0 +1,351 @@
+"""The runtime as a library, and that the command line is made of nothing else."""
+
+import ast
+import gc
+import itertools
+import json
+import re
+import shlex
+import threading
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import get_type_hints
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
+from test_cli import records, run, write_recording
+
+from edge import api
+from edge.api import (
+    EdgeError,
+    Event,
+    Fan,
+    ModelError,
+    SourceError,
+    Stream,
+    UsageError,
+    load_model,
+    open_runtime,
+    open_sink,
+    open_source,
+    save_baselines,
+    take_baselines,
+)
+from edge.source import Source
+from firmware_bridge.links.base import Notice
+
+FRONT = {
+    *("edge.api", "edge.run"),
+    *("edge.arguments", "edge.options", "edge.doctor.options", "edge.bench.options"),  # what may be asked
+    *("edge.commands", "edge.signals", "edge.realtime"),  # keys, lines, signals, scheduling: of a process
+    *("edge.sinks.messages", "edge.devices", "edge.demo", "edge.draw"),  # what a person reads
+    *("edge.view.live", "edge.recordings"),  # the page, and what is told of a recording
+    *("edge.doctor.command", "edge.bench.command"),  # commands of their own
+}
+NAN = float("nan")
+OURS = ("edge", "firmware_bridge", "train", "export")
+OF_THE_MOMENT = ("time_ns", "run_time_us", "latency_us", "baseline_age_s", "device_time_ns")
+
+
+@pytest.mark.parametrize("module", ["edge/cli.py", "edge/run.py"])
+def test_the_command_line_imports_nothing_of_the_inside(module):
+    imported = set()
+    for node in ast.walk(ast.parse((ROOT / module).read_text())):
+        if isinstance(node, ast.ImportFrom):
+            imported.add(node.module)
+        elif isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+    ours = {name for name in imported if name.partition(".")[0] in OURS}
+    assert "edge.api" in ours and ours <= FRONT, f"{module} imports {sorted(ours - FRONT)}: take it from edge.api"
+
+
+def test_all_that_is_public_is_there():
+    assert not [name for name in api.__all__ if not hasattr(api, name)]
+    assert len(set(api.__all__)) == len(api.__all__)
+    asked = re.findall(r"(?:edge|firmware_bridge)[\w.]*\.(\w+)", str(get_type_hints(Stream.__init__)))
+    assert {"Commands", "Event"} <= set(asked) <= set(api.__all__)
+
+
+def test_the_page_tells_of_everything_that_a_result_has():
+    page = (ROOT / "docs" / "python.md").read_text()
+    table = page.partition("## What a result has")[2].partition("##")[0]
+    assert {field.name for field in fields(api.Result)} <= set(re.findall(r"`(\w+)`", table))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    write_model(folder / "tiny.onnx", make_contract(interval_factor=1.6))
+    save_baselines(folder / "zero.json", [BASELINE])
+    write_recording(folder / "taps.npz", ([0] * 5 + [3000] * 5) * 3)
+    write_recording(folder / "rest.npz", [0] * 150)
+    return folder
+
+
+def timeless(record):
+    """What does not depend on when it was made; a reader may be ahead of its scan, and counters with it."""
+    kept = {name: value for name, value in record.items() if name not in OF_THE_MOMENT}
+    return kept | {"counters": sorted(record["counters"])}
+
+
+def played(files, **settings):
+    """Records of the API, written by its own sink."""
+    out, model = files / "api.jsonl", load_model(files / "tiny.onnx")
+    with open_source(f"replay:{files}/taps.npz", rate_hz=50) as source:
+        runtime = open_runtime(model, source, baselines=files / "zero.json", **settings)
+        sink, stream = open_sink(f"jsonl:{out}", model.contract, source), Stream(source, runtime)
+        for result in stream:
+            sink.write(result, stream.counters)
+        sink.close()
+    return records(out.read_text())
+
+
+@pytest.mark.parametrize(
+    ("options", "settings"),
+    [
+        ([], {}),
+        (
+            shlex.split(
+                "--every-scan --every-tap --contact-on-counts 2000 --contact-off-counts 900 --counts-per-newton 1200"
+            ),
+            {"every_scan": True, "every_tap": True, "contact_on_counts": 2000, "contact_off_counts": 900}
+            | {"counts_per_newton": 1200},
+        ),
+    ],
+)
+def test_records_of_the_command_line_are_those_of_the_api(files, options, settings):
+    fixed = ["--model", files / "tiny.onnx", "--baseline", files / "zero.json", "--rate-hz", "50"]
+    for _ in range(5):
+        made = played(files, **settings)
+        said = records(run(*fixed, "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-", *options).stdout)
+        if not [one for one in (*made, *said) if one["state"] == "dropped"]:  # which depends on the machine
+            break
+    assert len(said) == 30 and {one["state"] for one in said} == {"idle", "contact"}
+    assert [timeless(one) for one in made] == [timeless(one) for one in said]
+
+
+def test_a_source_is_used_open_and_once():
+    source = open_source("demo")
+    for use in (lambda: open_runtime(FakeModel(), source), lambda: next(iter(stream(source)))):
+        with pytest.raises(UsageError, match=r"^source demo is not open: use it in a with statement$"):
+            use()
+    source = Source(FakeLink([[make_scan(n)] for n in range(9)]))
+    with source:
+        results = iter(stream(source))
+        assert next(results).scan.number == 0
+    with pytest.raises(UsageError, match="fake is not open"):
+        list(stream(source))  # what still waits is old
+    with pytest.raises(UsageError, match="fake was opened before"), source:
+        pass
+
+
+def stream(source, model=None, **settings):
+    return Stream(source, open_runtime(model or FakeModel(), source, baselines={"4": BASELINE}), **settings)
+
+
+@pytest.mark.parametrize(
+    ("ask", "error", "words"),
+    [
+        (lambda: open_source("nothing"), SourceError, "source is 'nothing', expected one of: slcan:"),
+        (lambda: open_source("demo", rate_hz=0), UsageError, "rate_hz is 0, expected a positive number"),
+        (lambda: open_source("demo", give_up_s=NAN), UsageError, "give_up_s is nan, expected 0 or more"),
+        (lambda: open_source(["demo"]), UsageError, r"source is \['demo'\], expected text"),
+        (lambda: api.examine("demo", rate_hz=-1), UsageError, "rate_hz is -1, expected a positive number"),
+        (lambda: api.examine("demo", duration_s=-1), UsageError, "duration_s is -1, expected a positive number"),
+        (lambda: api.examine("demo", baselines={"4": 1}), UsageError, "baseline of sensor 4 is a int, expected"),
+        (lambda: api.examine("demo", "demo"), UsageError, "^2 sources, expected one: examine them one after"),
+        (lambda: load_model("stsr", threads=-1), UsageError, "threads is -1, expected a whole number from 1"),
+        (lambda: api.open_ladder("stsr", NAN), UsageError, "budget_us is nan, expected a positive number"),
+        (lambda: api.open_ladder("stsr", 9e3, rate_hz="50"), UsageError, "rate_hz is '50', expected a positive number"),
+        (lambda: load_model("nothing"), ModelError, r"no model 'nothing': .*bundled: .*stsr-int8\.onnx"),
+    ],
+)
+def test_what_cannot_be_is_one_line(ask, error, words):
+    with pytest.raises(error, match=words) as raised:
+        ask()
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda source: open_runtime(FakeModel(), source, counts_per_newton=0), "counts_per_newton is 0, expected a"),
+        (lambda source: open_runtime(FakeModel(), source, counts_per_newton=-3), "counts_per_newton is -3"),
+        (lambda source: open_runtime(FakeModel(), source, counts_per_newton={"6": NAN}), "newton of sensor 6 is nan"),
+        (lambda source: open_runtime(FakeModel(), source, baselines={"4": 1}), "baseline of sensor 4 is a int"),
+        (lambda source: open_runtime(FakeModel(), source, baselines=[BASELINE]), "baselines are a list, expected"),
+        (lambda source: open_runtime(FakeModel(), source, most_taps=0), "most_taps is 0, expected .* from 1 to 64$"),
+        (lambda source: open_runtime(FakeModel(), source, most_taps=99), "most_taps is 99"),
+        (lambda source: stream(source, duration_s=-1), "duration_s is -1, expected a positive number"),
+        (lambda source: take_baselines(source, scans=0), "scans is 0, expected a whole number from 100"),
+        (lambda source: take_baselines(source, skip=-1), "skip is -1, expected a whole number from 0"),
+    ],
+)
+def test_what_cannot_be_asked_of_an_open_source_is_one_line(ask, words):
+    with Source(FakeLink([])) as source, pytest.raises(UsageError, match=words):
+        ask(source)
+
+
+def footprint():
+    """Threads, open descriptors and processes of this one."""
+    gc.collect()
+    children = Path(f"/proc/self/task/{threading.main_thread().native_id}/children").read_text().split()
+    return threading.active_count(), len(list(Path("/proc/self/fd").iterdir())), len(children)
+
+
+@pytest.mark.parametrize("way", ["break", "exception", "return"])
+def test_leaving_the_loop_closes_everything(way):
+    def leave():
+        with open_source("demo") as source:
+            results = stream(source)
+            for _ in results:
+                assert footprint() > before
+                if way == "break":
+                    break
+                if way == "exception":
+                    raise ZeroDivisionError
+                return
+
+    before = footprint()
+    if way == "exception":
+        with pytest.raises(ZeroDivisionError):
+            leave()
+    else:
+        leave()
+    assert footprint() == before
+
+
+def test_zeroing_and_forgetting_taps_in_the_loop():
+    presses = [3000] * 5 + [0] * 5 + [3000] * 5 + [0] * 5
+    scans = [[make_scan(n, press_counts=press)] for n, press in enumerate(presses)]
+    said = [threading.Event(), threading.Event()]  # what comes in one batch has its results already
+    link = FakeLink([*scans[:8], said[0], *scans[8:13], said[1], *scans[13:]])
+    with Source(link) as source:
+        runtime = open_runtime(FakeModel(), source, baselines={"4": BASELINE}, every_tap=True)
+        results = []
+        for result in Stream(source, runtime):
+            results.append(result)
+            if result.scan.number == 7:
+                runtime.reset()
+                said[0].set()
+            if result.scan.number == 12:
+                runtime.zero("6")
+                said[1].set()
+    assert max(result.taps_used for result in results) == 1  # it would be two
+    told = [(result.scan.number, result.event) for result in results if result.event]
+    assert told == [(8, "earlier taps forgotten"), (13, "zeroing refused: no sensor 6, there are 4")]
+
+
+class Outage(FakeLink):
+    """A cable that is out for a moment after ten scans."""
+
+    def notices(self):
+        return [Notice(0, kind, "fake", kind) for kind in ("lost", "back")] if self.reads == 11 else []
+
+
+def test_a_loop_that_was_left_goes_on_with_the_next_result():
+    """What waited in its batch has its results, and a cable that was out in between is not forgotten."""
+    torn = make_scan(10, press_counts=3000, absent=(1,))
+    link = Outage([[make_scan(n, press_counts=3000) for n in range(9)], *[[]] * 9, [torn, make_scan(11)]])
+    heard = []
+    with Source(link) as source:
+        while not link.ended:
+            time.sleep(0.001)
+        results = stream(source, on_event=lambda event: heard.append(event.kind))
+        for result in results:
+            heard.append(result.scan.number)
+            break
+        for result in results:
+            heard.append(result.scan.number)
+        assert list(results) == []
+    assert heard == [*range(9), "lost", "back", 10, 11]
+    assert results.statistics.scans == 11
+
+
+def test_what_happens_beside_scans_is_told_in_its_place_and_nothing_of_before_is_used():
+    torn = make_scan(10, press_counts=3000, absent=(1,))
+    link = Outage([[make_scan(n, press_counts=3000)] for n in range(10)] + [[torn], [make_scan(11, press_counts=3000)]])
+    heard = []
+    with Source(link) as source:
+        for result in stream(source, on_event=heard.append):
+            heard.append(result)
+    kinds = [one.kind if isinstance(one, Event) else one.state for one in heard]
+    assert kinds[:10] == ["contact"] * 10 or "dropped" in kinds[:10]
+    assert kinds[10:] == ["lost", "back", "incomplete", "contact"]
+
+
+def test_a_sensor_that_something_is_given_of_and_that_is_never_heard_is_told():
+    link = FakeLink([[make_scan(n)] for n in range(100)])
+    events = []
+    with Source(link) as source:
+        other = api.Baseline.of("6", BASELINE.counts, 1000.0, 100, "file")
+        baselines, newtons = {"4": BASELINE, "6": other}, {"4": 1000.0, "l": 1000.0}
+        runtime = open_runtime(FakeModel(), source, baselines=baselines, counts_per_newton=newtons)
+        list(Stream(source, runtime, on_event=events.append))
+    assert [(event.kind, event.sensor) for event in events] == [("silent", "6"), ("silent", "l")]
+
+
+def test_a_pad_is_zeroed_once_and_its_baseline_kept(files, tmp_path):
+    with open_source(f"replay:{files}/rest.npz", rate_hz=1000) as source:
+        save_baselines(tmp_path / "zero.json", take_baselines(source).values(), source.sensor_file.orders)
+    with open_source(f"replay:{files}/taps.npz", rate_hz=1000) as source:
+        runtime = open_runtime(FakeModel(), source, baselines=tmp_path / "zero.json")
+        result = next(iter(Stream(source, runtime)))
+    assert result.state == "idle" and np.abs(result.zeroed).max() < 10
+
+
+def test_of_a_recording_the_duration_is_of_its_own_time(files):
+    def made(duration_s, **settings):
+        with api.open_recording(files / "rest.npz", zero=True) as source:
+            runtime = open_runtime(FakeModel(), source)
+            return [result.scan.time_ns for result in Stream(source, runtime, duration_s=duration_s, **settings)]
+
+    ticks = itertools.count()
+    whole = made(1e6)
+    half_s = (whole[-1] - whole[0]) / 2e9
+    first = made(half_s, clock_s=lambda: 10.0 * next(ticks))  # on the slowest of machines
+    assert first == [time_ns for time_ns in whole if time_ns - whole[0] < half_s * 1e9] and len(whole) == 150
+
+
+def test_a_sink_that_fails_is_given_up_and_the_others_go_on(files, tmp_path):
+    told, contract = [], make_contract()
+    with open_source(f"replay:{files}/taps.npz", rate_hz=1000) as source:
+        fan = Fan(told.append)
+        for target in (tmp_path / "good.jsonl", "/dev/full"):
+            fan.add(open_sink(f"jsonl:{target}", contract, source))
+        results = stream(source)
+        for result in results:
+            fan.write(result, results.counters)
+    assert [event.kind for event in told] == ["sink"]
+    with pytest.raises(EdgeError, match="/dev/full"):
+        fan.close()
+    assert len(records((tmp_path / "good.jsonl").read_text())) >= 30
+
+
+def test_the_doctors_findings_are_those_of_the_api(files):
+    arguments = (f"replay:{files}/rest.npz",)
+    findings = api.examine(*arguments, baselines=files / "zero.json", rate_hz=400, duration_s=30)
+    options = ("--source", *arguments, "--baseline", files / "zero.json", "--rate-hz", 400, "--drift-s", 30)
+    told = json.loads(run("doctor", "--json", "--no-press", *options).stdout)["findings"]
+    assert [one.name for one in findings] == [one["name"] for one in told if one["name"] != "guided press"]
+    verdicts = {one.name: one.verdict for one in findings}
+    assert verdicts["noise"] == verdicts["load"] == verdicts["baseline"] == "ok"
+
+
+def test_devices_are_listed(monkeypatch):
+    monkeypatch.setattr("firmware_bridge.links.devices.devices", lambda: (["found"], ["note"]))
+    assert api.devices() == (["found"], ["note"])
+
+
+def test_models_that_take_turns(files, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    said = []
+    ladder = api.open_ladder(files / "tiny.onnx", 1e6, rate_hz=1000, tell=said.append)
+    with open_source(f"replay:{files}/taps.npz", rate_hz=1000) as source:
+        runtime = open_runtime(ladder.model, source, most_taps=ladder.most_taps)
+        steps, results = ladder.steps(runtime), Stream(source, runtime)
+        for result in results:
+            steps.write(result, results.counters)
+            assert result.event == (said[-1] if result.scan.number == 0 else None)
