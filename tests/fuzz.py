@@ -140,6 +140,8 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     from fuzz_targets import TARGETS
 
+    from edge.progress import Progress
+
     chosen = [TARGETS[name] for name in options.parsers or TARGETS]
     if options.replay is not None:
         chosen[0].run(options.replay.read_bytes())
@@ -147,15 +149,19 @@ def main(arguments: list[str]) -> int:
     folder = options.corpus or Path(tempfile.mkdtemp(prefix="corpus-"))
     shares = sum(target.share for target in chosen)
     rows = []
+    bar = Progress("fuzzing", options.inputs, "input")
     for target in chosen:
         inputs = options.inputs * target.share // shares
         if options.blind:
             rows.append(run_blind(target.name, inputs, options.seed))
         else:
             rows.append(run_guided(target.name, inputs, options.seed, folder, options.seconds))
-        print(json.dumps(rows[-1]), flush=True)
+        bar.advance(inputs)
+        with bar.aside():
+            print(json.dumps(rows[-1]), flush=True)
         if options.out is not None:
             options.out.write_text(page(rows))
+    bar.close()
     return 0 if all(row.get("held", True) for row in rows) else 1
 
 

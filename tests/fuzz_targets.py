@@ -13,12 +13,15 @@ import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Message, Schema
+from mcap.writer import MCAP0_MAGIC
 
 from edge.bench.compare import compared
 from edge.bench.errors import BenchError
@@ -28,14 +31,17 @@ from edge.commands import LONGEST_LINE_BYTES, LineCommands
 from edge.contract import KEY_PREFIX, Contract
 from edge.errors import EdgeError, ModelError
 from edge.frozen import FrozenSet, load_frozen_set
+from edge.mcap_file import McapFile
 from edge.onnx_file import check_plain
 from edge.session import ModelSession
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.gs_usb_scans import GsUsbScans
+from firmware_bridge.mounting import Mounting
 from firmware_bridge.recording import CSV_HEADER, HIGHEST_COUNT, load_recording
-from firmware_bridge.scan import ABSENT
+from firmware_bridge.scan import ABSENT, Scan
+from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.server_scans import ServerScans
@@ -51,6 +57,7 @@ LONGEST_MESSAGE = 1000
 """Characters of an error that a user can still read, paths among them."""
 _KEPT = tempfile.TemporaryDirectory(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 FOLDER = Path(_KEPT.name)
+FRESH = np.ones((4, 4), dtype=bool)
 REST = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
 
 
@@ -279,6 +286,46 @@ def npz(data: bytes) -> None:
 
 def npz_seeds() -> list[bytes]:
     return [archive(**recording_arrays()), archive(compressed=True, rate_hz=100.0, **recording_arrays())]
+
+
+def mcap(data: bytes) -> None:
+    """A file as it is, and the same bytes as records of one that begins well, so that they are reached."""
+    for name, content in (("finger.mcap", data), ("records.mcap", MCAP0_MAGIC + data)):
+        recording = refused(lambda: load_recording(as_file(name, content)), RecordingError)  # noqa: B023
+        if recording is not None:
+            assert recording.tracks and all(len(note) <= LONGEST_MESSAGE for note in recording.notes)
+            for track in recording.tracks:
+                check_counts(track.counts)
+                assert track.time_ns is not None and track.renewed is not None
+                assert len(track.time_ns) == len(track.counts) == len(track.renewed)
+                assert track.time_ns[0] >= 0 and not (track.time_ns[1:] < track.time_ns[:-1]).any()
+                assert not (track.renewed & (track.counts[:, 0] == ABSENT)).any()
+            for sensor, one in recording.baselines.items():
+                held = one.counts[~np.isnan(one.counts)]
+                assert sensor == one.sensor and ((held >= 0) & (held <= 0x10000)).all()
+
+
+def mcap_seeds() -> list[bytes]:
+    """Whole, and plain: without chunks and sums, so that a change is no mere damage."""
+    path = FOLDER / "made.mcap"
+    path.unlink(missing_ok=True)
+    file = McapFile(path, "ros2", "fuzz")
+    file.add_metadata("mounting", {"sensor": "4", "mounting": json.dumps(asdict(Mounting()))})
+    baseline = encode_baseline(Baseline.of("4", REST, 1000.0, 100, "file"), 1.0, 5)
+    scans = [Scan("4", n, n, np.int32(REST + n), FRESH, FRESH) for n in range(2)]
+    messages = [(BASELINE, baseline), *((SCAN, encode_scan(scan, 5, 0xFFFF, 0xFFFF)) for scan in scans)]
+    plain = RecordBuilder()
+    channels: dict[str, int] = {}
+    for kind, message in messages:
+        if kind.name not in channels:
+            schema = file.add_schema(kind.name, "ros2msg", kind.definition)
+            channels[kind.name] = number = file.add_channel(f"/{schema}", "cdr", schema, {})
+            Schema(number, kind.definition.encode(), "ros2msg", kind.name).write(plain)
+            Channel(number, "/x", "cdr", {}, number).write(plain)
+        file.add_message(channels[kind.name], 5, message)
+        Message(channels[kind.name], 5, message, 5, 0).write(plain)
+    file.close()
+    return [path.read_bytes(), plain.end()]
 
 
 def npy_in_npz(data: bytes) -> None:
@@ -580,6 +627,7 @@ TARGETS = {
         Target("CSV rows", csv_rows, csv_rows_seeds, 1024, 100),
         Target("CSV rate", csv_rate, csv_rate_seeds, 512, 10),
         Target("npz", npz, npz_seeds, 4096, 20),
+        Target("MCAP", mcap, mcap_seeds, 8192, 20),
         Target("npy in npz", npy_in_npz, npy_in_npz_seeds, 1024, 10),
         Target("baseline JSON", baseline, baseline_seeds, 8192, 80),
         Target("commands", commands, commands_seeds, 4096, 200),

@@ -19,8 +19,10 @@ from numpy.lib import format as npy
 from numpy.typing import ArrayLike
 
 from edge.errors import SinkError
+from edge.progress import Progress
 from edge.result import Result
 from edge.sinks.base import Sink
+from firmware_bridge.links.base import SourceKind
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 
 LAYOUT: Final = "layout.json"
@@ -34,31 +36,39 @@ class NpzSink(Sink):
     """Records into `path`, by way of parts beside it.
 
     Arrays, one row a scan: sensor, scan, time_ns, device_time_ns (-1 unknown), counts (3, rows, cols; -1
-    absent), source, state, model, contact (-1 unknown), taps_used, force_counts (NaN unknown), has_pattern,
-    pattern (H, W; zeros where there is none), deviation (the same, only if the model gives it), interval_mm,
-    expected_rmse_mm and run_time_us (NaN where there is none), another_tap and reused_from (-1 where there is
-    none), dead (bit i: taxel i is not believed), filled (what stood for them, or empty), baseline (its id, or
-    empty), baseline_age_s (NaN without) and baseline_counts (3, rows, cols, what was subtracted, drift and all;
-    NaN without, and where a taxel was not zeroed).
+    absent), source, origin (the same, but of a replay that of what is played), state, model, contact (-1 unknown),
+    taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros where there is none), deviation (the same,
+    only if the model gives it), interval_mm, expected_rmse_mm and run_time_us (NaN where there is none), another_tap
+    and reused_from (-1 where there is none), dead (bit i: taxel i is not believed), filled (what stood for them, or
+    empty), baseline (its id, or empty), baseline_age_s (NaN without) and baseline_counts (3, rows, cols, what was
+    subtracted, drift and all; NaN without, and where a taxel was not zeroed).
     """
 
     def __init__(
-        self, path: Path, scan_shape: tuple[int, ...], pattern_shape: tuple[int, ...], *, deviations: bool = False
+        self,
+        path: Path,
+        scan_shape: tuple[int, ...],
+        pattern_shape: tuple[int, ...],
+        *,
+        deviations: bool = False,
+        origin: SourceKind | None = None,
     ) -> None:
         """Start the parts.
 
         Args:
-            path: of the .npz; one that exists is replaced at the end.
+            path: of the .npz; one that exists is left alone.
             scan_shape: (3, rows, cols).
             pattern_shape: (H, W).
             deviations: patterns come with deviations.
+            origin: what kind of source the scans come from, where results are of a recording; else as they say.
 
         Raises:
-            SinkError: they cannot be written, or lie there from a run that did not end.
+            SinkError: it exists, or its parts cannot be written, or lie there from a run that did not end.
         """
         self._path = path
         self._scans = 0
         self._failed = False
+        self._origin = origin
         self._no_pattern = np.zeros(pattern_shape, dtype=np.float32)
         self._no_baseline = np.full(scan_shape, np.nan, dtype=np.float32)
         self._layout: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -68,6 +78,7 @@ class NpzSink(Sink):
             "device_time_ns": ("<i8", ()),
             "counts": ("<i4", scan_shape),
             "source": ("<U8", ()),
+            "origin": ("<U8", ()),
             "state": ("<U10", ()),
             "model": (f"<U{MODEL_CHARACTERS}", ()),
             "contact": ("|i1", ()),
@@ -90,6 +101,8 @@ class NpzSink(Sink):
         parts = parts_dir(path)
         if path.is_dir():
             raise SinkError(f"cannot record into {path}: it is a directory")
+        if path.exists():
+            raise SinkError(f"{path} exists: give another name, or delete it first")
         try:
             parts.mkdir()
             (parts / LAYOUT).write_text(json.dumps(self._layout))
@@ -111,6 +124,7 @@ class NpzSink(Sink):
             "device_time_ns": -1 if scan.device_ns is None else scan.device_ns,
             "counts": scan.counts,
             "source": result.source,
+            "origin": self._origin or result.source,
             "state": result.state,
             "model": result.model[:MODEL_CHARACTERS],
             "contact": -1 if result.contact is None else result.contact,
@@ -151,7 +165,7 @@ class NpzSink(Sink):
     def _failure(self, error: OSError) -> SinkError:
         self._failed = True
         reason = error.strerror or error
-        return SinkError(f"recording into {self._path} stopped: {reason}; what there is so far: {_remedy(self._path)}")
+        return SinkError(f"recording into {self._path} stopped: {reason}; of {self._scans} scans {_remedy(self._path)}")
 
 
 def parts_dir(path: Path) -> Path:
@@ -165,16 +179,21 @@ def gather(path: Path) -> int:
     A last row that a crash left incomplete is left out.
 
     Raises:
-        SinkError: there are no rows, or no room.
+        SinkError: there are no rows, or no room, or the file exists.
     """
     parts, draft = parts_dir(path), path.with_name(path.name + ".draft")
+    if path.exists():
+        raise SinkError(f"{path} exists, and is not replaced by what {parts} holds: move it away, then {_remedy(path)}")
     try:
         row = np.dtype([(name, kind, tuple(shape)) for name, (kind, shape) in _read_layout(parts).items()])
         scans = (parts / ROWS).stat().st_size // row.itemsize
         if scans == 0:
             raise SinkError(f"{parts} holds no scan: delete it")
         rows = np.memmap(parts / ROWS, dtype=row, mode="r", shape=scans)
-        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with (
+            zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+            Progress(path.name, scans * row.itemsize, "B") as bar,
+        ):
             for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION)):
                 with archive.open(f"{name}.npy", "w") as entry:
                     npy.write_array(entry, np.asarray(value))
@@ -184,7 +203,9 @@ def gather(path: Path) -> int:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     npy.write_array_header_1_0(entry, header)
                     for start in range(0, scans, CHUNK_SCANS):
-                        entry.write(column[start : start + CHUNK_SCANS].tobytes())
+                        chunk = column[start : start + CHUNK_SCANS].tobytes()
+                        entry.write(chunk)
+                        bar.advance(len(chunk))
         draft.replace(path)
         shutil.rmtree(parts)
     except OSError as error:
@@ -213,7 +234,7 @@ def _row_bytes(name: str, value: ArrayLike, kind: str, shape: tuple[int, ...]) -
 
 
 def _remedy(path: Path) -> str:
-    return f"`python -m edge.sinks.npz {path}` makes the .npz of it"
+    return f"`python -m edge.sinks.npz {path}` makes the .npz"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,121 @@
+"""What `edge-sr record` and `edge-sr replay` add to a run: the file, and what a recording knows of its sensors."""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from edge.commissioned import settled, with_recorded
+from edge.errors import SinkError, UsageError
+from edge.progress import Progress
+from edge.source import Source
+from edge.statistics import Statistics
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.links.changed import ChangedLink
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.links.source import place_recordings
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.recording import Recording, npz_baselines
+from firmware_bridge.scan import Scan
+from firmware_bridge.sensor_file import SensorEntry
+
+_NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
+"""Whose name says what is in them, which a recording is not."""
+_RECORDS: Final = "records in JSON are edge-sr --sink jsonl:FILE"
+
+
+@contextmanager
+def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
+    """Have a run recorded, and tell at its end, however it came, what there is.
+
+    Args:
+        options: of edge.options.record_parser; a sink is added.
+
+    Raises:
+        UsageError: a file of another kind is asked for.
+        SinkError: the file exists.
+    """
+    path = Path(options.file)
+    if path.is_dir():
+        raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
+    if path.suffix.lower() in _NOT_WRITTEN:
+        raise UsageError(f"no {path.suffix} is recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
+    if path.suffix not in (".mcap", ".npz"):
+        path = path.with_name(path.name + ".mcap")
+    if path.exists():  # before anything is begun
+        raise SinkError(f"{path} exists: give another name, or delete it first")
+    options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
+    statistics = Statistics()
+    try:
+        yield statistics
+    finally:
+        if path.exists():
+            size_mb = path.stat().st_size / 1e6
+            emulated = ", EMULATED" if statistics.source == "emulated" else ""
+            sure = sys.exception() is None and not statistics.unwritten  # else a sink has told what it does not hold
+            held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
+            with suppress(OSError):  # the terminal may have gone
+                sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
+
+
+def open_recording(
+    path: str | Path,
+    *,
+    sensor: str | Path | None,
+    zero: bool,
+    paced: bool,
+    rate_hz: float | None,
+    bar: bool = False,
+) -> Source:
+    """The source that plays a recording, as edge.api.open_recording; with a bar of how far it is, if asked for."""
+    replay = ReplayLink([path], rate_hz, paced=paced)
+    (recording,) = replay.recordings
+    link = _FollowedLink(replay, sum(len(track.counts) for track in recording.tracks)) if bar else replay
+    file = settled(sensor, None)
+    known = with_recorded(file, link)
+    baselines = {} if zero else _in_its_time(recording, paced=paced) or known.baselines
+    mountings = known.mountings
+    sensors = {*mountings, *baselines}
+    if sensor is None:  # else it is told which ones the file does not know
+        sensors |= {track.sensor for track in recording.tracks}
+    entries = {
+        name: SensorEntry(mountings.get(name, Mounting()), known.counts_per_newton.get(name), baselines.get(name))
+        for name in sorted(sensors)
+    }
+    known = replace(known, sensors=entries)
+    return Source(place_recordings(link, [path], file.mountings), sensor_file=known, rate_hz=rate_hz)
+
+
+class _FollowedLink(ChangedLink):
+    """A recording, and a bar that tells how much of it was taken."""
+
+    def __init__(self, link: ReplayLink, scans: int) -> None:
+        super().__init__(link)
+        self._bar = Progress("replay", scans, "scan")
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._bar.close()
+        super().__exit__(*exc_info)
+
+    def _change(self, scan: Scan) -> Scan:
+        self._bar.advance()
+        return scan
+
+
+def _in_its_time(recording: Recording, *, paced: bool) -> dict[str, Baseline]:
+    """Its baselines, as old as they were where nobody knows when that was, and the scans are of now."""
+    baselines = dict(recording.baselines)
+    if recording.path.suffix.lower() == ".npz":
+        baselines = npz_baselines(recording)
+    if not paced or recording.unix_offset_ns:  # 0: nobody knew either when it was recorded
+        return baselines
+    firsts_ns = {track.sensor: track.time_ns[0] for track in recording.tracks if track.time_ns is not None}
+    now_s = time.time()
+    return {
+        name: replace(one, created_unix_s=now_s - (firsts_ns[name] / 1e9 - one.created_unix_s))
+        for name, one in baselines.items()
+    }

@@ -1,0 +1,162 @@
+"""What edge-sr says as ROS 2 messages: of the usual types where there is one, of its own where there is none. No I/O.
+
+The texts of sensor_msgs, geometry_msgs, std_msgs, builtin_interfaces and rcl_interfaces are those of ROS 2's interface
+definitions (Apache-2.0), without their comments. What is not known is not made up: NaN stands where a number would.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from edge.event import Event
+from edge.result import Result
+from firmware_bridge.cdr import STD_HEADER, TIME, MessageType, stamp
+
+IMAGE: Final = MessageType(
+    "sensor_msgs/msg/Image",
+    "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n"
+    "uint8[] data",
+    STD_HEADER,
+)
+_VECTOR3: Final = MessageType("geometry_msgs/msg/Vector3", "float64 x\nfloat64 y\nfloat64 z")
+_WRENCH: Final = MessageType(
+    "geometry_msgs/msg/Wrench", "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque", _VECTOR3
+)
+WRENCH_STAMPED: Final = MessageType(
+    "geometry_msgs/msg/WrenchStamped",
+    "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
+    *(STD_HEADER, _WRENCH, _VECTOR3),
+)
+LOG: Final = MessageType(
+    "rcl_interfaces/msg/Log",
+    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line",
+    TIME,
+)
+_NUMBERS: Final = (
+    *("force_counts", "force_n", "area_mm2", "interval_mm", "expected_rmse_mm", "run_time_us", "latency_us"),
+    "baseline_age_s",
+)
+RESULT: Final = MessageType(
+    "tactile_edge_sr/msg/Result",
+    """\
+# What was made of one scan, without its maps. NaN: not known.
+std_msgs/Header header     # wall clock time of the scan; frame_id as of images
+int64 time_ns              # of the scan, monotonic
+int64 scan                 # its number
+string source              # device, replay or emulated
+string state
+string model
+int8 contact               # 1, 0, or -1: not known
+int32 taps_used
+float64 force_counts
+float64 force_n
+float64 area_mm2
+float64 centroid_x_mm
+float64 centroid_y_mm
+float64 interval_mm
+float64 expected_rmse_mm
+float64 run_time_us
+float64 latency_us
+float64 baseline_age_s
+string record              # all of it as JSON, as in a line of jsonl:
+""",
+    STD_HEADER,
+)
+_WARN, _ERROR, _INFO = 30, 40, 20
+_LEVELS: Final = {"lost": _ERROR, "silent": _WARN, "trouble": _WARN, "sink": _ERROR}
+
+
+def frame_of(result: Result) -> str:
+    """The frame_id of what is said of a sensor: its name, behind what it is where it is none, as in emulated/4."""
+    return result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
+
+
+def force_xyz_n(result: Result) -> tuple[float, float, float] | None:
+    """Force on the pad in [N], x to the right, y down, z into the pad; None where it is known in counts alone.
+
+    Our own calibration is of z alone: x and y are NaN, and known only where all of it is the vendor's.
+    """
+    if result.force_n is None:
+        return None
+    vendor = result.scan.vendor_force_n
+    return vendor if vendor is not None and vendor[2] == result.force_n else (math.nan, math.nan, result.force_n)
+
+
+def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
+    """A map (H, W) as an Image of encoding 32FC1, in the map's unit, x to the right and y down."""
+    height, width = values.shape
+    return IMAGE.encode(
+        {
+            "header": {"stamp": stamp(unix_ns), "frame_id": frame},
+            "height": height,
+            "width": width,
+            "encoding": "32FC1",
+            "is_bigendian": 0,
+            "step": 4 * width,
+            "data": np.ascontiguousarray(values, dtype="<f4").view(np.uint8),
+        }
+    )
+
+
+def image_map(data: bytes) -> NDArray[np.float32]:
+    """The map (H, W) in an Image that `image` made.
+
+    Raises:
+        CdrError: it is no Image.
+        ValueError: it is one of another kind.
+    """
+    said = IMAGE.decode(data)
+    if said["encoding"] != "32FC1" or said["is_bigendian"]:
+        raise ValueError(f"an image of encoding {said['encoding'][:20]!r}, expected 32FC1, little-endian")
+    return said["data"].view("<f4").reshape(said["height"], said["width"])
+
+
+def wrench(result: Result, unix_ns: int) -> bytes | None:
+    """Force on the pad; None where it is not known in [N]."""
+    force_n = force_xyz_n(result)
+    if force_n is None:
+        return None
+    header = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
+    force, unknown = dict(zip("xyz", force_n, strict=True)), dict.fromkeys("xyz", math.nan)
+    return WRENCH_STAMPED.encode({"header": header, "wrench": {"force": force, "torque": unknown}})
+
+
+def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
+    """A result without its maps; `record` is what edge.record says of it."""
+    x_mm, y_mm = result.centroid_mm or (math.nan, math.nan)
+    numbers = {name: math.nan if (value := getattr(result, name)) is None else value for name in _NUMBERS}
+    return RESULT.encode(
+        {
+            "header": {"stamp": stamp(unix_ns), "frame_id": frame_of(result)},
+            "time_ns": result.scan.time_ns,
+            "scan": result.scan.number,
+            "source": result.source,
+            "state": result.state,
+            "model": result.model,
+            "contact": -1 if result.contact is None else result.contact,
+            "taps_used": result.taps_used,
+            **numbers,
+            "centroid_x_mm": x_mm,
+            "centroid_y_mm": y_mm,
+            "record": orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode(),
+        }
+    )
+
+
+def log_message(event: Event, unix_ns: int) -> bytes:
+    """An event as a line of ROS's log: `function` is its kind, `name` its sensor or "edge-sr"."""
+    return LOG.encode(
+        {
+            "stamp": stamp(unix_ns),
+            "level": _LEVELS.get(event.kind, _INFO),
+            "name": event.sensor or "edge-sr",
+            "msg": event.text,
+            "file": "",
+            "function": event.kind,
+            "line": 0,
+        }
+    )

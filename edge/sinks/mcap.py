@@ -1,0 +1,211 @@
+"""Scans, patterns and events in one MCAP file, which Foxglove and `ros2 bag play` open and `replay:` plays again."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+from edge.contract import Contract
+from edge.errors import SinkError
+from edge.event import Event
+from edge.mcap_file import McapFile
+from edge.record import record
+from edge.result import Result
+from edge.ros_messages import (
+    IMAGE,
+    LOG,
+    RESULT,
+    WRENCH_STAMPED,
+    frame_of,
+    image,
+    log_message,
+    result_message,
+    wrench,
+)
+from edge.ros_names import sensor_path
+from edge.sinks.base import Sink
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.cdr import MessageType
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.links.base import SourceKind
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.recording import MOUNTING_METADATA, SOURCE_METADATA
+from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+
+EVENTS_TOPIC: Final = "/events"
+_PROFILE: Final = "ros2"
+
+
+class McapSink(Sink):
+    """Records into a new file; times on the wall are those of the clock at the start, however it is set later.
+
+    Where a robot waits, a disk that is too slow must hold up nothing: after some seconds records are left out, and
+    counted.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        contract: Contract,
+        *,
+        patient: bool = True,
+        mountings: Mapping[str, Mounting] | None = None,
+        unix_offset_ns: int | None = None,
+        origin: SourceKind | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin the file.
+
+        Args:
+            path: of the file; one that exists is left alone.
+            contract: of the model that the run begins with.
+            patient: wait for a slow disk, rather than leave records out.
+            mountings: of the sensors, by name: without them, axes would point elsewhere when it is played again.
+            unix_offset_ns: what is added to the time of a scan for [ns] since 1970; by default as the clocks are now.
+            origin: what kind of source the scans come from, where results are of a recording; else as they say.
+            clock_s: monotonic, in [s].
+
+        Raises:
+            SinkError: it exists, or cannot be written.
+        """
+        self._path = path
+        self._offset_ns = time.time_ns() - time.monotonic_ns() if unix_offset_ns is None else unix_offset_ns
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._baselines: dict[str, Baseline | None] = {}
+        self._origin = origin
+        self._source_told = False
+        self._patient = patient
+        self._unwritten = 0
+        self._failed = False
+        try:
+            self._file = McapFile(path, _PROFILE, f"tactile-edge-sr {_version()}", clock_s)
+            try:
+                self._file.add_metadata("contract", {key: json.dumps(one) for key, one in asdict(contract).items()})
+                self._file.add_metadata("geometry", {key: json.dumps(one) for key, one in asdict(USPA44).items()})
+                for name, mounting in (mountings or {}).items():
+                    text = json.dumps(asdict(mounting))
+                    self._file.add_metadata(MOUNTING_METADATA, {"sensor": name, "mounting": text})
+            except OSError:
+                self._file.abandon()
+                raise
+        except FileExistsError as error:
+            raise SinkError(f"{path} exists: give another name, or delete it first") from error
+        except OSError as error:
+            raise SinkError(f"cannot record into {path}: {error.strerror or error}") from error
+
+    @property
+    def scans(self) -> int:
+        """On the disk so far, of all sensors."""
+        numbers = [number for (_, name), number in self._channels.items() if name == "scan"]
+        return sum(self._file.written.get(number, 0) for number in numbers)
+
+    @property
+    def unwritten(self) -> int:
+        """Records left out so far."""
+        return self._unwritten
+
+    @property
+    def size_bytes(self) -> int:
+        """On the disk so far."""
+        return self._file.size_bytes
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Add the messages of one scan: the baseline if it is another than before comes first."""
+        if not self._has_room():
+            return
+        scan = result.scan
+        sensor, unix_ns = scan.sensor, scan.time_ns + self._offset_ns
+        said = record(result, counters)
+        try:
+            if not self._source_told:
+                self._file.add_metadata(SOURCE_METADATA, {"kind": self._origin or result.source})
+                self._source_told = True
+            if result.baseline is not None and self._baselines.get(sensor) is not result.baseline:
+                data = encode_baseline(result.baseline, result.baseline_age_s, unix_ns)
+                self._add(sensor, "baseline", BASELINE, unix_ns, data)
+                self._baselines[sensor] = result.baseline
+            self._add(sensor, "scan", SCAN, unix_ns, encode_scan(scan, unix_ns, said["fresh"], said["renewed"]))
+            self._add(sensor, "result", RESULT, unix_ns, result_message(result, said, unix_ns))
+            if result.pattern is not None:
+                self._add(sensor, "pattern", IMAGE, unix_ns, image(result.pattern, frame_of(result), unix_ns))
+            if result.deviation is not None:
+                self._add(sensor, "deviation", IMAGE, unix_ns, image(result.deviation, frame_of(result), unix_ns))
+            force = wrench(result, unix_ns)
+            if force is not None:
+                self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
+            if result.event is not None:
+                self._log(Event(scan.time_ns, "note", sensor, result.event))
+            self._file.look()  # once all of the scan is there
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Add an event."""
+        if not self._has_room():
+            return
+        try:
+            self._log(event)
+            self._file.look()
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def wait(self) -> None:
+        """Let nothing lie about while no scan comes."""
+        try:
+            self._file.look()
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def close(self) -> None:
+        """Finish the file; one without a message is deleted."""
+        if self._failed:
+            self._file.abandon()
+            return
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._failure(error) from error
+        if not self._file.messages:
+            self._path.unlink(missing_ok=True)
+
+    def _has_room(self) -> bool:
+        """Whether there is for one more record, which is counted as left out else."""
+        try:
+            full = self._file.full()
+            if full and self._patient:
+                self._file.drain()
+                return True
+        except OSError as error:
+            raise self._failure(error) from error
+        self._unwritten += full
+        return not full
+
+    def _log(self, event: Event) -> None:
+        unix_ns = event.time_ns + self._offset_ns
+        self._add("", EVENTS_TOPIC, LOG, unix_ns, log_message(event, unix_ns))
+
+    def _add(self, sensor: str, name: str, kind: MessageType, unix_ns: int, data: bytes) -> None:
+        channel = self._channels.get((sensor, name))
+        if channel is None:
+            if kind.name not in self._schemas:
+                self._schemas[kind.name] = self._file.add_schema(kind.name, "ros2msg", kind.definition)
+            topic = f"/{sensor_path(sensor)}/{name}" if sensor else name
+            channel = self._file.add_channel(topic, "cdr", self._schemas[kind.name], {"sensor": sensor})
+            self._channels[sensor, name] = channel
+        self._file.add_message(channel, unix_ns, data)
+
+    def _failure(self, error: OSError) -> SinkError:
+        self._failed = True
+        reason = error.strerror or error
+        return SinkError(f"recording into {self._path} stopped: {reason}; its {self.scans} scans can be played")
+
+
+def _version() -> str:
+    try:
+        return version("tactile-edge-sr")
+    except PackageNotFoundError:  # run from a checkout
+        return "0"

@@ -1,0 +1,67 @@
+"""What the tests of MCAP recordings share: a recording, and reading one with the public package."""
+
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from edge_samples import BASELINE, FakeModel, make_contract, make_scan
+from mcap.reader import make_reader
+
+from edge.runtime import Runtime
+from edge.sinks.mcap import McapSink
+from firmware_bridge.scan import ABSENT, Scan, VendorReading
+
+OFFSET_NS = 1_700_000_000_000_000_000
+
+
+def odd_scans(count: int = 12) -> list[Scan]:
+    """Scans of two sensors with all that scans may have: gaps, old readings, device times, a vendor's words."""
+    scans = []
+    for number in range(count):
+        press = 3000 + 40 * number if number % 4 > 1 else 0
+        scan = make_scan(number, press_counts=press, absent=(3, 7) if number % 5 == 2 else (), stale=(1,), noise=3)
+        scans.append(replace(scan, device_ns=None if number % 3 else scan.time_ns - 1234))
+        newtons = np.random.default_rng(number).normal(size=(3, 4, 4)).astype(np.float32)
+        vendor = VendorReading(newtons, np.full((4, 4), 300.5, np.float32) if number % 2 else None)
+        other = make_scan(number, sensor="left/6", press_counts=press, noise=2)
+        scans.append(replace(other, time_ns=other.time_ns + 77 * (number % 2), vendor=vendor if number % 4 else None))
+    return scans
+
+
+def make_results(scans: list[Scan], **settings):
+    baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "left/6")}
+    settings = {"source": "device", "baselines": baselines, "unix_time_s": lambda: OFFSET_NS / 1e9} | settings
+    runtime = Runtime(FakeModel(make_contract(interval_factor=1.6)), **settings)
+    return [runtime.push(scan) for scan in scans]
+
+
+def record_into(path: Path, results, contract=None, **settings) -> Path:
+    sink = McapSink(path, contract or make_contract(interval_factor=1.6), unix_offset_ns=OFFSET_NS, **settings)
+    for result in results:
+        sink.write(result, {"dropped": 2})
+    sink.close()
+    return path
+
+
+def messages_of(path: Path) -> dict[str, list]:
+    """(log time, data) by topic, as the public package reads a whole file, its sums checked."""
+    by_topic = defaultdict(list)
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            by_topic[channel.topic].append((message.log_time, message.data))
+    return by_topic
+
+
+def same_scan(got: Scan, scan: Scan, moved_ns: int = 0) -> bool:
+    """Bit for bit."""
+    arrays = [(getattr(got, name), getattr(scan, name)) for name in ("counts", "fresh", "renewed")]
+    for one in ("newtons", "temperature_k", "ups_hz"):
+        arrays.append((getattr(got.vendor, one, None), getattr(scan.vendor, one, None)))
+    device_ns = None if scan.device_ns is None else scan.device_ns + moved_ns
+    return (
+        (got.sensor, got.number, got.time_ns, got.device_ns)
+        == (scan.sensor, scan.number, scan.time_ns + moved_ns, device_ns)
+        and all((a is None) == (b is None) and (a is None or a.tobytes() == b.tobytes()) for a, b in arrays)
+        and (got.counts[:, ~got.fresh] == ABSENT).all()
+    )

@@ -1,0 +1,280 @@
+"""MCAP files made to harm, or of others: each is refused in one line, before it costs time or memory."""
+
+import json
+import re
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+import zstandard
+from edge_samples import FakeModel, make_contract
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Chunk, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap_samples import OFFSET_NS, make_results, odd_scans, record_into
+
+from edge.api import open_recording, open_sink
+from edge.runtime import Runtime
+from edge.stream import Stream
+from firmware_bridge import mcap_recording
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.mcap_recording import MOST_RECORD_BYTES
+from firmware_bridge.recording import load_recording
+from firmware_bridge.scan_messages import BASELINE, SCAN
+
+MEMORY_LIMIT_BYTES = 60_000_000
+GOOD = {
+    "header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "4"},
+    "sensor": "4",
+    "number": 0,
+    "time_ns": 10,
+    "device_time_ns": -1,
+    "fresh": 0xFFFF,
+    "renewed": 0xFFFF,
+    "counts": np.full(48, 16_000),
+    "vendor_newtons": (),
+    "vendor_temperature_k": (),
+    "vendor_ups_hz": (),
+}
+REST = {
+    "header": GOOD["header"],
+    "sensor": "4",
+    "id": "abc",
+    "origin": "file",
+    "created_unix_s": 1000.0,
+    "scans": 100,
+    "age_s": 1.0,
+    "counts": np.full(48, 16_000.0),
+}
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory():
+    tracemalloc.start()
+    yield
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < MEMORY_LIMIT_BYTES
+
+
+def written(tmp_path, *records, magic=MCAP0_MAGIC):
+    builder = RecordBuilder()
+    builder.write(magic)
+    for record in records:
+        builder.write(record) if isinstance(record, bytes) else record.write(builder)
+    path = tmp_path / "made.mcap"
+    path.write_bytes(builder.end())
+    return path
+
+
+def channel_of(kind, number=1, text=None):
+    text = kind.definition.encode() if text is None else text
+    return (
+        Schema(id=number, name=kind.name, encoding="ros2msg", data=text),
+        Channel(id=number, topic=f"/t{number}", message_encoding="cdr", metadata={}, schema_id=number),
+    )
+
+
+def message(kind, values, channel=1, **changes):
+    return Message(channel, OFFSET_NS, kind.encode(values | changes), OFFSET_NS, 0)
+
+
+def refused(path, words):
+    with pytest.raises(RecordingError, match=words) as error:
+        load_recording(path)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 1000
+
+
+def test_files_that_are_something_else(tmp_path):
+    refused(written(tmp_path, magic=b"PK\3\4 not an mcap"), r"made\.mcap: not an MCAP file")
+    refused(written(tmp_path), r"no scans that edge-sr recorded; .* breaks off \(without an end, at byte 8\)")
+    refused(tmp_path / "gone.mcap", r"gone\.mcap: cannot be read: No such file")
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_a_file_of_others_is_refused_with_its_topics(tmp_path, compression):
+    with (tmp_path / "other.mcap").open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start()
+        for number in range(12):
+            schema = writer.register_schema("Other", "jsonschema", b"{}")
+            channel = writer.register_channel(f"/camera\n{number}", "json", schema)
+            writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    refused(tmp_path / "other.mcap", r"no scans that edge-sr recorded; its topics are '/camera\\n0', .*, and 2 more")
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_scans_are_found_in_whatever_another_writer_packs_them(tmp_path, compression):
+    with (tmp_path / "other.mcap").open("wb") as file:
+        writer = Writer(file, compression=compression)
+        writer.start()
+        other = writer.register_channel("/other", "json", writer.register_schema("Other", "jsonschema", b"{}"))
+        own = writer.register_channel(
+            "/t", "cdr", writer.register_schema(SCAN.name, "ros2msg", SCAN.definition.encode())
+        )
+        for number in range(3):
+            writer.add_message(other, 1, b"{}", 1)
+            writer.add_message(own, OFFSET_NS, SCAN.encode(GOOD | {"number": number}), OFFSET_NS)
+        writer.finish()
+    recording = load_recording(tmp_path / "other.mcap")
+    assert recording.tracks[0].numbers.tolist() == [0, 1, 2] and recording.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sensor": ""}, "sensor"),
+        ({"sensor": "a\nb"}, "sensor"),
+        ({"number": -1}, "number"),
+        ({"time_ns": -1}, "time_ns"),
+        ({"time_ns": 1 << 61}, "time_ns"),
+        ({"device_time_ns": -2}, "device_time_ns"),
+        ({"fresh": 0x1FFFF}, "fresh"),
+        ({"renewed": 0x10000}, "fresh"),
+        ({"fresh": 0xFFFE, "renewed": 1}, "fresh"),
+        ({"fresh": 0xFFFE, "renewed": 0}, "one on each axis"),
+        ({"counts": np.full(48, -1)}, "one on each axis"),
+        ({"counts": np.full(48, -2)}, "counts"),
+        ({"counts": np.full(48, 0x10000)}, "counts"),
+        ({"vendor_newtons": np.zeros(47)}, "vendor_newtons"),
+        ({"vendor_newtons": np.full(48, np.nan)}, "vendor_newtons"),
+        ({"vendor_newtons": np.full(48, -1001.0)}, "vendor_newtons"),
+        ({"vendor_temperature_k": np.full(16, np.inf)}, "vendor_temperature_k"),
+        ({"vendor_temperature_k": np.full(16, 199.0)}, "vendor_temperature_k"),
+        ({"vendor_ups_hz": np.full(16, np.nan)}, "vendor_ups_hz"),
+        ({"vendor_ups_hz": np.full(16, -1.0)}, "vendor_ups_hz"),
+    ],
+)
+def test_scans_that_cannot_be(tmp_path, changes, words):
+    refused(written(tmp_path, *channel_of(SCAN), message(SCAN, GOOD, **changes)), rf"topic '/t1': .*{words}")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sensor": ""}, "sensor"),
+        ({"id": ""}, "id"),
+        ({"created_unix_s": -1.0}, "created_unix_s"),
+        ({"created_unix_s": float("inf")}, "created_unix_s"),
+        ({"created_unix_s": float("nan"), "age_s": -1.0}, "age_s"),
+        ({"created_unix_s": float("nan"), "age_s": 1e300}, "age_s"),
+        ({"created_unix_s": 1e300}, "created_unix_s"),
+        ({"scans": 0}, "scans"),
+        ({"counts": np.full(48, float("inf"))}, "counts"),
+        ({"counts": np.full(48, -1.0)}, "counts"),
+    ],
+)
+def test_baselines_that_cannot_be(tmp_path, changes, words):
+    records = (*channel_of(SCAN), *channel_of(BASELINE, 2), message(BASELINE, REST, 2, **changes), message(SCAN, GOOD))
+    refused(written(tmp_path, *records), rf"topic '/t2': {words}")
+
+
+def test_times_that_go_back_and_too_many_sensors(tmp_path):
+    scans = [message(SCAN, GOOD, time_ns=10), message(SCAN, GOOD, time_ns=9)]
+    refused(written(tmp_path, *channel_of(SCAN), *scans), r"times of sensor '4' that go back")
+    scans = [message(SCAN, GOOD, sensor=str(n)) for n in range(65)]
+    refused(written(tmp_path, *channel_of(SCAN), *scans), r"more than 64 sensors")
+    scans = [message(BASELINE, REST, 2, sensor=str(n)) for n in range(65)]
+    refused(written(tmp_path, *channel_of(BASELINE, 2), *scans), r"baselines of more than 64 sensors")
+
+
+@pytest.mark.parametrize("log_ns", [1 << 63, (1 << 31) * 10**9, 10, 0])
+@pytest.mark.parametrize("second_ns", [10**9, 10, 0])
+def test_what_is_read_can_be_recorded_again(tmp_path, log_ns, second_ns):
+    first, second = SCAN.encode(GOOD | {"time_ns": 10**9}), SCAN.encode(GOOD | {"sensor": "6", "time_ns": second_ns})
+    messages = [Message(1, log_ns, data, log_ns, 0) for data in (first, second)]
+    path = written(tmp_path, *channel_of(SCAN), *messages)
+    if not 0 <= log_ns + second_ns - 10**9 <= log_ns < (1 << 31) * 10**9:
+        refused(path, r"a scan of sensor '[46]' at -?[0-9,]+ ns since 1970, expected 0\.\.")
+        return
+    contract = make_contract()
+    with open_recording(path) as source:
+        sink = open_sink(f"mcap:{tmp_path}/again.mcap", contract, source)
+        for result in Stream(source, Runtime(FakeModel(contract), source=source.kind)):
+            sink.write(result, {})
+        sink.close()
+    tracks = load_recording(tmp_path / "again.mcap").tracks
+    assert {one.sensor: one.time_ns.tolist() for one in tracks} == {"4": [10**9], "6": [second_ns]}
+
+
+def test_a_definition_of_another_release(tmp_path):
+    refused(written(tmp_path, *channel_of(SCAN, text=b"int8 a\n"), message(SCAN, GOOD)), r"of another release")
+
+
+def test_more_than_can_be_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(mcap_recording, "MOST_KEPT_BYTES", 1000)
+    scans = [message(SCAN, GOOD, time_ns=10 + n) for n in range(6)]
+    refused(written(tmp_path, *channel_of(SCAN), *scans), r"more scans than 1,000 bytes hold")
+
+
+def chunk(data, compression="zstd", size=None, crc=0, packed=None):
+    packed = zstandard.compress(data) if packed is None else packed
+    return Chunk(compression, packed, 0, 0, crc, len(data) if size is None else size)
+
+
+BOMB = zstandard.compress(bytes(1 << 28))
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        (chunk(b"", size=1 << 40), "expected at most"),
+        (chunk(b"", packed=BOMB, size=1 << 28), "expected at most"),
+        (chunk(b"", packed=BOMB, size=1 << 20), r"does not hold the 1,048,576 bytes"),
+        (chunk(b"abc", packed=b"nothing"), "cannot be unpacked"),
+        (chunk(b"abc", crc=1), "check sum"),
+        (chunk(b"abc", "rot13"), "compressed by 'rot13'"),
+        (chunk(b"abc", "lz4", packed=b"nothing"), "cannot be unpacked"),
+        (chunk(b"abc"), "a chunk that is cut off"),
+        (chunk(struct.pack("<BQ", 5, 1 << 60)), "a chunk that is cut off"),
+        (chunk(struct.pack("<BQ", 5, 3) + b"abc"), "a message that is cut off"),
+        (struct.pack("<BQ", 6, 1 << 62), "within a record"),
+        (struct.pack("<BQ", 4, 8) + b"\xff" * 8, "cannot be read"),
+        (struct.pack("<BQ", 6, 40) + bytes(28) + struct.pack("<IQ", 0, 1 << 62), "cannot be unpacked"),
+        (struct.pack("<BQ", 6, MOST_RECORD_BYTES + 1) + bytes(MOST_RECORD_BYTES + 1), "expected at most"),
+    ],
+)
+def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, words):
+    scan = message(SCAN, GOOD)
+    recording = load_recording(written(tmp_path, *channel_of(SCAN), scan, broken, scan))
+    assert len(recording.tracks[0].counts) == 1
+    (note,) = recording.notes
+    assert len(note) < 1000 and "\n" not in note
+    if words == "within a record":
+        assert "breaks off (within a record, at byte" in note
+    else:
+        behind = (tmp_path / "made.mcap").stat().st_size
+        left = int(re.search(r"is damaged \(.*\): ([0-9,]+) bytes behind that are not read", note)[1].replace(",", ""))
+        assert 0 < left < behind
+    with pytest.raises(RecordingError, match=words):
+        load_recording(written(tmp_path, broken))
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "", "[]", "{}", "[" * 5000, json.dumps({"order": [0] * 16, "swap_xy": False, "signs": [1, 1, 1], "gains": [1]}),
+        json.dumps({"order": list(range(16)), "swap_xy": False, "signs": [1, 1, 1], "gains": [1e999] * 48}),
+        json.dumps({"order": list(range(16)), "swap_xy": 2, "signs": [1, 1, 1], "gains": [1.0] * 48}),
+        json.dumps({"order": [0.0, *range(1, 16)], "swap_xy": True, "signs": [1, 1, 1], "gains": [1.0] * 48}),
+    ],
+)  # fmt: skip
+def test_mountings_that_cannot_be(tmp_path, said):
+    refused(written(tmp_path, Metadata("mounting", {"sensor": "4", "mounting": said})), r"no mounting of sensor '4'")
+
+
+def test_a_flipped_bit_is_seen_or_changes_no_reading(tmp_path):
+    path = record_into(tmp_path / "whole.mcap", make_results(odd_scans(4)))
+    data, flipped = path.read_bytes(), tmp_path / "flipped.mcap"
+    counts = {track.sensor: track.counts for track in load_recording(path).tracks}
+    rng = np.random.default_rng(3)
+    for at in rng.integers(8, len(data), 300).tolist():
+        flipped.write_bytes(data[:at] + bytes((data[at] ^ 1 << int(rng.integers(8)),)) + data[at + 1 :])
+        try:
+            recording = load_recording(flipped)
+        except RecordingError:
+            continue
+        for track in recording.tracks:
+            assert (track.counts == counts[track.sensor][: len(track.counts)]).all()

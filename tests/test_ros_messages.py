@@ -1,0 +1,231 @@
+"""Bytes of ROS messages, held against CycloneDDS's own serializer, which knows nothing of ours."""
+
+import json
+import math
+import struct
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from cyclonedds.idl import IdlStruct, types
+from edge_samples import make_scan
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap_samples import OFFSET_NS, make_results, odd_scans
+
+from edge import ros_messages
+from edge.event import Event
+from edge.record import record
+from edge.result import Result
+from firmware_bridge.cdr import HEADER, MessageType, stamp
+from firmware_bridge.errors import CdrError
+from firmware_bridge.scan import VendorReading
+from firmware_bridge.scan_messages import SCAN, decode_scan, encode_scan
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    sec: types.int32
+    nanosec: types.uint32
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
+    header: Header
+    height: types.uint32
+    width: types.uint32
+    encoding: str
+    is_bigendian: types.uint8
+    step: types.uint32
+    data: types.sequence[types.uint8]
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
+    x: types.float64
+    y: types.float64
+    z: types.float64
+
+
+@dataclass
+class Wrench(IdlStruct, typename="geometry_msgs::msg::dds_::Wrench_"):
+    force: Vector3
+    torque: Vector3
+
+
+@dataclass
+class WrenchStamped(IdlStruct, typename="geometry_msgs::msg::dds_::WrenchStamped_"):
+    header: Header
+    wrench: Wrench
+
+
+@dataclass
+class Log(IdlStruct, typename="rcl_interfaces::msg::dds_::Log_"):
+    stamp: Time
+    level: types.uint8
+    name: str
+    msg: str
+    file: str
+    function: str
+    line: types.uint32
+
+
+@dataclass
+class Scan(IdlStruct, typename="Scan"):
+    header: Header
+    sensor: str
+    number: types.int64
+    time_ns: types.int64
+    device_time_ns: types.int64
+    fresh: types.uint64
+    renewed: types.uint64
+    counts: types.array[types.int32, 48]
+    vendor_newtons: types.sequence[types.float32]
+    vendor_temperature_k: types.sequence[types.float32]
+    vendor_ups_hz: types.sequence[types.float32]
+
+
+UNIX_NS = 1_700_000_000_123_456_789
+STAMP = Time(1_700_000_000, 123_456_789)
+
+
+@pytest.mark.parametrize("sensor", ["4", "left/4", "ünten", "a" * 64])
+def test_an_image_is_what_cyclonedds_writes(sensor):
+    values = np.random.default_rng(1).normal(size=(3, 5)).astype(np.float32)
+    expected = Image(Header(STAMP, sensor), 3, 5, "32FC1", 0, 20, list(values.tobytes())).serialize()
+    data = ros_messages.image(values, sensor, UNIX_NS)
+    assert data == bytes(expected)
+    assert ros_messages.image_map(data).tobytes() == values.tobytes()
+
+
+def test_an_image_of_columns_is_written_row_by_row():
+    values = np.arange(12, dtype=np.float32).reshape(3, 4).T
+    assert (ros_messages.image_map(ros_messages.image(values, "4", 0)) == values).all()
+
+
+def test_another_image_is_not_taken_for_a_map():
+    said = ros_messages.IMAGE.decode(ros_messages.image(np.zeros((2, 2), np.float32), "4", 0))
+    with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
+        ros_messages.image_map(ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
+
+
+def test_a_force_says_what_is_known_and_no_more():
+    newtons = np.full((3, 4, 4), 0.125, np.float32)
+    scan = make_scan(press_counts=3000)
+    result = Result(replace(scan, vendor=VendorReading(newtons)), "device", "m", "contact", force_n=2.5)
+    nothing = Vector3(math.nan, math.nan, math.nan)
+    for force_n, vector in ((2.0, Vector3(2.0, 2.0, 2.0)), (2.5, Vector3(math.nan, math.nan, 2.5))):
+        expected = WrenchStamped(Header(STAMP, "4"), Wrench(vector, nothing)).serialize()
+        said = ros_messages.wrench(replace(result, force_n=force_n), UNIX_NS)
+        assert said == bytes(expected), "x and y are known where all of it is the vendor's"
+    said = ros_messages.WRENCH_STAMPED.decode(ros_messages.wrench(replace(result, scan=scan), UNIX_NS))
+    assert said["wrench"]["force"]["z"] == 2.5 and math.isnan(said["wrench"]["force"]["x"])
+
+
+@pytest.mark.parametrize(("source", "frame"), [("device", "4"), ("emulated", "emulated/4"), ("replay", "replay/4")])
+def test_the_frame_says_where_there_is_no_sensor(source, frame):
+    result = Result(make_scan(press_counts=3000), source, "m", "contact", force_n=2.5)
+    said = ros_messages.WRENCH_STAMPED.decode(ros_messages.wrench(result, UNIX_NS))
+    assert said["header"]["frame_id"] == frame
+
+
+def test_nothing_known_in_newtons_is_no_wrench():
+    result = Result(make_scan(press_counts=3000), "device", "m", "contact", force_counts=3000.0)
+    assert ros_messages.wrench(result, UNIX_NS) is None
+
+
+@pytest.mark.parametrize(("kind", "level"), [("lost", 40), ("silent", 30), ("back", 20), ("sink", 40)])
+def test_an_event_is_a_line_of_the_log(kind, level):
+    data = ros_messages.log_message(Event(5, kind, None, "über"), UNIX_NS)
+    assert data == bytes(Log(STAMP, level, "edge-sr", "über", "", kind, 0).serialize())
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_a_scan_is_what_cyclonedds_writes_and_comes_back_as_it_was(number):
+    for scan in odd_scans(4)[2 * number : 2 * number + 2]:
+        fresh, renewed = (sum(1 << i for i, one in enumerate(m.ravel()) if one) for m in (scan.fresh, scan.renewed))
+        data = encode_scan(scan, UNIX_NS, fresh, renewed)
+        vendor = scan.vendor or VendorReading()
+        lists = [[] if a is None else a.ravel().tolist() for a in (vendor.newtons, vendor.temperature_k, vendor.ups_hz)]
+        device_ns = -1 if scan.device_ns is None else scan.device_ns
+        expected = Scan(
+            Header(STAMP, scan.sensor), scan.sensor, scan.number, scan.time_ns, device_ns, fresh, renewed,
+            scan.counts.ravel().tolist(), *lists,
+        )  # fmt: skip
+        assert data == bytes(expected.serialize())
+        got = decode_scan(data)
+        assert (got.counts == scan.counts).all() and (got.fresh, got.renewed) == (fresh, renewed)
+
+
+def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():
+    for result in make_results(odd_scans(4)):
+        said = ros_messages.RESULT.decode(ros_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
+        told = json.loads(said["record"])
+        assert told["counts"][2][1][1] == (result.scan.counts[2, 1, 1] if result.scan.fresh[1, 1] else None)
+        assert told["counters"] == {"late": 1} and said["header"]["frame_id"] == result.scan.sensor
+        assert said["force_counts"] == result.force_counts or result.force_counts is None
+        assert math.isnan(said["run_time_us"]) == (result.run_time_us is None)
+        assert said["contact"] == {None: -1, False: 0, True: 1}[result.contact]
+
+
+NUMBERS = st.lists(st.floats(width=32, allow_nan=False, allow_subnormal=False), max_size=3)
+MIXED = MessageType("x/msg/Mixed", "string a\nint8 b\nfloat64[] c\nuint8 d\nfloat64 e\nint64[2] f\nstring g")
+
+
+@dataclass
+class Mixed(IdlStruct, typename="Mixed"):
+    a: str
+    b: types.int8
+    c: types.sequence[types.float64]
+    d: types.uint8
+    e: types.float64
+    f: types.array[types.int64, 2]
+    g: str
+
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
+
+
+@given(TEXT, NUMBERS, TEXT)
+def test_whatever_stands_before_a_number_it_lies_where_cyclonedds_puts_it(a, c, g):
+    values = {"a": a, "b": -3, "c": c, "d": 7, "e": 0.1, "f": [1, -2], "g": g}
+    data = MIXED.encode(values)
+    assert data == bytes(Mixed(**values).serialize())
+    got = MIXED.decode(data)
+    assert (got["a"], got["g"], got["c"].tolist(), got["f"].tolist()) == (a, g, c, [1, -2])
+
+
+def test_no_length_is_believed_that_the_bytes_do_not_bear_out():
+    data = MIXED.encode({"a": "abc", "b": 0, "c": [1.0], "d": 0, "e": 0.0, "f": [0, 0], "g": "z"})
+    for end in range(len(data)):
+        with pytest.raises(CdrError):
+            MIXED.decode(data[:end])
+    for length in (0, 100, 0xFFFFFFFF):  # of a text: none of it, not even its end, and far too much
+        with pytest.raises(CdrError, match=r"a has \d+ bytes"):
+            MIXED.decode(data[:4] + struct.pack("<I", length) + data[8:])
+    with pytest.raises(CdrError, match=r"begins with 00000000"):
+        MIXED.decode(bytes(4) + data[4:])
+    with pytest.raises(CdrError, match=r"utf-8"):
+        MIXED.decode(data[:8] + b"\xff" + data[9:])
+
+
+def test_a_definition_names_the_messages_in_it():
+    text = SCAN.definition
+    assert text.count("=" * 80) == 2
+    assert text.index("MSG: std_msgs/Header\n") < text.index("MSG: builtin_interfaces/Time\nint32 sec\n")
+    assert ros_messages.WRENCH_STAMPED.definition.count("MSG: geometry_msgs/Vector3\n") == 1
+    for wrong in ("float128 a", "int8 A", "std_msgs/Other a", "string[] a"):
+        with pytest.raises(ValueError, match=r"kind|no field"):
+            MessageType("x/msg/X", wrong)
+    with pytest.raises(ValueError, match=r"f has 3 numbers, expected 2"):
+        MIXED.encode({"a": "", "b": 0, "c": [], "d": 0, "e": 0, "f": [1, 2, 3], "g": ""})
+
+
+def test_a_time_is_of_1970():
+    assert stamp(OFFSET_NS + 5) == {"sec": OFFSET_NS // 10**9, "nanosec": 5} and HEADER == b"\0\1\0\0"
