@@ -1,0 +1,180 @@
+"""Scans, patterns and events over zenoh, from many grippers to one place. docs/middleware.md describes the messages.
+
+zenoh's own threads send: `put` hands over and returns. What the network does not take in time zenoh drops, without
+telling; readers tell by the gaps in `scan`.
+"""
+
+import json
+import os
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+import orjson
+
+from edge.errors import SinkError, UsageError
+from edge.event import Event
+from edge.packed import pack
+from edge.record import event_record, record
+from edge.result import Result
+from edge.sinks.base import Sink
+from firmware_bridge.extras import how_to_install
+
+if TYPE_CHECKING:
+    import zenoh
+
+PLACE: Final = "tcp/127.0.0.1:7447"
+"""Where a router listens on this machine, with zenoh's usual port."""
+CLOSED: Final = {
+    "mode": "peer",
+    "listen/endpoints": [],
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/shared_memory/enabled": False,
+}
+"""Nobody is let in, looked for or heard of, unless a configuration says so: zenoh's own defaults would do it all."""
+CLOSE_S: Final = 1.0
+_JSON: Final = "application/json"
+_PACKED: Final = "application/octet-stream"
+_REMEDY: Final = "expected zenoh:KEY, zenoh:KEY?connect=tcp/HOST:7447 or zenoh:KEY?config=FILE.json5"
+
+
+class ZenohSink(Sink):
+    """Puts KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, and lives as KEY/alive/ID.
+
+    Attributes:
+        zid: the session's id, which the time stamp of every message holds, too.
+    """
+
+    def __init__(self, target: str, *, patient: bool = False, source: str | None = None) -> None:
+        """Open a session; whether anybody is there, now or later, is all the same.
+
+        Args:
+            target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
+            patient: wait for a slow network, rather than leave messages out.
+            source: kind of what is read, told with every event.
+
+        Raises:
+            UsageError: the target cannot be understood.
+            SinkError: no zenoh, or it cannot be opened.
+        """
+        key, configuration = understood(target)
+        try:
+            import zenoh
+        except ImportError as error:
+            raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
+        self._zenoh = zenoh
+        self._key = key
+        self._source = source
+        self._congestion = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
+        try:
+            self._session = zenoh.open(_config(configuration))
+            self.zid = str(self._session.zid())
+            self._events = self._publisher(f"{key}/event", _JSON)
+            self._alive = self._session.liveliness().declare_token(f"{key}/alive/{self.zid}")
+        except zenoh.ZError as error:
+            raise SinkError(f"zenoh cannot be opened: {_reason(error)}") from error
+        self._publishers: dict[str, tuple[zenoh.Publisher, zenoh.Publisher]] = {}
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Put the scan, and its pattern where that is new.
+
+        Raises:
+            SinkError: the session is broken.
+        """
+        publishers = self._publishers.get(result.scan.sensor) or self._declare(result.scan.sensor)
+        said = record(result, counters)
+        self._put(publishers[0], orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
+        if result.pattern is not None and result.reused_from is None:
+            maps = {"pattern": result.pattern}
+            if result.deviation is not None:
+                maps["deviation"] = result.deviation
+            self._put(publishers[1], pack(said, maps))
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Put an event.
+
+        Raises:
+            SinkError: the session is broken.
+        """
+        self._put(self._events, orjson.dumps(event_record(event, counters, self._source)))
+
+    def close(self) -> None:
+        """Send what is under way, and end; subscribers to KEY/alive/* are told.
+
+        A subscriber that stands still would hold zenoh up for ten seconds: it is left alone after one.
+        """
+        closing = threading.Thread(target=self._close, name="zenoh-close", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+
+    def _close(self) -> None:
+        with suppress(self._zenoh.ZError):  # that it took too long, which is no fault of what was done
+            self._session.close()
+
+    def _declare(self, sensor: str) -> "tuple[zenoh.Publisher, zenoh.Publisher]":
+        base = f"{self._key}/{chunks(sensor)}"
+        publishers = self._publisher(f"{base}/scan", _JSON), self._publisher(f"{base}/pattern", _PACKED)
+        self._publishers[sensor] = publishers
+        return publishers
+
+    def _publisher(self, key: str, encoding: str) -> "zenoh.Publisher":
+        return self._session.declare_publisher(key, encoding=encoding, congestion_control=self._congestion)
+
+    def _put(self, publisher: "zenoh.Publisher", message: bytes) -> None:
+        try:
+            publisher.put(message, timestamp=self._session.new_timestamp())
+        except self._zenoh.ZError as error:
+            raise SinkError(f"zenoh cannot send: {_reason(error)}") from error
+
+
+def chunks(sensor: str) -> str:
+    """A sensor's name as part of a key: as in a web address, so that `urllib.parse.unquote` gives it back."""
+    return quote(sensor, safe="/" if all(sensor.split("/")) else "")
+
+
+def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
+    """Key and configuration that a target asks for.
+
+    Raises:
+        UsageError: it cannot be understood.
+    """
+    key, asked, option = target.partition("?")
+    if not all(key.split("/")) or set(key) & set("*$#") or key.startswith("@") or "/@" in key:
+        raise UsageError(
+            f"zenoh:{target} has {key!r} for a key: expected words with '/' between, without any of * $ # @"
+        )
+    name, _, value = option.partition("=")
+    if not asked:
+        return key, {**CLOSED, "connect/endpoints": [PLACE]}
+    if name == "connect" and all("/" in endpoint for endpoint in value.split(",")):
+        return key, {**CLOSED, "connect/endpoints": value.split(",")}
+    if name == "config" and value:
+        return key, Path(value)
+    raise UsageError(f"zenoh:{target} has {option!r} behind its key: {_REMEDY}")
+
+
+def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
+    """Zenoh's own, with all doors closed that the user does not open."""
+    import zenoh
+
+    config = zenoh.Config()
+    if isinstance(configuration, Path):
+        untouched = {name: config.get_json(name) for name in CLOSED}
+        try:
+            config = zenoh.Config.from_file(configuration)
+        except zenoh.ZError as error:
+            raise SinkError(f"{configuration} is no configuration of zenoh: {_reason(error)}") from error
+        configuration = {name: CLOSED[name] for name, said in untouched.items() if config.get_json(name) == said}
+    for name, value in configuration.items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def _reason(error: Exception) -> str:
+    """What zenoh says, without where in its source, which comes behind " at "."""
+    said = str(error).strip().partition(f" at {os.sep}")[0]
+    return said.strip().splitlines()[-1].lstrip(" =")

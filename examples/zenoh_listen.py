@@ -1,0 +1,65 @@
+"""Print what grippers send that run `edge-sr --sink zenoh:KEY`: python zenoh_listen.py KEY [tcp/ADDRESS:7447].
+
+It is the one place that they connect to, on this machine unless told otherwise; with a zenoh router, zenohd, in that
+place, insert "connect/endpoints" instead of "listen/endpoints". Messages are described in docs/middleware.md.
+"""
+
+import json
+import os
+import sys
+from contextlib import suppress
+from math import prod
+from struct import unpack_from
+
+import numpy as np
+import zenoh
+
+
+def unpack(message: bytes) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header and maps of a pattern's message."""
+    (length,) = unpack_from("<I", message)
+    header, at, maps = json.loads(message[4 : 4 + length]), 4 + length, {}
+    for name, shape in header["maps"]:
+        maps[name] = np.frombuffer(message, "<f4", prod(shape), at).reshape(shape)
+        at += maps[name].nbytes
+    return header, maps
+
+
+def tell(line: str) -> None:
+    """Print at once; from any thread, since zenoh has its own."""
+    try:
+        print(line, flush=True)
+    except BrokenPipeError:  # who read has had enough
+        os._exit(0)
+
+
+def main(key: str, endpoint: str = "tcp/127.0.0.1:7447") -> None:
+    """Print a line for each new pattern, each event, and each gripper that comes or goes."""
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session, session.declare_subscriber(f"{key}/**") as samples:
+        session.liveliness().declare_subscriber(
+            f"{key}/alive/*",
+            lambda token: tell(f"{token.key_expr} {'came' if token.kind == zenoh.SampleKind.PUT else 'went'}"),
+        )
+        tell("listens")
+        for sample in samples:
+            what = str(sample.key_expr).rpartition("/")[2]
+            if what == "event":
+                tell(json.loads(sample.payload.to_bytes())["note"])
+            elif what == "pattern":
+                header, maps = unpack(sample.payload.to_bytes())
+                # "source" must be "device" before a robot acts on it.
+                told = f"{header['sensor']} {header['source']} scan {header['scan']}"
+                tell(f"{told}: {header['force_counts']} counts, {maps['pattern'].max():.3f} mm at most")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) not in (2, 3):
+        sys.exit("usage: python zenoh_listen.py KEY [tcp/ADDRESS:7447]")
+    try:
+        with suppress(KeyboardInterrupt):
+            main(*sys.argv[1:])
+    except zenoh.ZError as error:
+        sys.exit(f"zenoh_listen: {error}")

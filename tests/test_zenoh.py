@@ -1,0 +1,464 @@
+"""Results over zenoh: what another process reads, in a session of its own over loopback TCP."""
+
+import json
+import os
+import queue
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import orjson
+import pytest
+from bridge_samples import write_recording
+from edge_samples import BASELINE, ROOT, FakeModel, ended, make_contract, make_scan, write_model
+from test_listening import reachable
+
+from edge import api
+from edge.bench.zenoh import PacedLink
+from edge.bench.zenoh import _figures as figures_of
+from edge.errors import SinkError, UsageError
+from edge.event import Event
+from edge.packed import unpack
+from edge.record import event_record, record
+from edge.runtime import Runtime
+from edge.sinks.forms import open_sink
+from edge.sinks.zenoh import ZenohSink, chunks
+
+zenoh = pytest.importorskip("zenoh")
+
+CONTRACT = make_contract(interval_factor=1.6)
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "PYTHONUNBUFFERED": ""}
+# Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
+CONSUME = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+def tell(*words):
+    print(json.dumps(words), flush=True)
+def take(sample):
+    writer, payload = str(sample.timestamp.get_id()), sample.payload.to_bytes().hex()
+    tell("got", str(sample.key_expr), str(sample.encoding), writer, payload)
+def follow(token):
+    tell("came" if token.kind == zenoh.SampleKind.PUT else "went", str(token.key_expr))
+here = lambda callback: zenoh.handlers.Callback(callback, indirect=False)
+with zenoh.open(config) as session:
+    session.liveliness().declare_subscriber("grip/alive/*", here(follow), history=True)
+    session.declare_subscriber("grip/**", here(take))
+    tell("listens")
+    time.sleep(100)
+"""
+
+
+def free_endpoint():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{one.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+def listening(endpoint, *connect):
+    """A session of zenoh's own that listens there."""
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/endpoints", json.dumps(connect))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+class Consumer:
+    def __init__(self, endpoint):
+        self.process = subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE)
+        self.lines = queue.SimpleQueue()
+        self.reader = threading.Thread(target=self.read)  # at once: a full pipe would hold up the consumer
+        self.reader.start()
+        assert self.next() == ["listens"]
+
+    def read(self):
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(line)
+
+    def next(self):
+        return json.loads(self.lines.get(timeout=60))
+
+    def until_gone(self):
+        """Messages, each as key, encoding, writer, payload, until the writer has gone; and who that was."""
+        told = [self.next()]
+        while told[-1][0] != "went":
+            told.append(self.next())
+        with suppress(queue.Empty):  # that it goes may overtake what it sent
+            while True:
+                told.append(json.loads(self.lines.get(timeout=0.6)))
+        messages = [(*words[1:-1], bytes.fromhex(words[-1])) for words in told if words[0] == "got"]
+        return messages, [words for words in told if words[0] != "got"]
+
+    def stop(self):
+        self.process.kill()
+        self.process.wait()
+        self.reader.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def consume():
+    consumers = []
+
+    def start(endpoint):
+        consumers.append(Consumer(endpoint))
+        return consumers[-1]
+
+    yield start
+    for consumer in consumers:
+        consumer.stop()
+
+
+def make_results(count, **of_the_scans):
+    """Contact from the second on; every other of those as the one before it."""
+    runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
+    presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
+    return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]
+
+
+def wait_for(condition, within_s=10):
+    end_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def plain(said):
+    """As JSON says it."""
+    return orjson.loads(orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
+class TestMessages:
+    def test_all_that_was_written_comes_in_its_order(self, endpoint, consume):
+        consumer, results = consume(endpoint), make_results(40)
+        assert 5 < sum(result.pattern is not None and result.reused_from is None for result in results) < 30
+        event = Event(5, "lost", None, "the cable is out")
+        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, source="emulated")
+        expected = []
+        for number, result in enumerate(results):
+            counters = {"scans": number}
+            sink.write(result, counters)
+            said = plain(record(result, counters))
+            expected.append(("grip/4/scan", "application/json", said, {}))
+            if result.pattern is not None and result.reused_from is None:
+                maps = {"pattern": result.pattern, "deviation": result.deviation}
+                expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
+            if number == 20:
+                sink.tell(event, counters)
+                expected.append(
+                    (
+                        "grip/event",
+                        "application/json",
+                        plain(event_record(event, counters, "emulated")),
+                        {},
+                    )
+                )
+        sink.close()
+        messages, lives = consumer.until_gone()
+        alive = f"grip/alive/{sink.zid}"
+        assert lives == [["came", alive], ["went", alive]]
+        assert [message[:2] for message in messages] == [wanted[:2] for wanted in expected]
+        for (key, _, writer, payload), (*_, said, maps) in zip(messages, expected, strict=True):
+            assert writer == sink.zid
+            header, got = unpack(payload) if key.endswith("pattern") else (json.loads(payload), {})
+            header.pop("maps", None)
+            assert header == said
+            assert header["source"] == "emulated"
+            assert got.keys() == maps.keys()
+            for name, values in maps.items():
+                np.testing.assert_array_equal(got[name], values)
+
+    def test_a_replay_by_the_program_loses_nothing(self, endpoint, consume, tmp_path):
+        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
+        rng = np.random.default_rng(1)
+        presses = [0] * 110 + [2000 + 300 * (number // 3) for number in range(60)]
+        counts = np.stack(
+            [make_scan(n, press_counts=z).counts + rng.integers(-2, 3, (3, 4, 4)) for n, z in enumerate(presses)]
+        )
+        write_recording(tmp_path / "taps.csv", counts)
+        command = [sys.executable, "-m", "edge.cli", "replay", f"{tmp_path}/taps.csv", "--zero", "--model", str(model)]
+        sinks = ["--sink", f"zenoh:grip?connect={endpoint}", "--sink", f"jsonl:{tmp_path}/out.jsonl"]
+        consumer = consume(endpoint)
+        done = subprocess.run(
+            [*command, "--rate-hz", "400", "--every-scan", *sinks], env=ENVIRONMENT, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        messages, _ = consumer.until_gone()
+        records = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+        scans = [json.loads(payload) for key, *_, payload in messages if key.endswith("/scan")]
+        patterns = [unpack(payload) for key, *_, payload in messages if key.endswith("/pattern")]
+        new = [one for one in records if one["pattern"] is not None and one["reused_from"] is None]
+        assert new and [header["scan"] for header, _ in patterns] == [one["scan"] for one in new]
+        for (header, maps), one in zip(patterns, new, strict=True):
+            assert header["source"] == "replay"
+            np.testing.assert_allclose(maps["pattern"], one["pattern"], atol=1e-7)
+        for scan, one in zip(scans, records, strict=True):
+            assert scan == {name: one[name] for name in scan} | {"counters": scan["counters"]}
+
+    def test_events_say_of_what_they_are(self):
+        with api.open_source("demo") as source:
+            sink = api.open_sink("zenoh:grip", CONTRACT, source)
+        put = []
+        sink._put = lambda publisher, message: put.append(json.loads(message))
+        sink.tell(Event(5, "lost", None, "the cable is out"), {})
+        sink.close()
+        assert [(said["event"], said["source"]) for said in put] == [("lost", "emulated")]
+
+    @pytest.mark.parametrize("sensor", ["4", "left/4", "/4", "a//b", "a*?#$b", "%2F", "@left", "右 手"])
+    def test_every_name_of_a_sensor_makes_a_key_and_is_told(self, sensor):
+        part = chunks(sensor)
+        assert unquote(part) == sensor
+        key = zenoh.KeyExpr(f"grip/{part}/scan")
+        assert zenoh.KeyExpr("grip/**").includes(key) and not set("*$#?") & set(part)
+
+    def test_different_names_make_different_keys(self):
+        names = ["a//b", "a/b", "a%2F%2Fb", "a%2Fb", "/a/b", "a b", "a%20b", "event", "alive"]
+        assert len({chunks(name) for name in names}) == len(names)
+
+
+class TestWhoComesAndGoes:
+    def test_a_reader_that_comes_late_hears_the_rest_and_who_is_there(self, endpoint, consume):
+        results = make_results(3)
+        sink = ZenohSink(f"grip?connect={endpoint}")
+        sink.write(results[0], {})
+        consumer = consume(endpoint)
+        sink.write(results[1], {})
+        wait_for(lambda: sink._events.matching_status.matching)
+        sink.write(results[2], {})
+        sink.close()
+        messages, lives = consumer.until_gone()
+        assert [words[0] for words in lives] == ["came", "went"]
+        scans = [json.loads(payload)["scan"] for key, *_, payload in messages if key.endswith("/scan")]
+        assert scans[-1] == 2 and 0 not in scans
+
+    def test_a_reader_that_goes_ends_nothing_and_the_next_is_found(self, endpoint, consume):
+        results = make_results(2)
+        first, sink = consume(endpoint), ZenohSink(f"grip?connect={endpoint}")
+        wait_for(lambda: sink._events.matching_status.matching)
+        sink.write(results[0], {})
+        first.stop()
+        wait_for(lambda: not sink._events.matching_status.matching)
+        sink.write(results[1], {})
+        second = consume(endpoint)
+        wait_for(lambda: sink._events.matching_status.matching)
+        sink.write(replace(results[1], note="again"), {})
+        sink.close()
+        messages, _ = second.until_gone()
+        assert json.loads(messages[0][-1])["note"] == "again"
+
+    def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consume):
+        consumer, result = consume(endpoint), make_results(2)[1]
+        sink = ZenohSink(f"grip?connect={endpoint}")
+        wait_for(lambda: sink._events.matching_status.matching)
+        consumer.process.send_signal(signal.SIGSTOP)
+        for number in range(1000):  # 15 MB, more than sockets and queues hold
+            sink.write(replace(result, scan=replace(result.scan, number=number)), {})
+        consumer.process.send_signal(signal.SIGCONT)
+        told = [consumer.next()]
+        while told[-1][:2] != ["got", "grip/event"]:
+            sink.tell(Event(5, "back", None, "goes on"), {})
+            told.append(consumer.next())
+        sink.close()
+        assert ["went", f"grip/alive/{sink.zid}"] not in told, "it was cut off: had it been waited for?"
+        scans = [json.loads(bytes.fromhex(words[-1]))["scan"] for words in told if words[1].endswith("/scan")]
+        assert scans == sorted(scans) and 0 < len(scans) < 1000
+
+    def test_a_killed_writer_is_told_to_have_gone(self, endpoint, consume):
+        consumer = consume(endpoint)
+        script = f"from edge.sinks.zenoh import ZenohSink; sink = ZenohSink('grip?connect={endpoint}'); input()"
+        with subprocess.Popen([sys.executable, "-c", script], env=ENVIRONMENT, stdin=subprocess.PIPE) as writer:
+            assert consumer.next()[0] == "came"
+            writer.kill()
+            assert consumer.next()[0] == "went"
+
+    def test_the_example_tells_patterns_events_and_grippers(self, endpoint):
+        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
+        with ended(subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)) as listener:
+            assert listener.stdout is not None and listener.stdout.readline() == "listens\n"
+            sink = ZenohSink(f"grip/left?connect={endpoint}")
+            wait_for(lambda: sink._events.matching_status.matching)
+            sink.write(make_results(2)[1], {})
+            sink.tell(Event(5, "lost", None, "the cable is out"), {})
+            lines = {listener.stdout.readline() for _ in range(3)}
+            sink.close()
+            lines.add(listener.stdout.readline())
+        alive = f"grip/left/alive/{sink.zid}"
+        pattern = "4 emulated scan 1: 3000.0 counts, 3.000 mm at most\n"
+        assert lines == {f"{alive} came\n", pattern, "the cable is out\n", f"{alive} went\n"}
+
+    @pytest.mark.parametrize("reader_goes", [True, False])
+    def test_the_example_ends_quietly_with_its_reader_and_with_ctrl_c(self, endpoint, reader_goes):
+        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        with ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **streams)) as listener:
+            assert listener.stdout is not None and listener.stdout.readline() == "listens\n"
+            if reader_goes:
+                listener.stdout.close()
+                ZenohSink(f"grip/left?connect={endpoint}").close()  # that it came is what would be told
+            else:
+                listener.send_signal(signal.SIGINT)
+            assert listener.stderr is not None
+            assert (listener.stderr.read(), listener.wait(60)) == ("", 0)
+
+    def test_the_example_says_what_is_wrong_with_its_place(self):
+        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", "tcp/192.0.2.1:7447"]
+        done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
+        assert done.returncode == 1 and done.stderr.startswith("zenoh_listen: ") and done.stderr.count("\n") == 1
+
+    def test_the_example_says_how_it_is_called(self):
+        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py")]
+        done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
+        assert done.returncode == 1 and done.stderr == "usage: python zenoh_listen.py KEY [tcp/ADDRESS:7447]\n"
+
+
+class TestOpening:
+    @pytest.mark.parametrize(
+        ("target", "told"),
+        [
+            ("a//b", r"'a//b' for a key"),
+            ("a/*", r"'a/\*' for a key"),
+            ("@/a", r"'@/a' for a key"),
+            ("a?listen=x", r"'listen=x' behind its key: expected zenoh:KEY, zenoh:KEY\?connect="),
+            ("a?connect=here", r"'connect=here' behind its key"),
+            ("a?", r"'' behind its key"),
+        ],
+    )
+    def test_what_cannot_be_understood_is_refused(self, target, told):
+        with pytest.raises(UsageError, match=told):
+            open_sink(f"zenoh:{target}", CONTRACT)
+
+    def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
+        with pytest.raises(SinkError, match=r"none.json5 is no configuration of zenoh: No such file"):
+            open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT)
+        (tmp_path / "bad.json5").write_text("{mode: ")
+        with pytest.raises(SinkError, match=r"bad.json5 is no configuration of zenoh: expected"):
+            open_sink(f"zenoh:a?config={tmp_path}/bad.json5", CONTRACT)
+
+    def test_an_endpoint_that_zenoh_does_not_know_is_told(self):
+        with pytest.raises(SinkError, match=r"zenoh cannot be opened: Unicast not supported for smoke protocol$"):
+            open_sink("zenoh:a?connect=smoke/1:2", CONTRACT)
+
+    def test_without_the_package_it_says_what_to_install(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "zenoh", None)
+        with pytest.raises(SinkError, match=r"pip install '\.\[zenoh\]'"):
+            open_sink("zenoh:a", CONTRACT)
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
+class TestListening:
+    def opened(self, target):
+        """What such a sink opens to more than this machine."""
+        before = reachable(os.getpid())
+        sink = ZenohSink(target)
+        after = reachable(os.getpid())
+        sink.close()
+        return [one for one in after if one not in before]
+
+    def test_nobody_can_reach_it_unless_a_configuration_says_so(self, tmp_path):
+        assert self.opened("grip") == []
+        config = tmp_path / "zenoh.json5"
+        config.write_text("{connect: {endpoints: ['tcp/127.0.0.1:1']}}")
+        assert self.opened(f"grip?config={config}") == []
+
+    def test_and_one_that_says_so_is_obeyed(self, tmp_path):
+        config = tmp_path / "zenoh.json5"
+        config.write_text("{listen: {endpoints: ['tcp/0.0.0.0:0']}}")
+        assert [one.split()[0] for one in self.opened(f"grip?config={config}")] == ["tcp"]
+        config.write_text("{scouting: {multicast: {enabled: true}}}")
+        assert "udp" in {one.split()[0] for one in self.opened(f"grip?config={config}")}
+
+
+@pytest.mark.parametrize("by_file", [False, True])
+def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
+    """A peer tells of the others that it knows."""
+    endpoint, others = free_endpoint(), free_endpoint()
+    config = tmp_path / "zenoh.json5"
+    config.write_text(json.dumps({"connect": {"endpoints": [endpoint]}}))
+    with listening(endpoint) as known, listening(others, endpoint):
+        wait_for(lambda: known.info.peers_zid())
+        sink = ZenohSink(f"grip?config={config}" if by_file else f"grip?connect={endpoint}")
+        wait_for(lambda: sink._session.info.peers_zid())
+        time.sleep(0.3)  # for a call to another, were there one
+        assert [str(peer) for peer in sink._session.info.peers_zid()] == [str(known.zid())]
+        sink.close()
+
+
+def test_the_bench_counts_what_comes():
+    wrote = [
+        {"written": 10, "patterns": 4, "dropped": 2, "cpu_s": 0.5},
+        {"written": 10, "patterns": 4, "dropped": 0, "cpu_s": 0.3},
+    ]
+    got = {"latencies_us": {"scan": [1000.0] * 15, "pattern": [2000.0] * 6}, "bytes": 4_000_000, "cpu_s": 0.1}
+    told = (10, 4, 2, 1, 1, 1, 2, 2, 2, 10, 25, 25, 40, 5)
+    assert figures_of(wrote, got, 2.0) == pytest.approx(told)
+
+
+def test_the_bench_gives_every_sensor_a_scan_a_tick():
+    sensors, given = ("4", "6"), []
+    link = PacedLink([make_scan(number) for number in range(150)], sensors, ticks=3)
+    while not link.ended:
+        given += link.read(1)
+    assert [(scan.sensor, scan.number) for scan in given] == [(name, tick) for tick in range(3) for name in sensors]
+    assert all(scan.time_ns <= later.time_ns for scan, later in pairwise(given))
+    assert given[0].counts.tolist() == make_scan(0).counts.tolist()
+
+
+def start_bench(*words, **settings):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [sys.executable, "-m", "edge.bench.zenoh", "--sensors", "1", "--processes", "1", *words]
+    return ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, start_new_session=True, **pipes, **settings))
+
+
+def hear_interrupts():
+    """As from a terminal: who started the tests may have SIGINT ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def test_an_interrupted_bench_ends_with_all_its_processes_and_one_line(tmp_path):
+    with start_bench("--out", str(tmp_path), preexec_fn=hear_interrupts) as bench:
+        while not bench.stdout.readline().startswith("|---"):
+            assert bench.poll() is None
+        time.sleep(0.5)  # its processes are starting, or have started
+        os.killpg(bench.pid, signal.SIGINT)
+        _, errors = bench.communicate()  # which all of them hold open
+    assert (bench.returncode, errors) == (130, "edge-sr: zenoh stopped before its end\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bench_that_cannot_write_says_so_before_it_measures(tmp_path):
+    (tmp_path / "taken").touch()
+    with start_bench("--out", str(tmp_path / "taken")) as bench:
+        out, errors = bench.communicate()
+    assert (bench.returncode, out) == (1, "") and re.fullmatch(r"zenoh: .*File exists: '.*/taken'\n", errors)
+
+
+def test_a_reader_that_stands_still_holds_up_no_end(endpoint, consume):
+    consumer, result = consume(endpoint), make_results(2)[1]
+    sink = ZenohSink(f"grip?connect={endpoint}")
+    wait_for(lambda: sink._events.matching_status.matching)
+    consumer.process.send_signal(signal.SIGSTOP)
+    for _ in range(500):
+        sink.write(result, {})
+    closing = threading.Thread(target=sink.close)
+    closing.start()
+    closing.join(8)  # zenoh itself gives up after ten seconds
+    assert not closing.is_alive()
