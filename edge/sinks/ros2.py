@@ -1,0 +1,274 @@
+"""ROS 2 messages over DDS, as a ROS node would publish them, with no ROS installed."""
+
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Final, TypeVar
+
+import numpy as np
+import orjson
+from cyclonedds.core import DDSException
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.topic import Topic
+from numpy.typing import NDArray
+
+from edge.errors import SinkError
+from edge.event import Event
+from edge.record import event_record
+from edge.result import Result
+from edge.ros_messages import force_xyz_n, frame_of
+from edge.ros_names import base_topic, sensor_topic
+from edge.sinks.base import Sink
+from edge.sinks.ros2_diagnostics import Diagnosis, Level, diagnose
+from edge.sinks.ros2_domain import join
+from edge.sinks.ros2_types import (
+    TYPE_HASHES,
+    DiagnosticArray,
+    DiagnosticStatus,
+    Header,
+    Image,
+    KeyValue,
+    String,
+    Time,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
+
+DIAGNOSTICS_S: Final = 1.0
+_DIAGNOSTICS_TOPIC: Final = "diagnostics"
+"""ROS's tools listen there, whatever a robot is called."""
+_EVENTS_KEPT: Final = 100
+_UNKNOWN: Final = math.nan
+_FORCE_UNKNOWN: Final = (_UNKNOWN, _UNKNOWN, _UNKNOWN)
+_OUTAGES: Final = ("lost", "silent")
+_Message = TypeVar("_Message", bound=IdlStruct)
+
+
+@dataclass(slots=True)
+class _Sensor:
+    """What is published of one sensor, and what was said of it last.
+
+    Attributes:
+        shown: writers whose last message was a map that still holds, and its shape.
+        force_shown: the last wrench was a force that still holds.
+        trouble: what the link said of it and has not taken back, by the kind of event.
+    """
+
+    pattern: "DataWriter[Image]"
+    deviation: "DataWriter[Image]"
+    frame: str
+    last: Result
+    shown: "dict[DataWriter[Image], tuple[int, ...]]" = field(default_factory=dict)
+    wrench: "DataWriter[WrenchStamped] | None" = None
+    force_shown: bool = False
+    trouble: dict[str, str] = field(default_factory=dict)
+
+
+class Ros2Sink(Sink):
+    """Publishes patterns, forces, diagnostics and events.
+
+    Writers are reliable, for the subscriptions that ROS makes by default take nothing less, but wait for nobody: of
+    each topic the newest message alone is kept for a reader that is behind.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        environment: Mapping[str, str] = os.environ,
+        *,
+        unix_offset_ns: int | None = None,
+        source: str | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        unix_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Join the domain.
+
+        Args:
+            topic: what all topics begin with, but that of the diagnostics.
+            environment: ROS_DOMAIN_ID and others are read from it.
+            unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
+            source: kind of what is read, told with every event.
+            clock_ns: the clock of the scans that are of now, in [ns].
+            unix_ns: wall time, in [ns]; asked once, for it may be set meanwhile.
+
+        Raises:
+            UsageError: the topic, or the environment, is none of ROS.
+            SinkError: the domain cannot be joined.
+        """
+        self._base = base_topic(topic)
+        self._clock_ns = clock_ns
+        self._source = source
+        self._of_now = unix_offset_ns is None
+        self._unix_offset_ns = unix_ns() - clock_ns() if unix_offset_ns is None else unix_offset_ns
+        self._unwritten = 0
+        self._sensors: dict[str, _Sensor] = {}
+        self._counters: Mapping[str, int] = {}
+        self._counters_before: Mapping[str, int] = {}
+        self._diagnosed_ns = clock_ns()
+        self._domain, self._participant = join(environment)
+        self._diagnostics = self._writer(_DIAGNOSTICS_TOPIC, DiagnosticArray)
+        self._events = self._writer(f"{self._base}/events", String, _EVENTS_KEPT)
+
+    @property
+    def unwritten(self) -> int:
+        """Messages that could not be sent without waiting."""
+        return self._unwritten
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Publish one result: its pattern if it has one, its force in newtons if that is known.
+
+        Raises:
+            SinkError: it cannot be published.
+        """
+        sensor = self._sensors.get(result.scan.sensor)
+        if sensor is None:
+            sensor = self._sensors[result.scan.sensor] = self._begin(result)
+        sensor.last, self._counters = result, counters
+        for kind in _OUTAGES:
+            sensor.trouble.pop(kind, None)
+        time_ns = result.scan.time_ns
+        if result.pattern is not None:
+            self._show(sensor, sensor.pattern, time_ns, result.pattern)
+            if result.deviation is not None:
+                self._show(sensor, sensor.deviation, time_ns, result.deviation)
+        elif result.state != "dropped":  # a newer scan, which has one, is already there
+            self._withdraw(sensor, time_ns, 0.0 if result.contact is False else _UNKNOWN)
+        force_n = force_xyz_n(result)
+        if force_n is not None:
+            self._publish_wrench(sensor, time_ns, force_n)
+        elif result.state != "dropped":
+            self._withdraw_force(sensor, time_ns)
+        if result.event is not None:
+            self._tell(Event(time_ns, "runtime", result.scan.sensor, result.event))
+        self._diagnose_if_due()
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Publish an event; what an outage makes unknown is said to be so."""
+        self._counters = counters
+        for name, sensor in self._sensors.items():
+            if event.sensor not in (None, name):
+                continue
+            if event.kind in _OUTAGES:
+                self._withdraw_all(sensor, event.time_ns)
+            if event.kind in (*_OUTAGES, "trouble"):
+                sensor.trouble[event.kind] = event.text
+            elif event.kind == "well":
+                sensor.trouble.pop("trouble", None)
+        self._tell(event)
+        self._diagnose_if_due()
+
+    def wait(self) -> None:
+        """Go on saying how the sensors are."""
+        self._diagnose_if_due()
+
+    def close(self) -> None:
+        """Say that nothing more will come, and leave the domain."""
+        for sensor in self._sensors.values():
+            self._withdraw_all(sensor, self._now_ns())
+        self._diagnose(ended=True)
+        self._sensors.clear()
+        # Each goes when nothing holds it: the writers before the participant, the participant before its domain.
+        del self._diagnostics, self._events, self._participant, self._domain
+
+    def _begin(self, result: Result) -> _Sensor:
+        name = result.scan.sensor
+        return _Sensor(
+            pattern=self._writer(sensor_topic(self._base, name, "pattern"), Image),
+            deviation=self._writer(sensor_topic(self._base, name, "deviation"), Image),
+            frame=frame_of(result),
+            last=result,
+        )
+
+    def _writer(self, topic: str, kind: type[_Message], depth: int = 1) -> "DataWriter[_Message]":
+        qos = Qos(
+            Policy.Reliability.Reliable(max_blocking_time=0),
+            Policy.Durability.Volatile,
+            Policy.History.KeepLast(depth),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(f"typehash=RIHS01_{TYPE_HASHES[kind]};".encode()),
+        )
+        try:
+            return DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), qos)
+        except DDSException as error:
+            raise SinkError(f"cannot publish on /{topic}: {error}") from error
+
+    def _publish(self, writer: "DataWriter[_Message]", message: _Message) -> None:
+        try:
+            writer.write(message)
+        except DDSException as error:
+            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
+                raise SinkError(f"cannot publish on {writer.topic.name.removeprefix('rt')}: {error}") from error
+            self._unwritten += 1
+
+    def _header(self, time_ns: int, frame: str) -> Header:
+        sec, nanosec = divmod(time_ns + self._unix_offset_ns, 10**9)
+        return Header(Time(sec, nanosec), frame)
+
+    def _image(self, sensor: _Sensor, time_ns: int, values: NDArray[np.float32]) -> Image:
+        height, width = values.shape
+        pixels = np.ascontiguousarray(values, "<f4")
+        return Image(
+            self._header(time_ns, sensor.frame), height, width, "32FC1", 0, width * pixels.itemsize, pixels.tobytes()
+        )
+
+    def _show(self, sensor: _Sensor, writer: "DataWriter[Image]", time_ns: int, values: NDArray[np.float32]) -> None:
+        self._publish(writer, self._image(sensor, time_ns, values))
+        sensor.shown[writer] = values.shape
+
+    def _withdraw(self, sensor: _Sensor, time_ns: int, pattern_value: float) -> None:
+        """Say once, where there were maps, that they hold no more."""
+        for writer, shape in sensor.shown.items():
+            value = pattern_value if writer is sensor.pattern else _UNKNOWN
+            self._publish(writer, self._image(sensor, time_ns, np.full(shape, value, dtype=np.float32)))
+        sensor.shown.clear()
+
+    def _withdraw_force(self, sensor: _Sensor, time_ns: int) -> None:
+        """Say once, where there was a force, that it holds no more."""
+        if sensor.force_shown:
+            self._publish_wrench(sensor, time_ns, _FORCE_UNKNOWN)
+            sensor.force_shown = False
+
+    def _withdraw_all(self, sensor: _Sensor, time_ns: int) -> None:
+        self._withdraw(sensor, time_ns, _UNKNOWN)
+        self._withdraw_force(sensor, time_ns)
+
+    def _publish_wrench(self, sensor: _Sensor, time_ns: int, force_n: tuple[float, float, float]) -> None:
+        if sensor.wrench is None:
+            topic = sensor_topic(self._base, sensor.last.scan.sensor, "wrench")
+            sensor.wrench = self._writer(topic, WrenchStamped)
+        wrench = Wrench(Vector3(*force_n), Vector3(*_FORCE_UNKNOWN))
+        self._publish(sensor.wrench, WrenchStamped(self._header(time_ns, sensor.frame), wrench))
+        sensor.force_shown = True
+
+    def _tell(self, event: Event) -> None:
+        self._publish(self._events, String(orjson.dumps(event_record(event, self._counters, self._source)).decode()))
+
+    def _diagnose_if_due(self) -> None:
+        if self._clock_ns() - self._diagnosed_ns >= DIAGNOSTICS_S * 1e9:
+            self._diagnose()
+
+    def _diagnose(self, *, ended: bool = False) -> None:
+        self._diagnosed_ns, now_ns = self._clock_ns(), self._now_ns()
+        statuses = []
+        for name, sensor in self._sensors.items():
+            trouble = "; ".join(sensor.trouble.values()) or None
+            silence_s = (now_ns - sensor.last.scan.time_ns) / 1e9 if self._of_now else None
+            said = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
+            statuses.append(self._status(name, Diagnosis(Level.STALE, "ended", said.values) if ended else said))
+        self._counters_before = self._counters
+        self._publish(self._diagnostics, DiagnosticArray(self._header(now_ns, ""), statuses))
+
+    def _now_ns(self) -> int:
+        """By the clock of the scans; where that is of another time, when the last scan came."""
+        if self._of_now:
+            return self._clock_ns()
+        return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
+
+    def _status(self, sensor: str, said: Diagnosis) -> DiagnosticStatus:
+        values = [KeyValue(key, value) for key, value in said.values.items()]
+        return DiagnosticStatus(int(said.level), f"{self._base}: {sensor}", said.text, sensor, values)

@@ -1,0 +1,95 @@
+"""How a sensor is, in the terms of ROS's diagnostics: a level, a line, and what is behind it."""
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+from edge.result import Result
+
+SILENCE_S: Final = 1.0
+_LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
+_TOLD: Final = (
+    *("state", "source", "model", "contact", "force_counts", "force_n", "expected_rmse_mm", "interval_mm"),
+    *("latency_us", "pattern_unit", "filled", "baseline_age_s", "note"),
+)
+
+
+class Level(IntEnum):
+    """As diagnostic_msgs/DiagnosticStatus numbers them."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+class Diagnosis(NamedTuple):
+    """How a sensor is.
+
+    Attributes:
+        level: the worst that is known.
+        text: all that is wrong, or what state it is in.
+        values: by name, with their units in the names.
+    """
+
+    level: Level
+    text: str
+    values: Mapping[str, str]
+
+
+def diagnose(
+    result: Result, counters: Mapping[str, int], before: Mapping[str, int], silence_s: float | None, trouble: str | None
+) -> Diagnosis:
+    """How a sensor is.
+
+    Args:
+        result: its last.
+        counters: up to now, of the whole run.
+        before: the same a diagnosis ago; what was lost since is told.
+        silence_s: how long ago its last scan came, in [s]; None where scans are of another time.
+        trouble: what the link has said and not taken back.
+    """
+    findings = list(_findings(result, silence_s, trouble))
+    lost = {name: counters.get(name, 0) - before.get(name, 0) for name in _LOSSES}
+    findings += [(Level.WARN, f"{count} {name}") for name, count in lost.items() if count > 0]
+    level = max((level for level, _ in findings), default=Level.OK)
+    text = "; ".join(text for _, text in findings) or result.state
+    return Diagnosis(level, text, _values(result, counters, silence_s))
+
+
+def _findings(result: Result, silence_s: float | None, trouble: str | None) -> list[tuple[Level, str]]:
+    found: list[tuple[Level, str]] = []
+    if result.source != "device":
+        found.append((Level.WARN, f"{result.source.upper()}, not a sensor"))
+    if silence_s is not None and silence_s >= SILENCE_S:
+        found.append((Level.STALE, f"no scan for {silence_s:.0f} s"))
+    if trouble is not None:
+        found.append((Level.ERROR, trouble))
+    if result.state == "incomplete":
+        found.append((Level.ERROR, result.note or "incomplete"))
+    if result.state == "zeroing":
+        found.append((Level.WARN, result.note or "zeroing"))
+    if result.dead:
+        dead = ", ".join(f"{taxel} ({reason})" for taxel, reason in result.dead.items())
+        found.append((Level.WARN, f"without taxel {dead}"))
+    if result.drift is not None and result.drift.step_counts:
+        found.append((Level.WARN, f"rest level off by {result.drift.step_counts:.0f} counts"))
+    return found
+
+
+def _values(result: Result, counters: Mapping[str, int], silence_s: float | None) -> dict[str, str]:
+    values = {name: _text(getattr(result, name)) for name in _TOLD if getattr(result, name) is not None}
+    values["sensor"] = result.scan.sensor
+    if silence_s is not None:
+        values["scan_age_s"] = _text(silence_s)
+    values["dead"] = ", ".join(f"{taxel}: {reason}" for taxel, reason in result.dead.items())
+    if result.baseline is not None:
+        values["baseline"] = result.baseline.id
+        values["baseline_origin"] = result.baseline.origin
+    if result.force_n is None:
+        values["force"] = "counts only, so there is no wrench: --counts-per-newton gives newtons"
+    return values | {name: str(count) for name, count in counters.items() if count}
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

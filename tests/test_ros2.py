@@ -1,0 +1,471 @@
+"""The sink for ROS 2, and subscribers in processes of their own whose types are made of ROS's .msg files."""
+
+import json
+import math
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+
+import ros2_messages
+from edge_samples import BASELINE, ROOT, make_contract, make_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge import ros_messages
+from edge.errors import SinkError, UsageError
+from edge.event import Event
+from edge.result import Result
+from edge.ros_names import LONGEST_TOPIC, base_topic, sensor_topic
+from edge.sinks import ros2_domain
+from edge.sinks.forms import open_sink
+from edge.sinks.ros2 import Ros2Sink
+from edge.sinks.ros2_diagnostics import Level, diagnose
+from edge.sinks.ros2_types import TYPE_HASHES, DiagnosticArray
+from firmware_bridge.scan import VendorReading
+
+TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
+"""Whoever else tests on this machine is not heard."""
+ENVIRONMENT = {
+    "ROS_DOMAIN_ID": str(1 + os.getpid() % 90),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    "CYCLONEDDS_URI": TAG,
+}
+LISTENERS_CONFIGURATION = (
+    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    '<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer address="localhost"/></Peers></Discovery>'
+    f"</Domain></CycloneDDS>,{TAG}"
+)
+PATIENCE_S = 20
+IMAGE, WRENCH = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped"
+TOPICS = {
+    "skin/s4/pattern": IMAGE,
+    "skin/s4/deviation": IMAGE,
+    "skin/s4/wrench": WRENCH,
+    "skin/left/s4/pattern": IMAGE,
+    "skin/left/s4/wrench": WRENCH,
+    "skin/events": "std_msgs/msg/String",
+    "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+
+def contact(number, *, sensor="4", source="device", **changes):
+    random = np.random.default_rng(number)
+    maps = {name: random.random((40, 40), dtype=np.float32) for name in ("pattern", "deviation")}
+    scan = make_scan(number, sensor=sensor, time_ns=time.monotonic_ns())
+    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0, **maps)
+    return replace(made, **changes)
+
+
+def without_pattern(result, **changes):
+    scan = replace(result.scan, time_ns=time.monotonic_ns())
+    return replace(result, scan=scan, pattern=None, deviation=None, **changes)
+
+
+class Listener:
+    """A subscriber; its lines are kept as they come."""
+
+    def __init__(self, topics, *words):
+        environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+        command = [sys.executable, str(ROOT / "tests/ros2_listener.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
+        self.process = subprocess.Popen(
+            [*command, json.dumps(topics), *words], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        self.heard = []
+        self._lines = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        for line in self.process.stdout:
+            self._lines.put(json.loads(line))
+
+    def of(self, topic):
+        self._keep()
+        return [line["message"] for line in self.heard if line["topic"] == topic]
+
+    def _keep(self):
+        while not self._lines.empty():
+            self.heard.append(self._lines.get())
+
+    def until(self, satisfied, act=lambda: None):
+        """Go on acting until what was heard is enough."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not satisfied():
+            assert time.monotonic() < end_s, f"heard only {[line['topic'] for line in self.heard]}"
+            assert self.process.poll() is None
+            act()
+            time.sleep(0.01)
+
+    def __enter__(self):
+        self.until(lambda: self._keep() or self.heard)
+        return self
+
+    def __exit__(self, *exc_info):
+        self.process.kill()
+        self.process.wait()
+        self.process.stdout.close()
+
+
+def pixels(image):
+    return np.frombuffer(bytes.fromhex(image["data"]), "<f4").reshape(image["height"], image["width"])
+
+
+def stamp_ns(message):
+    return message["header"]["stamp"]["sec"] * 10**9 + message["header"]["stamp"]["nanosec"]
+
+
+@pytest.fixture
+def sink():
+    made = Ros2Sink("/skin", ENVIRONMENT)
+    yield made
+    if hasattr(made, "_domain"):
+        made.close()
+
+
+class Talker:
+    """Writes contacts of two sensors, and keeps what it wrote by its stamp."""
+
+    def __init__(self, sink, **changes):
+        self.sink, self.number, self.wrote = sink, 0, {}
+        self._changes = changes
+
+    def __call__(self):
+        self.number += 1
+        for sensor, force_n in (("4", 1.5), ("left/4", None)):
+            result = contact(self.number, sensor=sensor, force_n=force_n, **self._changes)
+            self.sink.write(result, {"dropped": 7})
+            self.wrote[sensor, result.scan.time_ns + self.sink._unix_offset_ns] = result
+
+
+def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(sink):
+    """One session, for processes are dear: two sensors, contact, its end, an outage, and the end of it all."""
+    with Listener(TOPICS) as listener:
+        talker = Talker(sink)
+        wanted = TOPICS.keys() - {"skin/events", "skin/left/s4/wrench"}
+        listener.until(lambda: all(len(listener.of(topic)) >= 3 for topic in wanted - {"diagnostics"}), talker)
+        for topic, sensor, name in (
+            ("skin/s4/pattern", "4", "pattern"),
+            ("skin/s4/deviation", "4", "deviation"),
+            ("skin/left/s4/pattern", "left/4", "pattern"),
+        ):
+            for image in listener.of(topic):
+                written = getattr(talker.wrote[sensor, stamp_ns(image)], name)
+                assert pixels(image).tobytes() == written.tobytes()
+                header = {key: image[key] for key in ("encoding", "is_bigendian", "step")}
+                assert header == {"encoding": "32FC1", "is_bigendian": 0, "step": 160}
+                assert image["header"]["frame_id"] == sensor
+        for message in listener.of("skin/s4/wrench"):
+            force, torque = message["wrench"]["force"], message["wrench"]["torque"]
+            assert force["z"] == 1.5 and all(map(math.isnan, (force["x"], force["y"], *torque.values())))
+
+        # The end of a contact is told once, and by zeros; that readings were lost by what is no number.
+        four = contact(1000)
+        sink.write(without_pattern(four, state="dropped"), {})
+        for _ in range(3):
+            sink.write(without_pattern(four, state="idle", contact=False), {})
+        sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
+        sink.tell(Event(time.monotonic_ns(), "lost", None, "again"), {})
+        ends = {"4": "skin/s4/pattern", "left/4": "skin/left/s4/pattern"}
+        listener.until(lambda: len(listener.of("skin/events")) == 2)
+
+        def extraordinary(sensor):
+            return [image for image in listener.of(ends[sensor]) if (sensor, stamp_ns(image)) not in talker.wrote]
+
+        listener.until(lambda: all(map(extraordinary, ends)))
+        (zeros,), (unknown,) = extraordinary("4"), extraordinary("left/4")
+        assert not pixels(zeros).any() and np.isnan(pixels(unknown)).all()
+        assert np.isnan(pixels(listener.of("skin/s4/deviation")[-1])).all()
+        assert stamp_ns(unknown) > stamp_ns(zeros)
+        events = [json.loads(message["data"]) for message in listener.of("skin/events")]
+        assert [(event["event"], event["note"]) for event in events] == [("lost", "the plug is out"), ("lost", "again")]
+
+        sink.write(contact(2000, source="emulated"), {})
+        sink.close()
+        listener.until(lambda: [a for a in listener.of("diagnostics") if a["status"][0]["message"] == "ended"])
+        statuses = {status["hardware_id"]: status for status in listener.of("diagnostics")[-1]["status"]}
+        assert {name: status["name"] for name, status in statuses.items()} == {"4": "skin: 4", "left/4": "skin: left/4"}
+        assert {status["level"] for status in statuses.values()} == {Level.STALE}
+        assert np.isnan(pixels(listener.of("skin/s4/pattern")[-1])).all(), "left standing by a program that has ended"
+        last = listener.of("skin/s4/wrench")[-1]["wrench"]["force"]
+        assert all(map(math.isnan, last.values())), "of a contact that has ended"
+        assert not listener.of("skin/left/s4/wrench"), "no newtons are known of it"
+
+
+def test_who_joins_late_stops_or_dies_holds_up_nobody(sink):
+    topics = {"skin/s4/pattern": IMAGE}
+    with Listener(topics) as stopped, Listener(topics) as dead:
+        talker = Talker(sink)
+        stopped.until(lambda: stopped.of("skin/s4/pattern") and dead.of("skin/s4/pattern"), talker)
+        stopped.process.send_signal(signal.SIGSTOP)
+        dead.process.kill()
+        joined_ns = time.time_ns()
+        with Listener(topics, "best-effort") as late:
+            late.until(lambda: len(late.of("skin/s4/pattern")) >= 5, talker)
+            for _ in range(300):  # two megabytes, to one who takes none of it
+                talker()
+            newest = max(stamp for sensor, stamp in talker.wrote if sensor == "4")
+            late.until(lambda: max(map(stamp_ns, late.of("skin/s4/pattern"))) >= newest, talker)
+            assert min(map(stamp_ns, late.of("skin/s4/pattern"))) > joined_ns, "an old pattern for one who joined late"
+        assert sink.unwritten == 0
+
+
+def test_of_another_source_than_a_sensor_the_frame_and_the_diagnostics_tell(sink):
+    result = contact(1, source="emulated")
+    sink.write(result, {})
+    assert sink._sensors["4"].frame == "emulated/4"
+    said = diagnose(result, {}, {}, 0.0, None)
+    assert said.level == Level.WARN and said.text == "EMULATED, not a sensor"
+
+
+def test_forces_of_the_vendor_have_three_axes_and_counts_are_no_newtons(sink):
+    published = []
+    sink._publish = lambda writer, message: published.append(message)
+    newtons = np.zeros((3, 4, 4), dtype=np.float32)
+    newtons[:, 1, 1] = 0.25, -0.5, 2.0
+    result = contact(1)
+    scan = replace(result.scan, vendor=VendorReading(newtons=newtons))
+    sink.write(replace(result, scan=scan, force_n=2.0), {})
+    sink.write(replace(result, scan=scan, force_n=1.9), {})
+    sink.write(result, {})
+    forces = [message.wrench.force for message in published if hasattr(message, "wrench")]
+    assert (forces[0].x, forces[0].y, forces[0].z) == (0.25, -0.5, 2.0)
+    assert math.isnan(forces[1].x) and forces[1].z == 1.9, "z of one calibration beside x and y of another"
+    assert len(forces) == 3 and math.isnan(forces[2].z), "counts in place of newtons"
+    assert diagnose(result, {}, {}, 0.0, None).values["force"].startswith("counts only")
+
+
+def test_two_sinks_share_the_domain_and_one_outlives_the_other(sink):
+    other = open_sink_in(ENVIRONMENT, "ros2:other/skin")
+    other.write(contact(1), {})
+    other.close()
+    with Listener({"skin/s4/pattern": IMAGE}) as listener:
+        listener.until(lambda: listener.of("skin/s4/pattern"), Talker(sink))
+    assert int(ENVIRONMENT["ROS_DOMAIN_ID"]) in ros2_domain._OPEN
+    sink.close()
+    assert int(ENVIRONMENT["ROS_DOMAIN_ID"]) not in ros2_domain._OPEN, "threads and sockets are left behind"
+
+
+def open_sink_in(environment, text):
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        return open_sink(text, make_contract())
+
+
+class Clock:
+    def __init__(self):
+        self.now_ns = 10**12
+
+    def __call__(self):
+        return self.now_ns
+
+
+def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
+    clock, published = Clock(), []
+    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock, unix_ns=lambda: 1_700_000_000_123_456_789)
+    sink._publish = lambda writer, message: published.append(message)
+
+    def statuses():
+        taken = [message for message in published if isinstance(message, DiagnosticArray)]
+        published.clear()
+        return [(status.level, status.message) for array in taken for status in array.status]
+
+    scan = make_scan(1, time_ns=clock.now_ns)
+    idle = Result(scan, "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
+    for _ in range(250):
+        clock.now_ns += 10_000_000
+        sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns)), {"dropped": 2})
+    assert statuses() == [(Level.WARN, "2 dropped"), (Level.OK, "idle")]
+    sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
+    clock.now_ns += 1_500_000_000
+    sink.wait()
+    sink.wait()
+    assert statuses() == [(Level.STALE, "no scan for 2 s; bus-off")]
+    sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
+    sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
+    clock.now_ns += 1_000_000_000
+    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), dead={3: "stuck"}), {"dropped": 2})
+    assert statuses() == [(Level.WARN, "without taxel 3 (stuck)")]
+    assert sink._header(10**12 + 5, "4").stamp.nanosec == 123_456_794, "wall time, from the start's on"
+    sink.close()
+
+
+DAYS_NS = 3 * 86_400 * 10**9
+
+
+def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_silent():
+    """Recorded on a machine that was up for three days more than this one."""
+    recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
+    published, later_ns = [], time.monotonic_ns() + 60 * 10**9
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in ENVIRONMENT.items():
+            patch.setenv(name, value)
+        sink = open_sink("ros2:skin", make_contract(), unix_offset_ns=offset_ns, source="replay")
+    sink._clock_ns = lambda: later_ns
+    sink._publish = lambda writer, message: published.append(message)
+    result = contact(1, source="replay", force_n=1.0)
+    sink.write(replace(result, scan=replace(result.scan, time_ns=recorded_ns)), {})
+    sink.close()
+    stamps = {one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in published}
+    assert stamps == {recorded_ns + offset_ns}
+    said = [status for one in published if isinstance(one, DiagnosticArray) for status in one.status]
+    assert [status.message for status in said] == ["REPLAY, not a sensor", "ended"]
+    assert "scan_age_s" not in {pair.key for status in said for pair in status.values}
+
+
+def test_a_force_that_is_known_no_more_is_taken_back_once():
+    published = []
+    sink = Ros2Sink("skin", ENVIRONMENT, source="emulated")
+    sink._publish = lambda writer, message: published.append(message)
+
+    def taken_back():
+        forces = [one.wrench.force for one in published if hasattr(one, "wrench")]
+        published.clear()
+        return [math.isnan(force.z) for force in forces]
+
+    idle = without_pattern(contact(1, force_n=0.1), state="idle", contact=False)
+    lost = Event(time.monotonic_ns(), "lost", None, "the plug is out")
+    sink.write(idle, {})
+    assert taken_back() == [False]
+    sink.tell(lost, {})
+    (said,) = (json.loads(one.data) for one in published if hasattr(one, "data"))
+    assert (said["event"], said["source"]) == ("lost", "emulated")
+    assert taken_back() == [True]
+    sink.tell(lost, {})
+    assert taken_back() == []
+    sink.write(idle, {})
+    sink.write(replace(idle, state="dropped", force_n=None), {})  # of a newer scan it is known
+    assert taken_back() == [False]
+    for _ in range(2):
+        sink.write(replace(idle, state="incomplete", contact=None, force_n=None), {})
+    assert taken_back() == [True]
+    sink.write(idle, {})
+    sink.close()
+    assert taken_back() == [False, True]
+
+
+def test_what_a_link_said_of_an_outage_holds_until_the_next_scan(sink):
+    sink.write(contact(1), {})
+    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
+    assert sink._sensors["4"].trouble == {"lost": "the plug is out"}
+    sink.write(contact(2), {})
+    assert not sink._sensors["4"].trouble
+    sink.tell(Event(time.monotonic_ns(), "silent", "5", "another one is silent"), {})
+    assert not sink._sensors["4"].trouble and sink._sensors["4"].shown, "what 4 shows is as true as before"
+
+
+@pytest.mark.parametrize("kind", list(TYPE_HASHES), ids=lambda kind: kind.__name__)
+def test_types_are_called_and_hashed_as_ros_does(kind):
+    name = re.sub(r"::msg::dds_::(.*)_$", r"/msg/\1", kind.__idl__.idl_transformed_typename)
+    assert name in ros2_messages.DEFINITIONS
+    assert TYPE_HASHES[kind] == ros2_messages.type_hash(name)
+
+
+def test_bytes_on_the_wire_are_plain_cdr(sink):
+    published = []
+    sink._publish = lambda writer, message: published.append(message)
+    result = contact(3, force_n=1.25, event="zeroed anew, ä")
+    sink.write(result, {"dropped": 1})
+    sink._diagnose()
+    pattern, deviation, wrench, event, diagnostics = (
+        message.serialize(use_version_2=sink._events._use_version_2) for message in published
+    )
+    image = ros2_messages.decode(IMAGE, pattern)
+    assert bytes(image.pop("data")) == result.pattern.tobytes()
+    assert bytes(ros2_messages.decode(IMAGE, deviation)["data"]) == result.deviation.tobytes()
+    stamp = dict(zip(("sec", "nanosec"), divmod(result.scan.time_ns + sink._unix_offset_ns, 10**9), strict=True))
+    header = {"stamp": stamp, "frame_id": "4"}
+    expected = {"height": 40, "width": 40, "encoding": "32FC1", "is_bigendian": 0, "step": 160}
+    assert image == {"header": header, **expected}
+    decoded = ros2_messages.decode(WRENCH, wrench)
+    assert decoded["header"] == header and decoded["wrench"]["force"]["z"] == 1.25
+    said = json.loads(ros2_messages.decode("std_msgs/msg/String", event)["data"])
+    assert (said["sensor"], said["note"], said["counters"]) == ("4", "zeroed anew, ä", {"dropped": 1})
+    (status,) = ros2_messages.decode("diagnostic_msgs/msg/DiagnosticArray", diagnostics)["status"]
+    values = {pair["key"]: pair["value"] for pair in status["values"]}
+    assert status["level"] == Level.WARN and status["message"] == "1 dropped"
+    assert (values["state"], values["pattern_unit"], values["force_n"]) == ("contact", "mm", "1.25")
+
+
+def test_recordings_hold_the_same_bytes(sink):
+    published = []
+    sink._publish = lambda writer, message: published.append(message.serialize(use_version_2=False))
+    result = contact(3, force_n=1.25)
+    sink.write(result, {})
+    unix_ns = result.scan.time_ns + sink._unix_offset_ns
+    recorded = [ros_messages.image(values, "4", unix_ns) for values in (result.pattern, result.deviation)]
+    recorded.append(ros_messages.wrench(result, unix_ns))
+    for sent, kept in zip(published, recorded, strict=True):
+        assert sent[: len(kept)] == kept and not any(sent[len(kept) :]) and len(sent) - len(kept) < 4
+
+
+ROS_TOPIC = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+NAMES = st.text(st.sampled_from("s4x_/é a0Z"), min_size=1, max_size=8)
+
+
+@given(NAMES, NAMES)
+def test_every_sensor_has_topics_of_its_own_that_ros_can_hold(one, other):
+    topics = [sensor_topic("skin", name, "pattern") for name in (one, other)]
+    assert all(map(ROS_TOPIC.fullmatch, topics)) and "__" not in "".join(topics)
+    assert (topics[0] == topics[1]) == (one == other)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "topic"),
+    [("4", "s4"), ("left/4", "left/s4"), ("left_1", "left_1"), ("s4", "x_7334"), ("x_1", "x_785f31"), ("/", "x_0/x_0")],
+)
+def test_sensors_names_as_topics(sensor, topic):
+    assert sensor_topic("skin", sensor, "pattern") == f"skin/{topic}/pattern"
+
+
+def test_names_that_ros_cannot_hold_are_refused():
+    assert base_topic("/gripper/skin_1") == "gripper/skin_1"
+    for text in ("", "4", "a//b", "a/", "a b", "ä", "//a", "~/a"):
+        with pytest.raises(UsageError, match=r"is none of ROS: expected letters"):
+            base_topic(text)
+    with pytest.raises(SinkError, match=rf"ROS holds {LONGEST_TOPIC - 1}: name sensor"):
+        sensor_topic("skin", "ä" * 64, "pattern")
+
+
+@pytest.mark.parametrize(
+    ("environment", "said"),
+    [
+        ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID is '233'"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, so that nobody finds us"),
+    ],
+)
+def test_an_environment_that_ros_would_not_take_is_refused(environment, said):
+    with pytest.raises(UsageError, match=said):
+        Ros2Sink("skin", environment)
+
+
+def test_a_configuration_that_is_none_is_told(capfd):
+    with pytest.raises(SinkError, match=r"cannot join DDS domain 7 .*CYCLONEDDS_URI"):
+        Ros2Sink(
+            "skin", {"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"}
+        )
+
+
+def test_without_the_package_one_line_says_how_to_get_it():
+    script = (
+        "import sys; sys.modules['cyclonedds'] = None\n"
+        "from edge.sinks.forms import open_sink\n"
+        "try: open_sink('ros2:skin', None)\n"
+        "except ValueError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "ros2:skin needs Cyclone DDS: pip install '.[ros2]' in the folder of tactile-edge-sr\n", (
+        done.stderr
+    )
