@@ -1,0 +1,151 @@
+"""The layout of `shm:NAME`: latest values in shared memory. docs/middleware.md holds it as tables.
+
+A slot a sensor, and two halves a slot: the writer fills the half that is not the newest and then counts `sequence` up,
+so that a reader never waits, not even for a writer that was stopped or killed half-way. What a reader has copied is
+whole where the half tells that sequence and its checksum holds. On x86-64 stores and loads keep their order and the
+checksum never fails but for a copy that took longer than a period; elsewhere it stands for the barriers that Python
+does not have.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+FOLDER: Final = "/dev/shm"
+MAGIC: Final = b"TESR-SHM"
+VERSION: Final = 1
+SLOTS: Final = 32
+LINE_BYTES: Final = 64
+"""Of a cache line: what different processes write and read often lies in lines of its own."""
+HEADER_BYTES: Final = 192
+HEARTBEAT_AT: Final = 128
+SENSOR_BYTES: Final = 256
+"""Of a name of 64 characters, at most four bytes each."""
+MODEL_BYTES: Final = 64
+
+HEADER: Final = (
+    ("magic", "8s"),
+    ("version", "I"),
+    ("header_bytes", "I"),
+    ("slots", "I"),
+    ("slot_bytes", "I"),
+    ("half_bytes", "I"),
+    ("first_half_at", "I"),
+    ("rows", "I"),
+    ("cols", "I"),
+    ("height", "I"),
+    ("width", "I"),
+    ("zeroed_at", "I"),
+    ("counts_at", "I"),
+    ("pattern_at", "I"),
+    ("deviation_at", "I"),
+    ("writer_pid", "Q"),
+    ("pattern_unit", "16s"),
+)
+"""Name and struct's character of each field from byte 0 on; behind them, at HEARTBEAT_AT, `heartbeat_ns`, a q."""
+
+FIELDS: Final = (
+    ("checksum", "I"),
+    ("reserved", "I"),
+    ("sequence", "Q"),
+    ("time_ns", "q"),
+    ("scan", "q"),
+    ("device_time_ns", "q"),
+    ("reused_from", "q"),
+    ("source", "i"),
+    ("state", "i"),
+    ("contact", "i"),
+    ("taps_used", "i"),
+    ("has_pattern", "i"),
+    ("has_deviation", "i"),
+    ("another_tap", "i"),
+    ("filled", "i"),
+    ("dead", "Q"),
+    ("fresh", "Q"),
+    ("renewed", "Q"),
+    ("force_counts", "d"),
+    ("force_n", "d"),
+    ("area_mm2", "d"),
+    ("centroid_x_mm", "d"),
+    ("centroid_y_mm", "d"),
+    ("interval_mm", "d"),
+    ("expected_rmse_mm", "d"),
+    ("baseline_age_s", "d"),
+    ("run_time_us", "d"),
+    ("latency_us", "d"),
+    ("sensor", f"{SENSOR_BYTES}s"),
+    ("model", f"{MODEL_BYTES}s"),
+)
+"""Name and struct's character of each field of a half; its maps follow."""
+
+SOURCES: Final = ("device", "replay", "emulated")
+STATES: Final = ("zeroing", "incomplete", "idle", "contact", "dropped")
+FILLED: Final = ("rest", "neighbours")
+# Told by their place, from 1: memory that nobody wrote must not pass for a sensor's.
+
+
+def struct_of(fields: tuple[tuple[str, str], ...]) -> struct.Struct:
+    """Fields side by side, little-endian."""
+    return struct.Struct("<" + "".join(kind for _, kind in fields))
+
+
+def offsets_of(fields: tuple[tuple[str, str], ...]) -> dict[str, int]:
+    """Where each field begins, in bytes."""
+    return {name: struct_of(fields[:index]).size for index, (name, _) in enumerate(fields)}
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where everything lies for a sensor of rows x cols taxels and patterns of height x width pixels."""
+
+    rows: int
+    cols: int
+    height: int
+    width: int
+
+    @property
+    def maps(self) -> dict[str, tuple[np.dtype, tuple[int, ...], int]]:
+        """Type, shape and place in a half of each map, by name."""
+        scan, pattern = (3, self.rows, self.cols), (self.height, self.width)
+        at, maps = struct_of(FIELDS).size, {}
+        for name, kind, shape in (
+            ("zeroed", "<f4", scan),
+            ("counts", "<i4", scan),
+            ("pattern", "<f4", pattern),
+            ("deviation", "<f4", pattern),
+        ):
+            maps[name] = (np.dtype(kind), shape, at)
+            at = _aligned(at + int(np.prod(shape)) * 4, 8)
+        return maps
+
+    @property
+    def half_bytes(self) -> int:
+        """Size of one half of a slot."""
+        kind, shape, at = self.maps["deviation"]
+        return _aligned(at + int(np.prod(shape)) * kind.itemsize, LINE_BYTES)
+
+    @property
+    def slot_bytes(self) -> int:
+        """Size of a slot: its sequence, alone in its line, and two halves."""
+        return LINE_BYTES + 2 * self.half_bytes
+
+    @property
+    def total_bytes(self) -> int:
+        """Size of everything."""
+        return HEADER_BYTES + SLOTS * self.slot_bytes
+
+    def header(self, writer_pid: int, pattern_unit: str) -> bytes:
+        """The header's fields, without the heartbeat."""
+        return struct_of(HEADER).pack(
+            *(MAGIC, VERSION, HEADER_BYTES, SLOTS, self.slot_bytes, self.half_bytes, LINE_BYTES),
+            *(self.rows, self.cols, self.height, self.width),
+            *(at for _, _, at in self.maps.values()),
+            writer_pid,
+            pattern_unit.encode()[:16],
+        )
+
+
+def _aligned(size: int, to: int) -> int:
+    return -(-size // to) * to

@@ -1,0 +1,227 @@
+"""The latest result of each sensor in shared memory, for a control loop on the same machine. Linux."""
+
+import fcntl
+import math
+import mmap
+import os
+import re
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge.contract import Contract
+from edge.errors import SinkError
+from edge.event import Event
+from edge.result import Result, mask_bits
+from edge.shm_layout import (
+    FIELDS,
+    FILLED,
+    FOLDER,
+    HEADER,
+    HEADER_BYTES,
+    HEARTBEAT_AT,
+    LINE_BYTES,
+    MAGIC,
+    MODEL_BYTES,
+    SLOTS,
+    SOURCES,
+    STATES,
+    Layout,
+    offsets_of,
+    struct_of,
+)
+from edge.sinks.base import Sink
+
+_HEAD: Final = struct_of(FIELDS)
+_WRITER_PID_AT: Final = offsets_of(HEADER)["writer_pid"]
+_CHECKED_FROM: Final = offsets_of(FIELDS)["sequence"]
+_WORD: Final = 8
+
+
+class SharedMemorySink(Sink):
+    """Writes what `edge.shm_layout` describes; readers cost it nothing, however many and slow they are."""
+
+    def __init__(
+        self,
+        name: str,
+        contract: Contract,
+        folder: Path = Path(FOLDER),
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Make the segment; one that a crash left behind is taken over.
+
+        Args:
+            name: of the file in `folder`.
+            contract: says the shapes.
+            folder: of shared memory.
+            clock_ns: monotonic, the scans' own, in [ns].
+
+        Raises:
+            SinkError: it cannot be made, or another program writes it.
+        """
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name):
+            raise SinkError(f"shm:{name} cannot be a name: expected letters, digits, '_', '.' and '-', 100 at most")
+        if not folder.is_dir():
+            raise SinkError(f"no {folder} here: shm: needs Linux")
+        self._path = folder / name
+        self._clock_ns = clock_ns
+        height, width = contract.pattern_shape
+        self._layout = Layout(contract.rows, contract.cols, height, width)
+        try:
+            self._file, self._memory = self._create(contract.output_unit)
+        except OSError as error:
+            if isinstance(error, SinkError):
+                raise
+            raise SinkError(f"cannot make shared memory {self._path}: {error.strerror}") from error
+        # Numbers of eight bytes are stored by this in one piece, which struct does only byte by byte.
+        self._words = memoryview(self._memory).cast("Q")
+        self._slots: dict[str, int] = {}
+        self._draft = bytearray(self._layout.half_bytes)
+        self._maps = {
+            map_name: np.frombuffer(self._draft, kind, math.prod(shape), at).reshape(shape)
+            for map_name, (kind, shape, at) in self._layout.maps.items()
+        }
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Replace what there is of this sensor.
+
+        Raises:
+            SinkError: there are too many sensors.
+        """
+        slot_at = self._slots.get(result.scan.sensor)
+        if slot_at is None:
+            slot_at = self._add(result.scan.sensor)
+        sequence = self._words[slot_at // _WORD] + 1
+        self._fill(result, sequence)
+        half_at = slot_at + LINE_BYTES + (sequence & 1) * self._layout.half_bytes
+        self._memory[half_at : half_at + len(self._draft)] = self._draft
+        self._words[slot_at // _WORD] = sequence
+        self._beat()
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Events have no place here: of an outage the age of the values tells."""
+        self._beat()
+
+    def wait(self) -> None:
+        """Tell that the writer is there, though no scan comes."""
+        self._beat()
+
+    def close(self) -> None:
+        """Let go of the name; readers that still see the memory see that it ended."""
+        if self._file < 0:
+            return
+        self._words[HEARTBEAT_AT // _WORD] = 0
+        self._unname(self._file)
+        self._words.release()
+        self._memory.close()
+        os.close(self._file)
+        self._file = -1
+
+    def _beat(self) -> None:
+        self._words[HEARTBEAT_AT // _WORD] = self._clock_ns()
+
+    def _add(self, sensor: str) -> int:
+        if len(self._slots) == SLOTS:
+            raise SinkError(f"shared memory {self._path} has room for {SLOTS} sensors, and {sensor} is one more")
+        slot_at = self._slots[sensor] = HEADER_BYTES + len(self._slots) * self._layout.slot_bytes
+        return slot_at
+
+    def _fill(self, result: Result, sequence: int) -> None:
+        scan = result.scan
+        x_mm, y_mm = (None, None) if result.centroid_mm is None else result.centroid_mm
+        _HEAD.pack_into(
+            self._draft,
+            0,
+            *(0, 0, sequence, scan.time_ns, scan.number, _or_less(scan.device_ns), _or_less(result.reused_from)),
+            *(SOURCES.index(result.source) + 1, STATES.index(result.state) + 1, _or_less(result.contact)),
+            *(result.taps_used, result.pattern is not None, result.deviation is not None),
+            _or_less(result.another_tap),
+            0 if result.filled is None else FILLED.index(result.filled) + 1,
+            *(sum(1 << taxel for taxel in result.dead), mask_bits(scan.fresh), mask_bits(scan.renewed)),
+            *map(_or_nan, (result.force_counts, result.force_n, result.area_mm2, x_mm, y_mm, result.interval_mm)),
+            *map(_or_nan, (result.expected_rmse_mm, result.baseline_age_s, result.run_time_us, result.latency_us)),
+            scan.sensor.encode(),
+            _cut(result.model, MODEL_BYTES),
+        )
+        self._maps["counts"][:] = scan.counts
+        # Where there is none, none must be left standing from before.
+        for name, values in (("zeroed", result.zeroed), ("pattern", result.pattern), ("deviation", result.deviation)):
+            self._maps[name][:] = np.nan if values is None else values
+        checksum = zlib.crc32(memoryview(self._draft)[_CHECKED_FROM:])
+        self._draft[:4] = checksum.to_bytes(4, "little")
+
+    def _create(self, pattern_unit: str) -> tuple[int, mmap.mmap]:
+        """Make it whole under another name first: nobody ever sees a part of it."""
+        draft = self._path.with_name(f".{self._path.name}.{os.getpid()}")
+        draft.unlink(missing_ok=True)
+        descriptor = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as this process lives
+            os.posix_fallocate(descriptor, 0, self._layout.total_bytes)  # later there would be a signal, no error
+            memory = mmap.mmap(descriptor, self._layout.total_bytes)
+            header = self._layout.header(os.getpid(), pattern_unit)
+            memory[: len(header)] = header
+            memory[HEARTBEAT_AT : HEARTBEAT_AT + _WORD] = self._clock_ns().to_bytes(_WORD, "little")
+            while not self._named(draft):
+                self._take_over()
+        except OSError:
+            os.close(descriptor)
+            raise
+        finally:
+            draft.unlink(missing_ok=True)
+        return descriptor, memory
+
+    def _named(self, draft: Path) -> bool:
+        try:
+            self._path.hardlink_to(draft)
+        except FileExistsError:
+            return False
+        return True
+
+    def _take_over(self) -> None:
+        """Remove what a writer left that has died.
+
+        Raises:
+            SinkError: it lives, or what lies there is no segment of ours.
+        """
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            return
+        try:
+            head = os.pread(descriptor, HEADER_BYTES, 0)
+            if len(head) < HEADER_BYTES or not head.startswith(MAGIC):
+                raise SinkError(f"{self._path} is another program's shared memory: choose another name behind shm:")
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                pid = int.from_bytes(head[_WRITER_PID_AT : _WRITER_PID_AT + _WORD], "little")
+                raise SinkError(f"{self._path} is written by process {pid}: end it, or choose another name") from error
+            os.pwrite(descriptor, bytes(_WORD), HEARTBEAT_AT)  # for readers that still look at it
+            self._unname(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def _unname(self, descriptor: int) -> None:
+        """Free the name, unless it is another's by now."""
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), self._path.stat()):
+                self._path.unlink()
+
+
+def _or_less(value: int | None) -> int:
+    return -1 if value is None else value
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _cut(text: str, most_bytes: int) -> bytes:
+    """The beginning of a text in UTF-8, never half a character."""
+    return text.encode()[:most_bytes].decode(errors="ignore").encode()

@@ -1,0 +1,70 @@
+"""Act on the newest pattern of a sensor that `edge-sr --sink shm:NAME` writes: shm_read.py NAME SENSOR [--pretend].
+
+`attach` and `latest` are a reader to copy; offsets, and what else there is, are in docs/middleware.md. Linux.
+"""
+
+import mmap
+import sys
+import time
+import zlib
+from pathlib import Path
+from struct import unpack_from
+
+import numpy as np
+
+USAGE = "usage: python shm_read.py NAME SENSOR [--pretend]; --pretend acts also on a sensor that is none"
+DEVICE = 1
+
+
+def attach(name: str) -> memoryview:
+    """See the memory; FileNotFoundError while nobody writes it."""
+    with Path("/dev/shm", name).open("rb") as file:
+        memory = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    if memory[:12] != b"TESR-SHM\1\0\0\0":
+        raise ValueError(f"{name} is of another program, or of another version")
+    return memory
+
+
+def latest(memory: memoryview, sensor: str, oldest_s: float = 0.05, pretend: bool = False) -> bytes | None:
+    """The newest result of a sensor, whole; None unless it is young and a device's, or one is to `pretend` it is."""
+    header_bytes, slots, slot_bytes, half_bytes, first_half_at = unpack_from("<5I", memory, 12)
+    sequences = memory.cast("Q")  # unlike struct, this reads eight bytes in one piece
+    for slot_at in range(header_bytes, header_bytes + slots * slot_bytes, slot_bytes):
+        for _ in range(100):  # once more where it was written anew while it was copied
+            newest = sequences[slot_at // 8]
+            if newest == 0:
+                return None
+            half_at = slot_at + first_half_at + (newest & 1) * half_bytes
+            half = bytes(memory[half_at : half_at + half_bytes])
+            checksum, _, sequence, time_ns = unpack_from("<IIQq", half)
+            if sequence == newest and checksum == zlib.crc32(memoryview(half)[8:]):
+                break
+        else:
+            return None
+        if half[184:440].rstrip(b"\0").decode() == sensor:
+            young = 0 <= time.monotonic_ns() - time_ns < oldest_s * 1e9
+            return half if young and (pretend or unpack_from("<i", half, 48) == (DEVICE,)) else None
+    return None
+
+
+def main(name: str, sensor: str, pretend: bool) -> None:
+    """Print ten lines a second, as long as there is the memory; attached anew, for a writer may have begun anew."""
+    while True:
+        memory = attach(name)
+        half = latest(memory, sensor, pretend=pretend)
+        told = "nothing to act on"
+        if half is not None:
+            height, width, _, _, pattern_at = unpack_from("<5I", memory, 40)
+            pattern = np.frombuffer(half, "<f4", height * width, pattern_at).reshape(height, width)  # NaN without one
+            told = f"{unpack_from('<d', half, 104)[0]:.0f} counts, {pattern.max():.3f} mm at most"
+        print(told, flush=True)
+        time.sleep(0.1)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 3 or sys.argv[3:] not in ([], ["--pretend"]):
+        sys.exit(USAGE)
+    try:
+        main(sys.argv[1], sys.argv[2], pretend=len(sys.argv) == 4)
+    except (OSError, ValueError) as error:
+        sys.exit(f"{error}: expected what edge-sr --sink shm:{sys.argv[1]} writes")
