@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from edge.errors import SinkClosedError, SinkError, UsageError
 from edge.event import Event
+from edge.result import Result
 from edge.runtime import Runtime
 from edge.sinks import npz
 from edge.sinks.fan import Fan
@@ -230,12 +231,13 @@ class TestJsonLines:
         sink.close()
 
     def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
-        sink = JsonLinesSink(str(tmp_path / "out.jsonl"))
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), source="replay")
         sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
         sink.close()
         assert json.loads((tmp_path / "out.jsonl").read_text()) == {
             "time_ns": 5,
             "sensor": None,
+            "source": "replay",
             "state": "event",
             "event": "lost",
             "note": "the cable is out",
@@ -327,6 +329,17 @@ class TestFan:
             fan.close()
         assert good.closed
 
+    def test_one_that_fails_while_nothing_comes_is_given_up_too(self):
+        fan, good, bad = Fan(lambda event: None), ListSink(), ListSink()
+        bad.wait = lambda: self.Failing(SinkError("disk full")).fail(None)
+        fan.add(bad)
+        fan.add(good)
+        fan.write(make_results(1)[0], RUN)
+        fan.wait()
+        fan.wait()
+        assert good.waits == 2 and bad.closed and [event.kind for event in good.events] == ["sink"]
+        assert good.told_counters == [RUN]  # and of what was counted nothing is forgotten
+
     def test_two_that_fail_together_leave_the_third(self):
         for acts in (
             lambda fan: fan.write(make_results(1)[0], RUN),
@@ -387,6 +400,29 @@ def test_events_are_lines_on_stderr(terminal):
     assert stream.getvalue() == ("\r\x1b[K" if terminal else "") + "edge-sr: the cable is out\n"
 
 
+def test_what_others_wrote_does_nothing_to_the_terminal():
+    stream = io.StringIO()
+    MessageSink(stream).tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
+    assert stream.getvalue() == "edge-sr: \\x1b[2J\\x9b\\rpad\\n\\ud800 in µm\n"
+
+
+@pytest.mark.parametrize(
+    ("events", "lines"),
+    [
+        (["zeroing refused: no sensor was heard yet"], ["zeroing refused: no sensor was heard yet"]),
+        (["slow, so small"], []),
+        (["slow, so small; zeroing refused"], ["zeroing refused"]),
+        ([None, "slow, so small"], ["slow, so small"]),
+    ],
+)
+def test_of_the_first_event_only_what_was_said_before_is_left_out(events, lines):
+    stream = io.StringIO()
+    messages = MessageSink(stream, said="slow, so small")
+    for number, event in enumerate(events):
+        messages.write(Result(make_scan(number), "device", "tiny", "idle", event=event), {})
+    assert stream.getvalue().splitlines() == [f"edge-sr: {line}" for line in lines]
+
+
 class TestNpz:
     def record(self, path, results, **settings):
         sink = NpzSink(path, *SHAPES, **settings)
@@ -441,20 +477,28 @@ class TestNpz:
         assert 0 < np.isfinite(data["interval_mm"]).sum() == data["has_pattern"].sum() < len(results)
         assert len(load_recording(tmp_path / "out.npz").tracks) == 2
 
-    def test_nothing_is_at_the_target_before_the_end_and_an_old_one_is_replaced(self, tmp_path):
+    def test_nothing_is_at_the_target_before_the_end_and_an_old_one_is_left_alone(self, tmp_path):
         path = tmp_path / "out.npz"
-        path.write_bytes(b"old")
         sink = NpzSink(path, *SHAPES)
         sink.write(make_results(1)[0], {})
-        assert path.read_bytes() == b"old"
+        assert not path.exists()
         sink.close()
         assert len(load_recording(path).tracks[0].counts) == 1
+        with pytest.raises(SinkError, match=r"out\.npz exists: give another name"):
+            NpzSink(path, *SHAPES)
+        path.rename(tmp_path / "first.npz")
+        sink = NpzSink(path, *SHAPES)
+        sink.write(make_results(1)[0], {})
+        path.write_bytes(b"of another meanwhile")
+        with pytest.raises(SinkError, match=r"out\.npz exists, .* move it away, then `python -m edge\.sinks\.npz"):
+            sink.close()
+        assert path.read_bytes() == b"of another meanwhile"
+        path.unlink()
+        assert npz.gather(path) == 1
 
     def test_without_a_scan_nothing_is_written(self, tmp_path):
-        path = tmp_path / "out.npz"
-        path.write_bytes(b"old")
-        NpzSink(path, *SHAPES).close()
-        assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+        NpzSink(tmp_path / "out.npz", *SHAPES).close()
+        assert list(tmp_path.iterdir()) == []
 
     def test_every_row_is_on_disk_as_soon_as_written_and_none_is_kept(self, tmp_path):
         sink = NpzSink(tmp_path / "out.npz", *SHAPES)

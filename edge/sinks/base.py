@@ -36,7 +36,7 @@ class Sink(Protocol):
         """
 
     def wait(self) -> None:
-        """Called several times a second while no scan comes."""
+        """Called several times a second while no scan comes; raises as `write` does."""
 
     def close(self) -> None:
         """Finish what was written.

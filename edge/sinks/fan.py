@@ -27,6 +27,7 @@ class Fan(Sink):
         self.failures: list[SinkError] = []
         self._sinks: list[Sink] = []
         self._given_up_unwritten = 0
+        self._counters: Mapping[str, int] = {}
         self._tell = tell
         self._clock_ns = clock_ns
 
@@ -52,9 +53,8 @@ class Fan(Sink):
         self._each(lambda sink: sink.tell(event, counters), counters)
 
     def wait(self) -> None:
-        """Hand on that nothing comes."""
-        for sink in self._sinks:
-            sink.wait()
+        """Hand on that nothing comes; raises as `write` does."""
+        self._each(lambda sink: sink.wait(), self._counters)
 
     def close(self) -> None:
         """Close what is left, each whatever becomes of the others.
@@ -72,6 +72,7 @@ class Fan(Sink):
             raise self.failures[0]
 
     def _each(self, act: Callable[[Sink], None], counters: Mapping[str, int]) -> None:
+        self._counters = counters  # of a sink that fails while nothing comes, these are still true
         for sink in tuple(self._sinks):
             if sink not in self._sinks:  # given up meanwhile, when it was told that another was
                 continue

@@ -1,40 +1,106 @@
 """Sinks as a user writes them."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from edge.contract import Contract
 from edge.errors import UsageError
+from edge.ros_names import base_topic
 from edge.sinks.base import Sink
+from firmware_bridge.extras import how_to_install
+from firmware_bridge.links.base import SourceKind
+from firmware_bridge.mounting import Mounting
 
-FORMS: Final = ("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz")
+FORMS: Final = (
+    *("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz", "mcap:FILE.mcap"),
+    *("shm:NAME", "zenoh:KEY", "ros2:TOPIC"),
+)
+_TARGETED: Final = ("jsonl", "npz", "mcap", "shm", "zenoh", "ros2")
 
 
-def open_sink(text: str, contract: Contract, *, patient: bool = True) -> Sink:
+def check_sink(text: str) -> tuple[str, str]:
+    """Form and target of the sink that `text` names; nothing is opened.
+
+    Raises:
+        UsageError: no such form; the forms are listed. Or no target of this form.
+    """
+    form, _, target = text.partition(":")
+    ending = f".{form}" if form in ("npz", "mcap") else ""
+    if text != "status" and (form not in _TARGETED or not target.endswith(ending) or not target):
+        raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")
+    if form == "ros2":
+        base_topic(target)
+    if form == "zenoh":
+        from edge.sinks.zenoh import understood
+
+        understood(target)
+    return form, target
+
+
+def open_sink(
+    text: str,
+    contract: Contract,
+    *,
+    patient: bool = True,
+    mountings: Mapping[str, Mounting] | None = None,
+    unix_offset_ns: int | None = None,
+    source: str | None = None,
+    origin: SourceKind | None = None,
+) -> Sink:
     """Open the sink that `text` names.
 
     Args:
         text: one of FORMS.
         contract: says which maps will come, and their shapes.
         patient: wait for slow readers, rather than leave records out.
+        mountings: of the sensors, by name.
+        unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
+        source: kind of what is read, told with events.
+        origin: what kind of source the scans come from, where they are of a recording that tells.
 
     Raises:
         UsageError: no such form; the forms are listed.
         SinkError: it cannot be opened.
     """
     # Each loaded only where it is used: start-up time and memory are for what runs.
-    form, _, target = text.partition(":")
-    if text == "status":
+    form, target = check_sink(text)
+    if form == "status":
         from edge.sinks.status import StatusSink
 
         return StatusSink()
-    if form == "jsonl" and target:
+    if form == "jsonl":
         from edge.sinks.jsonl import JsonLinesSink
 
-        return JsonLinesSink(target, patient=patient)
-    if form == "npz" and target.endswith(".npz"):
+        return JsonLinesSink(target, patient=patient, source=source)
+    if form == "npz":
         from edge.sinks.npz import NpzSink
 
         scan_shape, deviations = (3, contract.rows, contract.cols), contract.interval_factor is not None
-        return NpzSink(Path(target), scan_shape, contract.pattern_shape, deviations=deviations)
-    raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")
+        return NpzSink(Path(target), scan_shape, contract.pattern_shape, deviations=deviations, origin=origin)
+    if form == "mcap":
+        from edge.sinks.mcap import McapSink
+
+        return McapSink(
+            Path(target),
+            contract,
+            patient=patient,
+            mountings=mountings,
+            unix_offset_ns=unix_offset_ns,
+            origin=origin,
+        )
+    if form == "shm":
+        from edge.sinks.shm import SharedMemorySink
+
+        return SharedMemorySink(target, contract)
+    if form == "zenoh":
+        from edge.sinks.zenoh import ZenohSink
+
+        return ZenohSink(target, patient=patient, source=source)
+    try:
+        from edge.sinks.ros2 import Ros2Sink
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "cyclonedds":
+            raise
+        raise UsageError(f"{text} needs Cyclone DDS: {how_to_install('ros2')}") from error
+    return Ros2Sink(target, unix_offset_ns=unix_offset_ns, source=source)

@@ -14,15 +14,23 @@ CLEAR_LINE: Final = "\r\x1b[K"
 class MessageSink(Sink):
     """Writes each event as a line."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    def __init__(self, stream: TextIO | None = None, *, said: str | None = None) -> None:
+        """Begin without an event.
+
+        Args:
+            stream: written to; stderr unless given.
+            said: what was said before the first result, which tells it once more, such as why it is this model.
+        """
         self._stream = sys.stderr if stream is None else stream
-        self._begun = False
+        self._said = said
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Say what happened before this scan; why it began with its model was said before the first."""
-        if result.event is not None and self._begun:
-            self._say(result.event)
-        self._begun = True
+        """Say what happened before this scan, but for what was said already."""
+        event, said, self._said = result.event, self._said, None
+        if event is not None and said is not None:
+            event = f"{event}; ".removeprefix(f"{said}; ").removesuffix("; ")
+        if event:
+            self._say(event)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Say what happened."""
@@ -36,10 +44,15 @@ class MessageSink(Sink):
         if self._stream is None:
             return
         try:
-            self._stream.write(f"{CLEAR_LINE if self._stream.isatty() else ''}edge-sr: {text}\n")
+            self._stream.write(f"{CLEAR_LINE if self._stream.isatty() else ''}edge-sr: {_harmless(text)}\n")
             self._stream.flush()
         except OSError:
             self._stream = None  # the window was closed; that ends no recording
 
     def close(self) -> None:
         """Nothing to finish."""
+
+
+def _harmless(text: str) -> str:
+    """Text that moves no cursor and sets no title: what devices and files say is in it."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
+from edge.rate import Rate
 from edge.result import Result
 from edge.sinks.base import Sink
 
 REFRESH_S: Final = 0.1
 SILENCE_S: Final = 1.0
-RATE_SMOOTHING: Final = 0.05
 CLEAR_TO_END: Final = "\x1b[K"
 
 
@@ -30,7 +30,7 @@ class StatusSink(Sink):
         self._columns = columns
         self._terminal = self._stream is not None and self._stream.isatty()
         self._latest: dict[str, Result] = {}
-        self._rates: dict[str, _Rate] = {}
+        self._rates: dict[str, Rate] = {}
         self._counters: Mapping[str, int] = {}
         self._last_scan_s = clock_s()
         self._heard_s: dict[str, float] = {}
@@ -39,7 +39,7 @@ class StatusSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
         self._latest[result.scan.sensor] = result
-        self._rates.setdefault(result.scan.sensor, _Rate()).add(result.scan.time_ns)
+        self._rates.setdefault(result.scan.sensor, Rate()).add(result.scan.time_ns)
         self._counters = counters
         self._last_scan_s = self._heard_s[result.scan.sensor] = self._clock_s()
         self._refresh()
@@ -119,21 +119,3 @@ class StatusSink(Sink):
         if rate_hz is not None:
             words.append(f"{rate_hz:.0f} Hz")
         return " ".join(words)
-
-
-class _Rate:
-    """Scans a second, smoothed over about twenty scans."""
-
-    def __init__(self) -> None:
-        self.rate_hz: float | None = None
-        self._period_ns: float | None = None
-        self._last_ns: int | None = None
-
-    def add(self, time_ns: int) -> None:
-        if self._last_ns is not None and time_ns > self._last_ns:
-            period_ns = time_ns - self._last_ns
-            if self._period_ns is None:
-                self._period_ns = period_ns
-            self._period_ns += RATE_SMOOTHING * (period_ns - self._period_ns)
-            self.rate_hz = 1e9 / self._period_ns
-        self._last_ns = time_ns
