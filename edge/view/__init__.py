@@ -1,0 +1,1 @@
+"""The live page: what the loop hears, sampled and shown in browsers."""

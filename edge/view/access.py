@@ -1,0 +1,126 @@
+"""Who may look: which requests the live page's server takes. No I/O.
+
+A browser runs pages of strangers, which can reach a server on loopback, too. Three things keep them out: the name that
+the browser was asked to reach (a stranger's name may be made to point here), the page that a socket is asked for by,
+and, where others than this machine can reach the server, a token.
+"""
+
+import hmac
+import ipaddress
+import re
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Final, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+from edge.errors import UsageError
+
+PAGE: Final = "/"
+SOCKET: Final = "/ws"
+SHORTEST_TOKEN: Final = 12
+REMEDY: Final = "open the address that edge-sr printed when it started, or name this one with --view-host"
+_TOKEN: Final = re.compile(rf"[A-Za-z0-9_-]{{{SHORTEST_TOKEN},200}}")
+
+
+class Refusal(NamedTuple):
+    """Why a request is not answered as wanted."""
+
+    status: HTTPStatus
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """What a request must know.
+
+    Attributes:
+        host: name or address that the server listens at.
+        name: what this machine is called, with or without a domain.
+        token: or None where none is needed.
+    """
+
+    host: str
+    name: str
+    token: str | None
+
+    def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
+        """Why a request is refused; None for one that is granted.
+
+        Args:
+            path: with its query.
+            hosts: values of its Host header.
+            origins: values of its Origin header; only browsers send it.
+        """
+        called = ", ".join(hosts) or "nothing"
+        if len(hosts) != 1 or not self._is_ours(hosts[0]):
+            return Refusal(HTTPStatus.FORBIDDEN, f"this server is not called {called}; {REMEDY}")
+        if any(origin != f"http://{hosts[0]}" for origin in origins):
+            return Refusal(HTTPStatus.FORBIDDEN, f"pages of {', '.join(origins)} may not ask this server")
+        place, _, query = path.partition("?")
+        if place not in (PAGE, SOCKET):
+            return Refusal(HTTPStatus.NOT_FOUND, f"there is only {PAGE}")
+        given = parse_qs(query).get("token", [""])
+        # The page alone shows nothing, and keeps the token out of the address bar: it must open again without.
+        if place == SOCKET and self.token is not None and not _same(given[-1], self.token):
+            text = "the token is missing or wrong: open the address that edge-sr printed when it started"
+            return Refusal(HTTPStatus.FORBIDDEN, text)
+        return None
+
+    def url(self, port: int) -> str:
+        """The page's address for a person on this machine, or on another where others can reach it."""
+        host = self.name if _is_everything(self.host) else self.host
+        shown = f"[{host}]" if ":" in host else host
+        return f"http://{shown}:{port}{PAGE}" + ("" if self.token is None else f"?token={self.token}")
+
+    def _is_ours(self, host: str) -> bool:
+        try:
+            name = urlsplit(f"//{host}").hostname
+        except ValueError:
+            return False
+        if name is None:
+            return False
+        if name in ("localhost", self.host.lower()):
+            return True
+        address = _address(name)
+        if address is not None:
+            return address.is_loopback or _is_everything(self.host)
+        # In whatever domain: a stranger can call his so, too, but where others can reach it he needs the token.
+        return not is_loopback(self.host) and name.partition(".")[0] == self.name.lower().partition(".")[0]
+
+
+def grant(host: str, name: str, token: str | None) -> Access:
+    """What is asked of requests to a server at `host`, on a machine called `name`: a token unless it is on loopback.
+
+    Raises:
+        UsageError: the token is too easy, or no part of an address.
+    """
+    if token is not None and not _TOKEN.fullmatch(token):
+        expected = f"expected at least {SHORTEST_TOKEN} letters, digits, - or _"
+        raise UsageError(f"a token of {len(token)} characters for the live page: {expected}, or leave it to be made")
+    if token is None and not is_loopback(host):
+        token = secrets.token_urlsafe(16)
+    return Access(host, name, token)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach it."""
+    address = _address(host)
+    return host.lower() == "localhost" if address is None else address.is_loopback
+
+
+def _is_everything(host: str) -> bool:
+    address = _address(host)
+    return address is not None and address.is_unspecified
+
+
+def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(host)
+    except ValueError:
+        return None
+
+
+def _same(given: str, token: str) -> bool:
+    return hmac.compare_digest(given.encode(errors="surrogatepass"), token.encode())

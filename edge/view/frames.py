@@ -1,0 +1,150 @@
+"""Frames of the live page: what was heard, packed for those who look. No I/O, no clock."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from edge.contract import Contract
+from edge.event import Event
+from edge.packed import pack
+from edge.record import encodable, event_record, record
+from edge.view.heard import Heard, Newest, Point, Told
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.links.base import SourceKind
+
+VERSION: Final = 1
+MAX_FPS: Final = 25
+"""Result frames a second of one sensor: as many as an eye takes in."""
+SILENT_NS: Final = 500_000_000
+"""As long as for a sensor of which the link tells that it is silent."""
+
+
+class Run(NamedTuple):
+    """What does not change while a run lasts.
+
+    Attributes:
+        name: of the source.
+        kind: of the source.
+        model: name of the model that it begins with.
+        contract: of that model.
+        id: this run's alone, by which a viewer that comes again knows whether it is another one.
+    """
+
+    name: str
+    kind: SourceKind
+    model: str
+    contract: Contract
+    id: str
+
+
+class Frames:
+    """Frames of one moment; who looks at the same gets the same bytes.
+
+    Attributes:
+        now_ns: the moment, in [ns].
+    """
+
+    def __init__(self, heard: Heard, now_ns: int) -> None:
+        self.now_ns = now_ns
+        self._heard = heard
+        self._newest = dict(heard.newest)
+        self._packed: dict[tuple[str, int], bytes] = {}
+
+    @property
+    def numbers(self) -> dict[str, int]:
+        """Number of the newest result of every sensor."""
+        return {sensor: newest.number for sensor, newest in self._newest.items()}
+
+    def result(self, sensor: str, since: int) -> bytes:
+        """The newest result of a sensor, with the trace behind number `since`."""
+        packed = self._packed.get((sensor, since))
+        if packed is None:
+            packed = self._packed[sensor, since] = self._pack(self._newest[sensor], since)
+        return packed
+
+    def events(self, since: int) -> list[tuple[int, bytes]]:
+        """The latest events behind number `since`, with their numbers."""
+        return [(told.number, self._event(told)) for told in self._heard.events(since)]
+
+    def silent(self) -> dict[str, float]:
+        """Sensors of which nothing is heard, and for how long, in [s]."""
+        away_ns = {sensor: self.now_ns - newest.heard_ns for sensor, newest in self._newest.items()}
+        return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SILENT_NS}
+
+    def _event(self, told: Told) -> bytes:
+        return _event(told.event, told.counters, self.now_ns - told.heard_ns, {"number": told.number})
+
+    def _pack(self, newest: Newest, since: int) -> bytes:
+        result = newest.result
+        first_ns = self._heard.first_ns or 0
+        header: dict[str, Any] = {
+            **record(result, newest.counters),
+            "kind": "result",
+            "rate_hz": None if newest.rate_hz is None else round(newest.rate_hz, 2),
+            "age_s": _seconds(self.now_ns - newest.heard_ns),
+            # Heard meanwhile may be more than what is packed here; the next frame begins behind this one.
+            "trace": [
+                _drawn(point, first_ns)
+                for point in self._heard.points(result.scan.sensor, since)
+                if point.number <= newest.number
+            ],
+        }
+        taps = None if result.window is None else result.window[: result.taps_used, 2]
+        maps = {"zeroed": result.zeroed, "pattern": result.pattern, "deviation": result.deviation, "taps": taps}
+        return pack(header, {name: values for name, values in maps.items() if values is not None})
+
+
+def hello(run: Run, recording: Path | None) -> bytes:
+    """The first frame that a viewer gets."""
+    contract = run.contract
+    height, width = contract.pattern_shape
+    header = {
+        "kind": "hello",
+        "version": VERSION,
+        "run": run.id,
+        "name": encodable(run.name),
+        "source": run.kind,
+        "model": run.model,
+        "taps": contract.taps,
+        "pattern_unit": contract.output_unit,
+        "full_scale": contract.output_full_scale,
+        "pixel_pitch_mm": USPA44.pixel_pitch_mm(contract.scale),
+        "taxel_pitch_mm": contract.pitch_mm,
+        "rows": contract.rows,
+        "cols": contract.cols,
+        "height": height,
+        "width": width,
+        "recording": _path(recording),
+        "max_fps": MAX_FPS,
+    }
+    return pack(header, {})
+
+
+def state(recording: Path | None, viewers: int, silent: dict[str, float]) -> bytes:
+    """What is true of the run beside its results."""
+    return pack({"kind": "state", "recording": _path(recording), "viewers": viewers, "silent": silent}, {})
+
+
+def refused(time_ns: int, why: str) -> bytes:
+    """The answer to what was no command: without a number, since it is none of the run's events."""
+    return _event(Event(time_ns, "refused", None, why), {}, 0, {})
+
+
+def _event(event: Event, counters: Mapping[str, int], age_ns: int, number: Mapping[str, int]) -> bytes:
+    said = event_record(event, counters, None)  # hello has told the source
+    return pack({**said, **number, "kind": "event", "age_s": _seconds(age_ns)}, {})
+
+
+def _path(path: Path | None) -> str | None:
+    return None if path is None else encodable(str(path))
+
+
+def _drawn(point: Point, first_ns: int) -> list[float | None]:
+    force = None if point.force_counts is None else round(point.force_counts, 1)
+    area = None if point.area_mm2 is None else round(point.area_mm2, 2)
+    force_n = None if point.force_n is None else round(point.force_n, 4)
+    return [round((point.time_ns - first_ns) / 1e9, 3), force, area, force_n]
+
+
+def _seconds(ns: int) -> float:
+    return round(ns / 1e9, 3)

@@ -1,0 +1,165 @@
+"""What a run was heard to say, for those who look now and then.
+
+The loop writes and never waits; others read meanwhile. What is written is replaced as a whole or appended to a bounded
+deque, and a deque is copied in one step, so no reader sees half of anything, and no lock is needed.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple
+
+from edge.event import Event
+from edge.rate import Rate
+from edge.result import Result
+from edge.rezero import GIVEN_UP, REFUSED, in_contact
+from edge.runtime import TAPS_FORGOTTEN
+
+TRACE_S: Final = 60.0
+TRACE_POINTS: Final = 1200
+"""Of the last TRACE_S: one in 50 ms, which a page some hundred pixels wide cannot tell from all."""
+RECENT_SCANS: Final = 256
+EVENTS: Final = 20
+_POINT_NS: Final = round(TRACE_S / TRACE_POINTS * 1e9)
+
+
+class Point(NamedTuple):
+    """What is drawn of one scan against time.
+
+    Attributes:
+        number: of the results heard of its sensor, from 1.
+        time_ns: of the scan, in [ns].
+        force_counts: or None.
+        area_mm2: or None.
+        force_n: or None.
+    """
+
+    number: int
+    time_ns: int
+    force_counts: float | None
+    area_mm2: float | None
+    force_n: float | None
+
+
+class Newest(NamedTuple):
+    """The newest result of a sensor.
+
+    Attributes:
+        number: of the results heard of this sensor, from 1.
+        result: as it came.
+        counters: up to it.
+        heard_ns: when it was heard, in [ns].
+        rate_hz: smoothed rate of the sensor's scans; None before the second.
+    """
+
+    number: int
+    result: Result
+    counters: Mapping[str, int]
+    heard_ns: int
+    rate_hz: float | None
+
+
+class Told(NamedTuple):
+    """An event.
+
+    Attributes:
+        number: of the events heard, from 1.
+        event: as it was told.
+        counters: up to it.
+        heard_ns: when, in [ns].
+    """
+
+    number: int
+    event: Event
+    counters: Mapping[str, int]
+    heard_ns: int
+
+
+class Heard:
+    """The newest of every sensor, a trace of each, and the latest events, in memory that does not grow with the run.
+
+    Attributes:
+        newest: by sensor.
+        first_ns: time of the run's first scan, in [ns]; None before.
+    """
+
+    def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self.newest: dict[str, Newest] = {}
+        self.first_ns: int | None = None
+        self._clock_ns = clock_ns
+        self._traces: dict[str, _Trace] = {}
+        self._events: deque[Told] = deque(maxlen=EVENTS)
+        self._told = 0
+
+    def add(self, result: Result, counters: Mapping[str, int]) -> int:
+        """Take a result; returns the time it was heard at, in [ns]."""
+        scan = result.scan
+        if self.first_ns is None:
+            self.first_ns = scan.time_ns
+        trace = self._traces.get(scan.sensor)
+        if trace is None:
+            trace = _Trace()
+            # Replaced, not added to: who iterates over the one before is not disturbed.
+            self._traces = {**self._traces, scan.sensor: trace}
+        trace.add(result)
+        if result.event is not None:
+            self.tell(_event_of(result, result.event), counters)
+        heard_ns = self._clock_ns()
+        newest = Newest(trace.number, result, counters, heard_ns, trace.rate.rate_hz)
+        if scan.sensor in self.newest:
+            self.newest[scan.sensor] = newest
+        else:
+            self.newest = {**self.newest, scan.sensor: newest}
+        return heard_ns
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Take an event."""
+        self._told += 1
+        self._events.append(Told(self._told, event, counters, self._clock_ns()))
+
+    def events(self, since: int) -> list[Told]:
+        """The latest events behind number `since`."""
+        return [told for told in self._events.copy() if told.number > since]
+
+    def points(self, sensor: str, since: int) -> list[Point]:
+        """What to draw of a sensor's scans behind number `since`: all, or if these are too many, one in 50 ms."""
+        return self._traces[sensor].points(since)
+
+
+def _event_of(result: Result, text: str) -> Event:
+    """What a result tells: taps are forgotten of all sensors; a refusal is of one where zeroing it may be forced."""
+    sensor = result.scan.sensor
+    if REFUSED not in text and GIVEN_UP not in text:
+        return Event(result.scan.time_ns, "note", None if TAPS_FORGOTTEN in text else sensor, text)
+    return Event(result.scan.time_ns, "refused", sensor if in_contact(sensor) in text else None, text)
+
+
+class _Trace:
+    """Scans of one sensor against time."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.rate = Rate()
+        self._recent: deque[Point] = deque(maxlen=RECENT_SCANS)
+        self._past: deque[Point] = deque(maxlen=TRACE_POINTS - 1)
+
+    def add(self, result: Result) -> None:
+        self.number += 1
+        time_ns = result.scan.time_ns
+        self.rate.add(time_ns)
+        point = Point(self.number, time_ns, result.force_counts, result.area_mm2, result.force_n)
+        self._recent.append(point)
+        past = self._past
+        if not past or time_ns // _POINT_NS != past[-1].time_ns // _POINT_NS:
+            past.append(point)
+        elif (result.force_counts or 0.0) > (past[-1].force_counts or 0.0):
+            past[-1] = point  # the highest of its 50 ms: a short touch is seen, too
+
+    def points(self, since: int) -> list[Point]:
+        recent = [point for point in self._recent.copy() if point.number > since]
+        if not recent or recent[0].number == since + 1:
+            return recent
+        newest = recent[-1]
+        from_ns = newest.time_ns - TRACE_S * 1e9
+        past = [point for point in self._past.copy() if since < point.number < newest.number]
+        return [point for point in past if point.time_ns > from_ns] + [newest]

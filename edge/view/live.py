@@ -1,0 +1,101 @@
+"""The live page of a run: what it hears, who may look, who serves, and the recording that a viewer may ask for."""
+
+import contextlib
+import secrets
+import socket
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Final, Self
+
+from edge.commands import AllCommands, Commands
+from edge.contract import Contract
+from edge.event import Event
+from edge.sinks.base import Sink
+from edge.view.access import grant
+from edge.view.asked import Asked
+from edge.view.frames import Run
+from edge.view.heard import Heard
+from edge.view.recorder import FORM, RecordCommands, Recorder
+from edge.view.server import Server
+from edge.view.sink import ViewSink
+from firmware_bridge.links.base import SourceKind
+
+LOOPBACK: Final = "127.0.0.1"
+
+
+class LiveView:
+    """A run's live page; the port is taken at once, and pages are answered from `begin` on.
+
+    Attributes:
+        sinks: what the loop writes to; none of them fails.
+        url: the page's address.
+    """
+
+    def __init__(self, host: str, port: int, token: str | None, record_dir: Path, contract: Contract) -> None:
+        """Take the port.
+
+        Args:
+            host: name or address to listen at.
+            port: 0 for any free one.
+            token: that requests must know; None makes one where others than this machine can reach `host`.
+            record_dir: where recordings are made.
+            contract: of the run's model.
+
+        Raises:
+            UsageError: the token cannot be one.
+            SinkError: the port cannot be had.
+        """
+        access = grant(host, socket.gethostname(), token)
+        self._heard = Heard()
+        self._asked = Asked()
+        self._messages: Callable[[Event], object] = lambda event: None
+        self._recorder = Recorder(record_dir, self._tell)
+        import_module(f"edge.sinks.{FORM}")  # now, rather than between two scans: it may take a fifth of a second
+        self._server = Server(self._heard, self._asked, access, port, lambda: self._recorder.path, self._failed)
+        self._view = ViewSink(self._heard, lambda: self._server.watched, self._server.wake)
+        self._contract = contract
+        self._open = contextlib.ExitStack()
+        self.sinks: list[Sink] = [self._recorder, self._view]
+        self.url = access.url(self._server.port)
+
+    def __enter__(self) -> Self:
+        self._open.callback(self._server.close)
+        self._open.callback(self._recorder.close)
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._open.close()
+
+    def begin(
+        self,
+        name: str,
+        kind: SourceKind,
+        model: str,
+        open_sink: Callable[[str], Sink],
+        messages: Callable[[Event], object],
+    ) -> None:
+        """Answer from now on.
+
+        Args:
+            name: of the source.
+            kind: of the source.
+            model: name of the model that the run begins with.
+            open_sink: opens the sink that a text names, to record into.
+            messages: is told of recordings, as viewers are.
+        """
+        self._messages = messages
+        self._recorder.open_sink = open_sink
+        self._server.begin(Run(name, kind, model, self._contract, secrets.token_hex(8)))
+
+    def commands(self, others: Commands) -> Commands:
+        """Commands of viewers, and others; those to record are done when they are polled."""
+        return RecordCommands(AllCommands([others, self._asked]), self._recorder)
+
+    def _failed(self, why: str) -> None:
+        self._messages(Event(time.monotonic_ns(), "trouble", None, why))
+
+    def _tell(self, event: Event) -> None:
+        self._messages(event)
+        self._view.tell(event, {})

@@ -1,0 +1,181 @@
+"""A recording that is begun and ended while the run goes on."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from threading import get_native_id
+from typing import Final
+
+from edge.commands import Command, Commands
+from edge.errors import SinkError
+from edge.event import Event
+from edge.result import Result
+from edge.sinks.base import Sink
+
+FORM: Final = "mcap"
+"""Of the sink that is recorded into, and the ending of its files."""
+
+
+class Recorder(Sink):
+    """Records into a new file each time it is asked to; what fails is told, and ends no run.
+
+    A thread of its own opens and closes, and nobody waits for a disk while the run goes on: what comes before the file
+    is open is not recorded. The thread is begun here: one that the loop begins later would have its processor, and what
+    a sink begins has this one's.
+
+    Attributes:
+        path: of the file that is recorded into; None while none is.
+        open_sink: opens the sink that a text names; to be set before anything is recorded.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        tell: Callable[[Event], object],
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        local_time: Callable[[], time.struct_time] = time.localtime,
+    ) -> None:
+        """Wait to be asked.
+
+        Args:
+            directory: where files are made.
+            tell: is told what begins, ends and fails.
+            clock_ns: monotonic, in [ns].
+            local_time: names the files.
+        """
+        self.path: Path | None = None
+        self.open_sink: Callable[[str], Sink] | None = None
+        self._directory = directory
+        self._tell = tell
+        self._clock_ns = clock_ns
+        self._local_time = local_time
+        self._sink: Sink | None = None
+        self._unwritten = 0
+        self._aside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
+        self._aside.submit(get_native_id).result()
+        self._opening: Future[tuple[Sink, Path]] | None = None
+        self._wanted = False
+        self._closing: tuple[Future[None], Path | None] | None = None
+
+    @property
+    def unwritten(self) -> int:
+        """Records left out, of all recordings."""
+        return self._unwritten + (0 if self._sink is None else self._sink.unwritten)
+
+    def record(self, on: bool) -> None:
+        """Begin a recording, or end it; asked for what is so already it does nothing."""
+        self._look_back()
+        if on and self._closing is not None:
+            self._say("refused", "not recording: the file before is still being written; ask again")
+            return
+        self._wanted = on
+        if on and self._sink is None and self._opening is None and self.open_sink is not None:
+            self._opening = self._aside.submit(self._open, self.open_sink)
+        elif not on and self._sink is not None:
+            self._end(self.path)
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Record one result, if it is recorded."""
+        self._do(lambda sink: sink.write(result, counters))
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Record an event, if it is recorded."""
+        self._do(lambda sink: sink.tell(event, counters))
+
+    def wait(self) -> None:
+        """Hand on that nothing comes."""
+        self._do(lambda sink: sink.wait())
+
+    def close(self) -> None:
+        """End the recording, if there is one, and wait until it is written."""
+        if self._opening is not None:
+            wait([self._opening])
+        self.record(False)
+        self._aside.shutdown()
+        self._look_back()
+
+    def _open(self, open_sink: Callable[[str], Sink]) -> tuple[Sink, Path]:
+        try:
+            path = _unused(self._directory / time.strftime("edge-%Y%m%d-%H%M%S", self._local_time()))
+        except OSError as error:
+            raise SinkError(f"cannot record into {self._directory}: {error.strerror}") from error
+        return open_sink(f"{FORM}:{path}"), path
+
+    def _do(self, act: Callable[[Sink], None]) -> None:
+        self._look_back()
+        if self._sink is None:
+            return
+        try:
+            act(self._sink)
+        except SinkError as error:
+            self._end(None)
+            self._say("sink", f"the recording has ended: {error}")
+
+    def _end(self, whole: Path | None) -> None:
+        """Have the file closed; `whole` is told once it is, None is told already."""
+        sink, self._sink, self.path = self._sink, None, None
+        if sink is not None:
+            self._unwritten += sink.unwritten
+            self._closing = self._aside.submit(sink.close), whole
+
+    def _look_back(self) -> None:
+        """See what the thread has done meanwhile."""
+        if self._opening is not None and self._opening.done():
+            self._begin(self._opening)
+        if self._closing is None or not self._closing[0].done():
+            return
+        (closed, whole), self._closing = self._closing, None
+        try:
+            closed.result()
+        except SinkError as error:
+            self._say("sink", f"the recording could not be finished: {error}")
+            return
+        if whole is not None:
+            self._say("note", f"recorded into {whole}")
+
+    def _begin(self, opened: Future[tuple[Sink, Path]]) -> None:
+        self._opening = None
+        try:
+            self._sink, self.path = opened.result()
+        except SinkError as error:
+            self._say("sink", f"not recording: {error}")
+            return
+        self._say("note", f"recording into {self.path}")
+        if not self._wanted:
+            self._end(self.path)
+
+    def _say(self, kind: str, text: str) -> None:
+        self._tell(Event(self._clock_ns(), kind, None, text))
+
+
+class RecordCommands:
+    """Commands, of which those to record are done here, and the others handed on to who polls."""
+
+    def __init__(self, commands: Commands, recorder: Recorder) -> None:
+        self._commands = commands
+        self._recorder = recorder
+
+    @property
+    def refused(self) -> int:
+        """What came and was no command."""
+        return self._commands.refused
+
+    def poll(self) -> Sequence[Command]:
+        """What else was asked for since the last call."""
+        others: list[Command] = []
+        for command in self._commands.poll():
+            if command.name == "record":
+                self._recorder.record(command.on)
+            else:
+                others.append(command)
+        return others
+
+
+def _unused(stem: Path) -> Path:
+    """A file of this name, or with a number behind it, that is not there yet."""
+    path, count = stem.with_name(f"{stem.name}.{FORM}"), 1
+    while path.exists():
+        count += 1
+        path = stem.with_name(f"{stem.name}-{count}.{FORM}")
+    return path

@@ -1,0 +1,278 @@
+"""The live page's server: one thread, which sleeps until there is something to send and somebody who looks.
+
+What it does in one go is short, since the loop cannot run meanwhile: it packs a frame, and sends it.
+"""
+
+import asyncio
+import contextlib
+import errno
+import gc
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from http import HTTPStatus
+from pathlib import Path
+from typing import ClassVar, Final
+
+from websockets.asyncio.server import ServerConnection, broadcast, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
+from websockets.protocol import State
+
+from edge.errors import SinkError
+from edge.view.access import SOCKET, Access
+from edge.view.asked import LONGEST_BYTES, Asked
+from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
+from edge.view.heard import Heard
+from edge.view.page import load_page
+from edge.view.viewer import Viewer
+
+MOST_VIEWERS: Final = 16
+MOST_CONNECTIONS: Final = 64
+"""Of viewers, of browsers that fetch the page, and of whoever says nothing for OPEN_S."""
+PERIOD_S: Final = 1 / MAX_FPS
+STATE_S: Final = 1.0
+TIDY_S: Final = 10.0
+PING_S: Final = 0.25
+LATE_S: Final = 0.5
+"""Since a ping that a viewer has not answered: what lies on its way is old, and nothing is put behind it."""
+GONE_S: Final = 10.0
+OPEN_S: Final = 5.0
+CLOSE_S: Final = 1.0
+COMMAND_PAUSE_S: Final = 0.02
+"""Between two commands of a viewer: one that never stops asking must not keep the loop from its work."""
+
+
+class Server:
+    """Shows a run to whoever looks.
+
+    Attributes:
+        watched: somebody looks.
+        port: that it listens at.
+    """
+
+    def __init__(
+        self,
+        heard: Heard,
+        asked: Asked,
+        access: Access,
+        port: int,
+        recording: Callable[[], Path | None] = lambda: None,
+        failed: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        """Take the port; pages are answered from `begin` to `close`.
+
+        Args:
+            heard: what to show.
+            asked: takes what viewers ask for.
+            access: who may look.
+            port: 0 for any free one.
+            recording: file that is recorded into, or None.
+            failed: is told why there is no page any more, from the server's thread.
+
+        Raises:
+            SinkError: the page cannot be served there.
+        """
+        self.watched = False
+        self._heard = heard
+        self._asked = asked
+        self._access = access
+        self._recording = recording
+        self._failed = failed
+        self._page = load_page()
+        self._socket = _listen(access.host, port)
+        self.port: int = self._socket.getsockname()[1]
+        self._thread: threading.Thread | None = None
+        self._connected: set[ServerConnection] = set()
+        self._granted: set[ServerConnection] = set()
+        self._viewers: dict[ServerConnection, _Attended] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._news = asyncio.Event()
+        self._ending = False
+        self._requests = 0
+
+    def begin(self, run: Run) -> None:
+        """Answer pages and sockets; `run` is what they are told of it first."""
+        ready = threading.Event()
+        self._thread = threading.Thread(target=self._serve, args=(run, ready), name="live-view")
+        self._thread.start()
+        ready.wait()
+
+    def close(self) -> None:
+        """Tell whoever looks that the run has ended, and give the port back."""
+        self._ending = True
+        self.wake()
+        if self._thread is not None:
+            self._thread.join()
+        self._socket.close()
+
+    def wake(self) -> None:
+        """There is something new. Never waits."""
+        loop = self._loop
+        if loop is not None:
+            with contextlib.suppress(RuntimeError):  # it has ended, that moment
+                loop.call_soon_threadsafe(self._news.set)
+
+    @property
+    def viewers(self) -> int:
+        """How many look."""
+        return len(self._viewers)
+
+    def _serve(self, run: Run, ready: threading.Event) -> None:
+        try:
+            asyncio.run(self._show(run, ready))
+        finally:  # also of what nobody thought of, which ends this thread and no run
+            self._loop, self.watched = None, False
+            ready.set()
+            if not self._ending:
+                self._failed(f"the live page has ended: {sys.exception()!r}; the run goes on")
+
+    async def _show(self, run: Run, ready: threading.Event) -> None:
+        self._loop = asyncio.get_running_loop()
+
+        class Counted(_Connection):
+            connected = self._connected
+
+        async with serve(
+            partial(self._attend, run),
+            sock=self._socket,
+            process_request=self._answer,
+            create_connection=Counted,
+            compression=None,  # a frame is made 25 times a second and read beside it
+            server_header=None,
+            open_timeout=OPEN_S,
+            ping_interval=None,
+            close_timeout=CLOSE_S,
+            max_size=LONGEST_BYTES,
+        ) as server:
+            ready.set()
+            said: tuple[object, ...] = ()
+            said_s = tidied_s = 0.0
+            while not self._ending:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(STATE_S if self._viewers or self._requests else None):
+                        await self._news.wait()
+                self._news.clear()
+                frames = Frames(self._heard, time.monotonic_ns())
+                silent, recording = frames.silent(), self._recording()
+                to_say = (recording, len(self._viewers), tuple(silent))
+                now_s = time.monotonic()
+                if to_say != said or now_s - said_s >= STATE_S:
+                    said, said_s = to_say, now_s
+                    broadcast(self._viewers, state(recording, len(self._viewers), silent))
+                if self._requests and now_s - tidied_s >= TIDY_S:
+                    self._requests, tidied_s = 0, now_s
+                    _tidy()
+                for attended in self._viewers.values():
+                    attended.send(frames, now_s)
+            server.close(code=CloseCode.GOING_AWAY, reason="the run has ended")
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        self._requests += 1
+        if getattr(request, "method", "GET") != "GET":  # older versions of the library take no other
+            return connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "only GET\n")
+        headers = request.headers
+        refusal = self._access.refusal(request.path, headers.get_all("Host"), headers.get_all("Origin"))
+        if refusal is not None:
+            return connection.respond(refusal.status, refusal.text + "\n")
+        if request.path.partition("?")[0] == SOCKET:
+            self._granted &= self._connected
+            if len(self._granted) < MOST_VIEWERS:
+                self._granted.add(connection)
+                return None
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} look already: close one\n")
+        return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
+
+    async def _attend(self, run: Run, connection: ServerConnection) -> None:
+        attended = _Attended(connection)
+        with contextlib.suppress(ConnectionClosed):
+            await connection.send(hello(run, self._recording()))
+            self._viewers[connection] = attended
+            self.watched = True
+            pinging = asyncio.create_task(attended.follow())
+            try:
+                self._news.set()
+                async for message in connection:
+                    if connection.state is not State.OPEN:
+                        break  # what was asked before it closed may be much, and takes its time
+                    why = self._asked.hear(message, attended.viewer)
+                    if why is not None:
+                        broadcast([connection], refused(time.monotonic_ns(), why))
+                    await asyncio.sleep(COMMAND_PAUSE_S)
+            finally:
+                del self._viewers[connection]
+                self.watched = bool(self._viewers)
+                pinging.cancel()
+                self._news.set()
+
+
+class _Connection(ServerConnection):
+    """One that is counted from before its first byte; of too many the newest is closed at once."""
+
+    connected: ClassVar[set[ServerConnection]]
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self.connected.add(self)
+        if len(self.connected) > MOST_CONNECTIONS:
+            self.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.connected.discard(self)
+        super().connection_lost(exc)
+
+
+class _Attended:
+    """One viewer's connection, followed by pings: an answer says that all before it was read."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self.viewer = Viewer()
+        self._connection = connection
+        self._asked_s: float | None = None
+
+    def send(self, frames: Frames, now_s: float) -> None:
+        """Send what is due, unless the viewer is behind."""
+        if self._asked_s is None or now_s - self._asked_s < LATE_S:
+            for frame in self.viewer.due(frames):
+                broadcast([self._connection], frame)
+
+    async def follow(self) -> None:
+        """Ask again and again whether the viewer has read everything; close the connection of one that does not."""
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                self._asked_s = time.monotonic()
+                try:
+                    async with asyncio.timeout(GONE_S):
+                        await (await self._connection.ping())
+                except TimeoutError:
+                    await self._connection.close(CloseCode.POLICY_VIOLATION, f"nothing was read for {GONE_S:.0f} s")
+                    return
+                self._asked_s = None
+                await asyncio.sleep(PING_S)
+
+
+def _tidy() -> None:
+    """Collect what requests leave behind, since nobody else does while the loop runs."""
+    if not gc.isenabled():
+        gc.collect()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.create_server((str(address[0]), port), family=family)
+        # Handed down to connections: else a small frame behind another waits 40 ms for the first to be acknowledged.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return listening
+    except OSError as error:
+        what, remedy = f"port {port} of {host} cannot be had: {error.strerror}", "name another with --view"
+        if error.errno == errno.EADDRINUSE:
+            what, remedy = f"port {port} of {host} is in use", "name another with --view, or 0 for any free one"
+        elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            what, remedy = f"{host} is no address of this machine", "name one with --view-host, or leave it out"
+        raise SinkError(f"no live page: {what}; {remedy}") from error

@@ -1,0 +1,68 @@
+"""What the loop gives the live page: it is stored, and the server woken now and then."""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from edge.event import Event
+from edge.result import Result
+from edge.sinks.base import Sink
+from edge.view.frames import MAX_FPS
+from edge.view.heard import Heard
+
+PERIOD_NS: Final = round(1e9 / MAX_FPS)
+
+
+class ViewSink(Sink):
+    """Stores, and never waits.
+
+    The server is woken from here, behind a scan's last work and not by a clock of its own: it then runs while the loop
+    sleeps, and not in its way.
+    """
+
+    def __init__(
+        self,
+        heard: Heard,
+        watched: Callable[[], bool],
+        wake: Callable[[], object],
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Begin without a result.
+
+        Args:
+            heard: stores.
+            watched: whether somebody looks.
+            wake: tells those who look that there is something new; never waits.
+            clock_ns: monotonic, in [ns].
+        """
+        self._heard = heard
+        self._watched = watched
+        self._wake = wake
+        self._clock_ns = clock_ns
+        self._due_ns = 0
+        self._unseen = False
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Store one result."""
+        self._news(self._heard.add(result, counters))
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Store one event."""
+        self._heard.tell(event, counters)
+        self._news(self._clock_ns())
+
+    def wait(self) -> None:
+        """Show what came last, now that nothing comes."""
+        if self._unseen:
+            self._news(self._clock_ns())
+
+    def close(self) -> None:
+        """Nothing to finish."""
+
+    def _news(self, now_ns: int) -> None:
+        self._unseen = now_ns < self._due_ns
+        if not self._unseen and self._watched():
+            # Every fourth of a hundred scans a second, though they come a little early or late.
+            behind = now_ns - self._due_ns < PERIOD_NS
+            self._due_ns = (self._due_ns if behind else now_ns) + PERIOD_NS
+            self._wake()

@@ -1,0 +1,31 @@
+"""What one viewer has seen, and is to be sent next. No I/O, no clock."""
+
+from edge.view.frames import Frames
+
+
+class Viewer:
+    """One who looks; every frame is the newest there is, however long ago the one before was sent.
+
+    Attributes:
+        paused: no results meanwhile; events go on.
+    """
+
+    def __init__(self) -> None:
+        self.paused = False
+        self._seen: dict[str, int] = {}
+        self._told = 0
+
+    def due(self, frames: Frames) -> list[bytes]:
+        """What is new since the last call: events, and unless paused one frame a sensor."""
+        due: list[bytes] = []
+        for number, frame in frames.events(self._told):
+            self._told = number
+            due.append(frame)
+        if self.paused:
+            return due
+        for sensor, number in frames.numbers.items():
+            seen = self._seen.get(sensor, 0)
+            if number > seen:
+                due.append(frames.result(sensor, seen))
+                self._seen[sensor] = number
+        return due

@@ -1,0 +1,438 @@
+"""Who may look, what they may ask for, and recordings that are asked for."""
+
+import json
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from view_samples import CONTRACT, TIMEOUT_S, Press, wait_for
+
+from edge.commands import Command, obey
+from edge.errors import SinkError, UsageError
+from edge.event import Event
+from edge.sinks.base import Sink
+from edge.sinks.forms import open_sink
+from edge.view.access import grant, is_loopback
+from edge.view.asked import LONGEST_BYTES, WAITING, Asked
+from edge.view.recorder import RecordCommands, Recorder
+from edge.view.viewer import Viewer
+from firmware_bridge.recording import load_recording
+
+TOKEN = "correct-horse-battery"
+
+
+def asks(access, path="/", host="127.0.0.1:8077", origin=None):
+    """Status of the refusal, or None."""
+    hosts = [host] if isinstance(host, str) else host
+    refusal = access.refusal(path, hosts, [] if origin is None else [origin])
+    return None if refusal is None else refusal.status.value
+
+
+class TestAccess:
+    @pytest.mark.parametrize("path", ["/", "/ws", "/?x=1", "/ws?token="])
+    def test_on_loopback_page_and_socket_are_there_for_this_machine(self, path):
+        assert asks(grant("127.0.0.1", "robot", None), path) is None
+
+    @pytest.mark.parametrize("path", ["/favicon.ico", "/ws/", "//", "/page.html", "/../etc/passwd", "", "*"])
+    def test_there_is_nothing_else(self, path):
+        assert asks(grant("127.0.0.1", "robot", None), path) == 404
+
+    @pytest.mark.parametrize(
+        ("host", "ours"),
+        [
+            ("127.0.0.1:8077", True),
+            ("127.0.0.1", True),
+            ("127.1.2.3:9", True),
+            ("localhost:9000", True),  # by ssh -L 9000:localhost:8077
+            ("LOCALHOST:8077", True),
+            ("[::1]:8077", True),
+            ("evil.example:8077", False),
+            ("127.0.0.1.evil.example", False),
+            ("localhost.evil.example", False),
+            ("evil.example@127.0.0.1.x", False),
+            ("192.168.0.5:8077", False),
+            ("robot:8077", False),
+            ("", False),
+            ("[::1", False),
+            (":8077", False),
+            ([], False),
+            (["127.0.0.1:8077", "evil.example"], False),
+        ],
+    )
+    def test_a_name_that_is_not_ours_is_refused(self, host, ours):
+        """What a stranger's name points to is up to the stranger."""
+        assert asks(grant("127.0.0.1", "robot", None), host=host) == (None if ours else 403)
+
+    @pytest.mark.parametrize(
+        ("listens", "host", "ours"),
+        [
+            ("192.168.0.5", "192.168.0.5:8077", True),
+            ("192.168.0.5", "localhost:8077", True),
+            ("192.168.0.5", "192.168.0.6:8077", False),
+            ("gripper.lan", "Gripper.lan:8077", True),
+            ("gripper.lan", "evil.example:8077", False),
+            ("0.0.0.0", "192.168.0.5:8077", True),
+            ("0.0.0.0", "robot:8077", True),
+            ("0.0.0.0", "robot.local:8077", True),
+            ("0.0.0.0", "robot.lan:8077", True),
+            ("0.0.0.0", "ROBOT.local.:8077", True),
+            ("192.168.0.5", "robot:8077", True),
+            ("192.168.0.5", "robots.lan:8077", False),
+            ("0.0.0.0", "evil.example:8077", False),
+            ("::", "[fe80::1]:8077", True),
+        ],
+    )
+    def test_other_addresses_are_called_by_their_name_and_need_the_token(self, listens, host, ours):
+        access = grant(listens, "Robot", TOKEN)
+        assert asks(access, f"/ws?token={TOKEN}", host) == (None if ours else 403)
+        assert asks(access, "/ws", host) == 403
+
+    def test_who_is_refused_for_a_name_is_told_what_to_do(self):
+        refusal = grant("0.0.0.0", "robot", TOKEN).refusal("/", ["arm.lan:8077"], [])
+        assert refusal is not None and "arm.lan:8077; open the address that edge-sr printed" in refusal.text
+
+    @pytest.mark.parametrize(
+        ("origin", "refused"),
+        [
+            ("http://127.0.0.1:8077", None),
+            ("http://127.0.0.1:8078", 403),  # another program's page on this machine
+            ("http://localhost:8077", 403),
+            ("https://127.0.0.1:8077", 403),
+            ("http://evil.example", 403),
+            ("null", 403),
+            ("", 403),
+        ],
+    )
+    def test_only_our_own_page_may_open_a_socket(self, origin, refused):
+        assert asks(grant("127.0.0.1", "robot", None), "/ws", origin=origin) == refused
+
+    def test_the_page_opens_again_without_the_token_that_it_took_out_of_the_address(self):
+        assert asks(grant("192.168.0.5", "robot", TOKEN), "/", "192.168.0.5:8077") is None
+
+    def test_the_token_opens_and_no_other_does(self):
+        access, path = grant("192.168.0.5", "robot", TOKEN), "/ws"
+        host = "192.168.0.5:8077"
+        assert asks(access, f"{path}?token={TOKEN}", host) is None
+        for query in (
+            "",
+            "?token=",
+            f"?token={TOKEN}x",
+            f"?token={TOKEN[:-1]}",
+            "?token=%ff",
+            "?token=ü",
+            "?Token=" + TOKEN,
+        ):
+            assert asks(access, path + query, host) == 403
+
+    def test_a_token_is_made_for_every_address_but_loopback(self):
+        made = {grant(host, "robot", None).token for host in ("0.0.0.0", "::", "192.168.0.5", "gripper.lan")}
+        assert None not in made and len(made) == 4 and all(len(token) >= 22 for token in made if token)
+        assert {grant(host, "robot", None).token for host in ("127.0.0.1", "::1", "localhost")} == {None}
+        assert grant("127.0.0.1", "robot", TOKEN).token == TOKEN
+
+    def test_names_that_look_like_loopback_are_not(self):
+        assert not any(map(is_loopback, ("localhost.evil.example", "127.0.0.1.evil.example", "0.0.0.0", "")))
+
+    @pytest.mark.parametrize("token", ["", "short", "with a space in it", "semi;colon;semi;colon", "x" * 201])
+    def test_a_token_that_cannot_be_one_is_one_line(self, token):
+        with pytest.raises(UsageError, match=rf"a token of {len(token)} characters .* expected at least 12"):
+            grant("127.0.0.1", "robot", token)
+
+    @pytest.mark.parametrize(
+        ("host", "token", "url"),
+        [
+            ("127.0.0.1", None, "http://127.0.0.1:8077/"),
+            ("::1", None, "http://[::1]:8077/"),
+            ("192.168.0.5", TOKEN, f"http://192.168.0.5:8077/?token={TOKEN}"),
+            ("0.0.0.0", TOKEN, f"http://robot:8077/?token={TOKEN}"),
+        ],
+    )
+    def test_the_address_printed_is_one_that_is_granted(self, host, token, url):
+        access = grant(host, "robot", token)
+        assert access.url(8077) == url
+        authority, _, rest = url.partition("//")[2].partition("/")
+        assert asks(access, "/" + rest, authority) is None
+
+    @settings(max_examples=60)
+    @given(
+        st.text() | st.sampled_from(["//[", "/ws?token=%", "/?" + "&" * 500, "/?token=\ud800"]),
+        st.just(["10.0.0.1:1"]) | st.lists(st.text(), max_size=2),
+        st.just([]) | st.lists(st.text(), max_size=2),
+    )
+    def test_whatever_is_asked_is_answered(self, path, hosts, origins):
+        grant("0.0.0.0", "robot", TOKEN).refusal(path, hosts, origins)
+
+
+class TestAsked:
+    def hear(self, *messages):
+        asked = Asked()
+        why = [asked.hear(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer()) for m in messages]
+        return asked, why
+
+    def test_commands_are_polled_once_in_their_order(self):
+        asked, why = self.hear(
+            {"cmd": "zero"},
+            {"cmd": "zero", "sensor": "4", "force": True},
+            {"cmd": "reset"},
+            {"cmd": "record", "on": True},
+            {"cmd": "record", "on": False},
+        )
+        assert why == [None] * 5 and asked.refused == 0
+        assert asked.poll() == [
+            Command("zero"),
+            Command("zero", "4", True),
+            Command("reset"),
+            Command("record", on=True),
+            Command("record", on=False),
+        ]
+        assert asked.poll() == []
+
+    @pytest.mark.parametrize(
+        "message",
+        [
+            "",
+            "zero",
+            "[]",
+            "null",
+            "[" * 4000,
+            b'{"cmd": "zero"}',
+            {"cmd": "stop"},
+            {"cmd": "zero", "sensro": "4"},
+            {"cmd": "zero", "sensor": 4},
+            {"cmd": "zero", "sensor": "\ud800"},  # which no record can hold
+            {"cmd": "zero", "sensor": "\x1b]0;mine\a"},  # which a terminal would do
+            {"cmd": "zero", "force": 1},
+            {"cmd": "record"},
+            {"cmd": "record", "on": "yes"},
+            {"cmd": "record", "on": True, "path": "/etc/passwd"},
+            {"cmd": "pause"},
+            {"cmd": ["zero"]},
+            {"cmd": {}},
+        ],
+    )
+    def test_what_is_none_is_counted_and_told(self, message):
+        asked, [why] = self.hear(message)
+        assert asked.refused == 1 and asked.poll() == []
+        assert why is not None and "expected {" in why and len(why) < 400 and "\n" not in why
+
+    @settings(max_examples=40)
+    @given(st.text() | st.binary() | st.recursive(st.none() | st.booleans() | st.text(), st.lists).map(json.dumps))
+    def test_nothing_raises(self, message):
+        Asked().hear(message, Viewer())
+
+    def test_pausing_is_the_viewers_own(self):
+        asked, viewer, other = Asked(), Viewer(), Viewer()
+        assert asked.hear('{"cmd": "pause", "on": true}', viewer) is None
+        assert viewer.paused and not other.paused and asked.poll() == []
+        asked.hear('{"cmd": "pause", "on": false}', viewer)
+        assert not viewer.paused
+
+    def test_where_nobody_polls_a_few_wait_and_the_others_are_refused(self):
+        asked, why = self.hear(*[{"cmd": "reset"}] * (WAITING + 3))
+        assert why.count(None) == WAITING and asked.refused == 3 and len(asked.poll()) == WAITING
+        assert asked.hear('{"cmd": "reset"}', Viewer()) is None
+
+    def test_the_longest_message_holds_any_command(self):
+        assert len(json.dumps({"cmd": "zero", "sensor": "s" * 1000, "force": False})) < LONGEST_BYTES
+
+
+class Failing(Sink):
+    """Takes so many results, or does not close."""
+
+    def __init__(self, takes, closes=True):
+        self.takes, self.closes, self.closed = takes, closes, 0
+
+    def write(self, result, counters):
+        self.takes -= 1
+        if self.takes < 0:
+            raise SinkError("disk full")
+
+    def close(self):
+        self.closed += 1
+        if not self.closes:
+            raise SinkError("no room for the end")
+
+
+class TestRecorder:
+    AT = time.struct_time((2026, 11, 22, 5, 6, 7, 6, 326, 0))
+
+    def recorder(self, directory, opener=None):
+        told = []
+        opener = opener or (lambda text: open_sink(text, CONTRACT))
+        recorder = Recorder(directory, told.append, local_time=lambda: self.AT)
+        recorder.open_sink = opener
+        return recorder, told
+
+    def begin(self, recorder):
+        """As who asks for it, and goes on until the file is open, or cannot be."""
+        recorder.record(True)
+        wait_for(lambda: recorder.wait() or recorder._opening is None)
+        return recorder.path
+
+    def end(self, recorder):
+        """As who asks for it, and goes on until it is written."""
+        recorder.record(False)
+        wait_for(lambda: recorder.wait() or recorder._closing is None)
+
+    def test_what_comes_while_it_is_on_is_recorded(self, tmp_path):
+        recorder, told = self.recorder(tmp_path)
+        press = Press()
+        recorder.write(press.next(), {})
+        path = self.begin(recorder)
+        assert path is not None and re.fullmatch(r"edge-20261122-050607\.\w+", path.name)
+        results = press.take(3)
+        for result in results:
+            recorder.write(result, {})
+        recorder.record(True)  # as from a second viewer
+        recorder.record(False)
+        recorder.record(False)
+        recorder.write(press.next(), {})
+        recorder.close()
+        assert recorder.path is None
+        assert [event.text for event in told] == [f"recording into {path}", f"recorded into {path}"]
+        assert [event.kind for event in told] == ["note", "note"]
+        [track] = load_recording(path).tracks
+        np.testing.assert_array_equal(track.counts, [result.scan.counts for result in results])
+
+    def test_nobody_waits_until_a_file_is_open(self, tmp_path):
+        disk = threading.Event()
+        sink = Failing(takes=9)
+        recorder, told = self.recorder(tmp_path, lambda text: disk.wait(TIMEOUT_S) and sink)
+        results = Press().take(3)
+        recorder.record(True)
+        recorder.write(results[0], {})
+        assert (recorder.path, told, sink.takes) == (None, [], 9)
+        disk.set()
+        wait_for(lambda: recorder.wait() or recorder.path)
+        recorder.write(results[1], {})
+        assert sink.takes == 8 and told[0].text == f"recording into {recorder.path}"
+
+    def test_one_that_is_not_wanted_any_more_once_its_file_is_open_ends_at_once(self, tmp_path):
+        disk = threading.Event()
+        sink = Failing(takes=9)
+        recorder, told = self.recorder(tmp_path, lambda text: disk.wait(TIMEOUT_S) and sink)
+        recorder.record(True)
+        recorder.record(False)
+        disk.set()
+        wait_for(lambda: recorder.wait() or sink.closed)
+        recorder.close()
+        assert sink.closed == 1 and [event.text.split()[0] for event in told] == ["recording", "recorded"]
+
+    def test_the_end_of_the_run_waits_for_one_that_is_being_opened(self, tmp_path):
+        sink = Failing(takes=9)
+        recorder, told = self.recorder(tmp_path, lambda text: time.sleep(0.2) or sink)
+        recorder.record(True)
+        recorder.close()
+        assert sink.closed == 1 and [event.text.split()[0] for event in told] == ["recording", "recorded"]
+
+    def test_a_second_recording_in_the_same_second_leaves_the_first_alone(self, tmp_path):
+        recorder, _ = self.recorder(tmp_path)
+        paths = []
+        for result in Press().take(3):
+            paths.append(self.begin(recorder))
+            recorder.write(result, {})
+            self.end(recorder)
+        assert len(set(paths)) == 3 and all(path.exists() for path in paths)
+
+    def test_the_end_of_the_run_ends_it(self, tmp_path):
+        recorder, _ = self.recorder(tmp_path)
+        path = self.begin(recorder)
+        recorder.write(Press().next(), {})
+        recorder.close()
+        assert path is not None and path.exists()
+
+    def test_a_place_where_nothing_can_be_made_is_told_and_ends_no_run(self, tmp_path):
+        recorder, told = self.recorder(tmp_path / "nowhere")
+        self.begin(recorder)
+        recorder.write(Press().next(), {})
+        assert recorder.path is None
+        assert [event.kind for event in told] == ["sink"] and told[0].text.startswith("not recording: ")
+
+    def test_a_failure_while_it_is_on_ends_the_recording_and_no_run(self, tmp_path):
+        sink = Failing(takes=2)
+        recorder, told = self.recorder(tmp_path, lambda text: sink)
+        self.begin(recorder)
+        for result in Press().take(5):
+            recorder.write(result, {})
+        assert recorder.path is None
+        self.end(recorder)
+        assert sink.closed == 1
+        assert [(event.kind, event.text) for event in told[1:]] == [("sink", "the recording has ended: disk full")]
+        assert self.begin(recorder) is not None
+
+    def test_nobody_waits_for_the_end_of_one_and_the_next_begins_behind_it(self, tmp_path):
+        written = threading.Event()
+        sink = Failing(takes=9)
+        sink.close = written.wait
+        recorder, told = self.recorder(tmp_path, lambda text: sink)
+        path = self.begin(recorder)
+        recorder.record(False)
+        recorder.record(True)
+        assert recorder.path is None
+        assert [(event.kind, event.text[:14]) for event in told[1:]] == [("refused", "not recording:")]
+        written.set()
+        self.end(recorder)
+        assert told[-1].text == f"recorded into {path}"
+        assert self.begin(recorder) is not None
+
+    def test_a_failure_while_nothing_comes_ends_the_recording_and_no_run(self, tmp_path):
+        sink = Failing(takes=9)
+        sink.takes, sink.wait = 0, lambda: sink.write(None, {})
+        recorder, told = self.recorder(tmp_path, lambda text: sink)
+        self.begin(recorder)
+        recorder.wait()
+        assert recorder.path is None and told[-1].text == "the recording has ended: disk full"
+
+    def test_a_name_that_the_disk_cannot_have_is_told_and_ends_no_run(self, tmp_path):
+        recorder, told = self.recorder(tmp_path / ("a" * 300))
+        self.begin(recorder)
+        assert told[-1].kind == "sink" and "not recording: cannot record into" in told[-1].text
+
+    def test_one_that_cannot_be_finished_is_told(self, tmp_path):
+        recorder, told = self.recorder(tmp_path, lambda text: Failing(takes=9, closes=False))
+        self.begin(recorder)
+        recorder.close()
+        assert told[-1].kind == "sink" and told[-1].text.endswith("could not be finished: no room for the end")
+
+    def test_events_and_what_is_left_out_go_through(self, tmp_path):
+        class Slow(Failing):
+            unwritten = 3
+
+            def tell(self, event, counters):
+                self.told = event
+
+        sink = Slow(9)
+        recorder, _ = self.recorder(tmp_path, lambda text: sink)
+        assert recorder.unwritten == 0
+        self.begin(recorder)
+        event = Event(1, "lost", None, "gone")
+        recorder.tell(event, {})
+        assert sink.told is event and recorder.unwritten == 3
+        recorder.record(False)
+        assert recorder.unwritten == 3
+
+    def test_to_record_is_not_to_zero(self):
+        class Untouched:
+            def reset(self):
+                raise AssertionError
+
+            zero = reset
+
+        asked = Asked()
+        asked.hear('{"cmd": "record", "on": true}', Viewer())
+        obey(asked, Untouched())
+
+    def test_commands_to_record_are_done_and_the_others_handed_on(self, tmp_path):
+        recorder, _ = self.recorder(tmp_path, lambda text: Failing(9))
+        asked = Asked()
+        commands = RecordCommands(asked, recorder)
+        for message in ({"cmd": "zero"}, {"cmd": "record", "on": True}, {"cmd": "reset"}, {"cmd": "jump"}):
+            asked.hear(json.dumps(message), Viewer())
+        assert recorder.path is None  # not before the loop asks
+        assert list(commands.poll()) == [Command("zero"), Command("reset")]
+        wait_for(lambda: recorder.wait() or recorder.path is not None)
+        assert commands.refused == 1

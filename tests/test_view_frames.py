@@ -1,0 +1,336 @@
+"""What viewers are sent: sampled, bounded, and the newest."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from edge_samples import PERIOD_NS
+from view_samples import CONTRACT, Press
+
+from edge.event import Event
+from edge.packed import unpack
+from edge.record import record
+from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
+from edge.view.heard import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard
+from edge.view.sink import ViewSink
+from edge.view.viewer import Viewer
+
+
+class Clock:
+    def __init__(self):
+        self.now_ns = 10**12
+
+    def __call__(self):
+        return self.now_ns
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def heard(clock):
+    return Heard(clock)
+
+
+def unpacked(frames):
+    return [unpack(frame) for frame in frames]
+
+
+def look(viewer, heard, clock):
+    return unpacked(viewer.due(Frames(heard, clock())))
+
+
+def numbers(header):
+    """Numbers of the scans that a trace is of, from their times."""
+    return [round(seconds * 1e9 / PERIOD_NS) for seconds, *_ in header["trace"]]
+
+
+def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
+    press = Press(counts_per_newton=1000.0)
+    result = press.take(3)[-1]
+    heard.add(result, {"dropped": 3})
+    clock.now_ns += 70_000_000
+    [(header, maps)] = look(Viewer(), heard, clock)
+    said = record(result, {"dropped": 3})
+    assert header["kind"] == "result" and header["age_s"] == 0.07
+    assert {key: header[key] for key in said if key != "counts"} == {k: v for k, v in said.items() if k != "counts"}
+    assert header["counts"] == result.scan.counts.tolist() and header["source"] == "emulated"
+    assert list(maps) == ["zeroed", "pattern", "deviation", "taps"]
+    np.testing.assert_array_equal(maps["pattern"], result.pattern)
+    np.testing.assert_array_equal(maps["deviation"], result.deviation)
+    np.testing.assert_array_equal(maps["zeroed"], result.zeroed)
+    np.testing.assert_array_equal(maps["taps"], result.window[: result.taps_used, 2])
+    assert header["trace"] == [
+        [0.0, round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4)]
+    ]
+
+
+def test_what_is_not_there_is_left_out(heard, clock):
+    heard.add(Press().next(0), {})
+    [(header, maps)] = look(Viewer(), heard, clock)
+    assert list(maps) == ["zeroed"] and header["contact"] is False and header["trace"][0][2:] == [None, None]
+    heard.add(Press("6", baselines={}).next(0), {})
+    header, maps = look(Viewer(), heard, clock)[1]
+    assert header["sensor"] == "6" and maps == {} and header["trace"][0][1:] == [None, None, None]
+
+
+def test_hello_says_what_does_not_change():
+    header, maps = unpack(hello(Run("demo", "emulated", "mtsr4", CONTRACT, "c0ffee"), None))
+    assert maps == {}
+    assert header == {
+        "kind": "hello",
+        "version": 1,
+        "run": "c0ffee",
+        "name": "demo",
+        "source": "emulated",
+        "model": "mtsr4",
+        "taps": 4,
+        "pattern_unit": "mm",
+        "full_scale": 2.0,
+        "pixel_pitch_mm": pytest.approx(0.47),
+        "taxel_pitch_mm": 4.7,
+        "rows": 4,
+        "cols": 4,
+        "height": 40,
+        "width": 40,
+        "recording": None,
+        "max_fps": MAX_FPS,
+        "maps": [],
+    }
+
+
+def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, clock):
+    press, viewer, traced = Press(), Viewer(), []
+    for scans in (1, 4, 0, 7, 200):
+        for result in press.take(scans):
+            heard.add(result, {})
+        got = look(viewer, heard, clock)
+        assert len(got) == (scans > 0)
+        for header, _ in got:
+            assert header["scan"] == press.number - 1
+            traced += numbers(header)
+    assert traced == list(range(212))
+
+
+def test_two_at_different_speeds_get_the_same_newest_and_what_each_has_missed(heard, clock):
+    press, quick, slow = Press(), Viewer(), Viewer()
+    heard.add(press.next(), {})
+    assert len(look(quick, heard, clock)) == len(look(slow, heard, clock)) == 1
+    for _ in range(3):
+        heard.add(press.next(), {})
+        look(quick, heard, clock)
+    heard.add(press.next(), {})
+    [(first, _)], [(second, _)] = look(quick, heard, clock), look(slow, heard, clock)
+    assert first["scan"] == second["scan"] == 4
+    assert (numbers(first), numbers(second)) == ([4], [1, 2, 3, 4])
+
+
+def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
+    press, viewer = Press(), Viewer()
+    heard.add(press.next(), {})
+    frames = Frames(heard, clock())
+    heard.add(press.next(), {})
+    [(first, _)] = unpacked(viewer.due(frames))
+    [(second, _)] = look(viewer, heard, clock)
+    assert (first["scan"], numbers(first)) == (0, [0]) and (second["scan"], numbers(second)) == (1, [1])
+
+
+def test_who_looks_at_the_same_shares_its_bytes(heard, clock):
+    heard.add(Press().next(), {})
+    frames = Frames(heard, clock())
+    assert Viewer().due(frames)[0] is Viewer().due(frames)[0]
+
+
+def test_the_age_is_of_the_moment_and_not_of_who_looked_before(heard, clock):
+    heard.add(Press().next(), {})
+    look(Viewer(), heard, clock)
+    clock.now_ns += 5 * 10**9
+    assert look(Viewer(), heard, clock)[0][0]["age_s"] == 5.0
+
+
+@pytest.mark.parametrize("rate_hz", [8, 100, 1000])
+def test_a_newcomer_gets_the_last_minute_thinned(heard, clock, rate_hz):
+    press, period_ns = Press(), 10**9 // rate_hz
+    idle = press.next(0)
+    count = 70 * rate_hz
+    spike = count - 30 * rate_hz + (rate_hz > 20) * 3  # neither the first of its 50 ms nor the last
+    for number in range(count):  # made over from one: what is drawn is all that matters
+        force = 9000.0 if number == spike else 0.0
+        scan = replace(idle.scan, number=number, time_ns=number * period_ns)
+        heard.add(replace(idle, scan=scan, force_counts=force), {})
+    [(header, _)] = look(Viewer(), heard, clock)
+    seconds = [point[0] for point in header["trace"]]
+    assert len(seconds) <= TRACE_POINTS and seconds == sorted(set(seconds))
+    assert seconds[-1] == round((count - 1) / rate_hz, 3)
+    assert TRACE_S - 0.25 <= seconds[-1] - seconds[0] <= TRACE_S
+    assert max(np.diff(seconds)) <= max(0.1, 1 / rate_hz) + 1e-3
+    assert [point[0] for point in header["trace"] if point[1] == 9000.0] == [round(spike / rate_hz, 3)]
+
+
+def test_who_was_away_long_gets_what_was_missed_thinned_and_nothing_twice(heard, clock):
+    press, viewer = Press(), Viewer()
+    heard.add(press.next(0), {})
+    look(viewer, heard, clock)
+    for result in press.take(2 * RECENT_SCANS, 0):
+        heard.add(result, {})
+    [(header, _)] = look(viewer, heard, clock)
+    got = numbers(header)
+    assert got[-1] == 2 * RECENT_SCANS and 1 <= got[0] <= 5 and len(got) <= 2 * RECENT_SCANS / 5 + 2
+    assert got == sorted(set(got))
+
+
+def test_memory_does_not_grow_with_the_run(heard):
+    idle = Press().next(0)
+    for number in range(20_000):
+        heard.add(replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), event="again"), {})
+    assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
+
+
+def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, clock):
+    viewer = Viewer()
+    for number in range(EVENTS + 5):
+        heard.tell(Event(number, "lost", None, f"gone {number}"), {"outages": number})
+    clock.now_ns += 2 * 10**9
+    got = look(viewer, heard, clock)
+    assert [header["note"] for header, _ in got] == [f"gone {number}" for number in range(5, EVENTS + 5)]
+    assert got[-1][0] | {"maps": []} == {
+        "kind": "event",
+        "state": "event",
+        "event": "lost",
+        "sensor": None,
+        "source": None,
+        "time_ns": EVENTS + 4,
+        "note": f"gone {EVENTS + 4}",
+        "counters": {"outages": EVENTS + 4},
+        "number": EVENTS + 5,
+        "age_s": 2.0,
+        "maps": [],
+    }
+    assert look(viewer, heard, clock) == []
+    heard.tell(Event(1, "back", None, "again"), {})
+    assert [header["note"] for header, _ in look(viewer, heard, clock)] == ["again"]
+
+
+def test_an_event_between_sampled_results_is_not_lost(heard, clock):
+    press, viewer = Press(), Viewer()
+    heard.add(press.next(), {})
+    heard.add(replace(press.next(), event="zeroed again"), {})
+    heard.add(press.next(), {})
+    event, result = look(viewer, heard, clock)
+    assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == ("note", "4", "zeroed again")
+    assert result[0]["scan"] == 2
+
+
+def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_trace(heard, clock):
+    press, viewer = Press(), Viewer()
+    heard.add(press.next(), {})
+    look(viewer, heard, clock)
+    viewer.paused = True
+    for result in press.take(9):
+        heard.add(result, {})
+    heard.tell(Event(1, "lost", None, "gone"), {})
+    assert [header["kind"] for header, _ in look(viewer, heard, clock)] == ["event"]
+    viewer.paused = False
+    [(header, _)] = look(viewer, heard, clock)
+    assert header["scan"] == 9 and numbers(header) == list(range(1, 10))
+
+
+def test_the_rate_is_the_scans_and_not_the_frames(heard, clock):
+    for result in Press().take(50):
+        heard.add(result, {})
+    assert look(Viewer(), heard, clock)[0][0]["rate_hz"] == 100.0
+
+
+def test_state_tells_the_silence_of_a_sensor(heard, clock):
+    heard.add(Press("4").next(), {})
+    clock.now_ns += 700_000_000
+    heard.add(Press("6").next(), {})
+    assert Frames(heard, clock()).silent() == {"4": 0.7}
+    clock.now_ns += 500_000_000
+    assert Frames(heard, clock()).silent() == {"4": 1.2}
+    header, _ = unpack(state(Path("edge.mcap"), 3, {"4": 1.2}))
+    assert header == {"kind": "state", "recording": "edge.mcap", "viewers": 3, "silent": {"4": 1.2}, "maps": []}
+
+
+def test_a_name_of_any_bytes_can_be_shown(heard, clock):
+    path = Path(os.fsdecode(b"\xff.mcap"))
+    header, _ = unpack(hello(Run(f"replay:{path}", "replay", "mtsr4", CONTRACT, "c0ffee"), path))
+    assert (header["name"], header["recording"]) == ("replay:?.mcap", "?.mcap")
+    assert unpack(state(path, 1, {}))[0]["recording"] == "?.mcap"
+    heard.tell(Event(1, "sink", None, f"recording into {path} stopped"), {})
+    assert look(Viewer(), heard, clock)[0][0]["note"] == "recording into ?.mcap stopped"
+
+
+def test_what_is_refused_is_an_event():
+    header, _ = unpack(refused(7, "no command"))
+    assert (header["kind"], header["event"], header["note"], header["time_ns"]) == ("event", "refused", "no command", 7)
+    assert "number" not in header and header["sensor"] is None
+
+
+def test_what_a_runtime_refuses_is_told_as_that_and_of_the_sensor_that_may_be_forced(heard, clock):
+    four, viewer = Press("4"), Viewer()
+
+    def told(press_counts=3000):
+        heard.add(four.next(press_counts), {})
+        return [(header["event"], header["sensor"]) for header, _ in look(viewer, heard, clock)[:-1]]
+
+    four.runtime.zero()
+    assert told() == [("refused", None)]  # no sensor was heard yet
+    four.runtime.zero("4")
+    assert told() == [("refused", "4")]
+    four.runtime.zero("6")
+    assert told() == [("refused", None)]
+    four.runtime.zero("4", force=True)
+    assert told() == []
+    four.runtime.lose_touch()
+    assert told() == [("refused", None)]  # given up
+    four.runtime.reset()
+    assert told() == [("note", None)]  # of all sensors, though this one's result tells it
+
+
+class TestSink:
+    """When those who look are woken."""
+
+    def sink(self, clock, watched=True):
+        woken = []
+        return ViewSink(Heard(clock), lambda: watched, lambda: woken.append(clock()), clock), woken
+
+    def test_nobody_is_woken_where_nobody_looks(self, clock):
+        sink, woken = self.sink(clock, watched=False)
+        for result in Press().take(20):
+            clock.now_ns += PERIOD_NS
+            sink.write(result, {})
+        assert woken == []
+
+    @pytest.mark.parametrize("jitter_ns", [0, 900_000])
+    def test_at_a_hundred_scans_a_second_every_fourth_wakes(self, clock, jitter_ns):
+        sink, woken = self.sink(clock)
+        start_ns = clock.now_ns
+        for number, result in enumerate(Press().take(400)):
+            clock.now_ns = start_ns + number * PERIOD_NS + (jitter_ns if number % 3 else -jitter_ns)
+            sink.write(result, {})
+        assert 95 <= len(woken) <= 4 * MAX_FPS + 1
+
+    def test_never_more_often_than_an_eye_takes_in(self, clock):
+        sink, woken = self.sink(clock)
+        for result in Press().take(1000):
+            clock.now_ns += 1_000_000
+            sink.write(result, {})
+            sink.tell(Event(1, "lost", None, "gone"), {})
+        assert len(woken) <= MAX_FPS + 1
+
+    def test_what_came_last_before_a_silence_is_shown_once(self, clock):
+        sink, woken = self.sink(clock)
+        press = Press()
+        sink.write(press.next(), {})
+        clock.now_ns += PERIOD_NS
+        sink.write(press.next(), {})
+        assert len(woken) == 1
+        for _ in range(5):
+            clock.now_ns += 100_000_000
+            sink.wait()
+        assert len(woken) == 2

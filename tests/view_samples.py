@@ -1,0 +1,125 @@
+"""What the live page's tests share: a run to look at, and viewers over loopback."""
+
+import socket
+import threading
+import time
+from contextlib import contextmanager
+from functools import partial
+
+from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from websockets.sync.client import connect
+
+from edge.packed import unpack
+from edge.runtime import Runtime
+from edge.sinks.forms import open_sink
+from edge.view.live import LiveView
+
+CONTRACT = make_contract(interval_factor=1.6)
+TIMEOUT_S = 60.0
+
+
+class Press:
+    """Results of scans, of an emulated sensor, pressed five times in eight."""
+
+    def __init__(self, sensor="4", contract=CONTRACT, **settings):
+        settings = {"source": "emulated", "baselines": {sensor: BASELINE}, "reuse": False} | settings
+        self.runtime = Runtime(FakeModel(contract), **settings)
+        self.sensor = sensor
+        self.number = 0
+
+    def next(self, press_counts=None, period_ns=PERIOD_NS):
+        number, self.number = self.number, self.number + 1
+        press = (3000 if number % 8 < 5 else 0) if press_counts is None else press_counts
+        scan = make_scan(number, sensor=self.sensor, press_counts=press, time_ns=(number + 1) * period_ns)
+        return self.runtime.push(scan)
+
+    def take(self, count, press_counts=None, period_ns=PERIOD_NS):
+        return [self.next(press_counts, period_ns) for _ in range(count)]
+
+
+class Page:
+    """A live page over loopback, and who looks at it."""
+
+    def __init__(self, view):
+        self.view = view
+        self.port = int(view.url.partition("//")[2].partition("/")[0].rpartition(":")[2])
+        self.asked = view.commands(NoCommands())
+        self.messages = []
+        self.press = Press()
+
+    def viewer(self, query="", *, host="127.0.0.1", origin=None, **settings):
+        headers = {} if origin is None else {"Origin": origin}
+        # One that has not read everything cannot hear that the server closes.
+        settings = {"compression": None, "additional_headers": headers, "close_timeout": 0.2} | settings
+        return connect(f"ws://{host}:{self.port}/ws{query}", **settings)
+
+    def stranger(self, data=b""):
+        """A plain connection, on which this much is sent."""
+        connection = socket.create_connection(("127.0.0.1", self.port), TIMEOUT_S)
+        connection.sendall(data)
+        return connection
+
+    def play(self, count=1, press_counts=None):
+        for result in self.press.take(count, press_counts):
+            for sink in self.view.sinks:
+                sink.write(result, {"dropped": 0})
+
+    def wait(self):
+        """As the loop does while nothing comes."""
+        for sink in self.view.sinks:
+            sink.wait()
+
+    @contextmanager
+    def playing(self, rate_hz=100.0):
+        """Results at a rate, from a thread of its own as the loop's."""
+        stop = threading.Event()
+
+        def loop():
+            while not stop.wait(1 / rate_hz):
+                result = self.press.next()
+                for sink in self.view.sinks:
+                    sink.write(result, {"dropped": 0})
+
+        thread = threading.Thread(target=loop, name="loop")
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+    def polled(self, count=1):
+        """Commands, once so many have come."""
+        commands = []
+        wait_for(lambda: commands.extend(self.asked.poll()) or len(commands) >= count)
+        return commands
+
+
+class NoCommands:
+    refused = 0
+
+    def poll(self):
+        return []
+
+
+@contextmanager
+def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT):
+    with LiveView(host, port, token, tmp_path, contract) as view:
+        page = Page(view)
+        view.begin("pretended", "emulated", "fake", partial(open_sink, contract=contract), page.messages.append)
+        yield page
+
+
+def frame(viewer, kind=None, sensor=None):
+    """The next frame, or the next of a kind: header and maps."""
+    while True:
+        header, maps = unpack(viewer.recv(TIMEOUT_S))
+        if kind in (None, header["kind"]) and sensor in (None, header.get("sensor")):
+            return header, maps
+
+
+def wait_for(condition):
+    end_s = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0.005)
