@@ -1,0 +1,231 @@
+"""Close a gripper, and stop it as soon as the touched area is large enough.
+
+    python stop_on_area.py --area-mm2 60 --source slcan:serial=D30BL366
+    python stop_on_area.py --area-mm2 60 --source demo --pretend        # without a sensor
+
+Replace `PrintedGripper` by your own. It is stopped for everything that may be wrong as well: too much force, a dead
+taxel, readings that are old or do not come, a lost link, an error, Ctrl-C. Of several sensors every one must be well
+and free before it begins, and any one stops it; --name goes by one alone. It never moves by what an emulated sensor or
+a recording feels, unless asked to by --pretend. Exit code 0 only where the area was reached.
+
+What no program can do is to watch itself: let the gripper's own controller stop where nobody tells it to go on.
+"""
+
+import argparse
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from typing import Protocol
+
+from edge.api import BridgeError, EdgeError, Event, Result, Source, Stream, open_runtime, open_source
+
+SETTLING_NS = 500_000_000
+"""Who has not been heard so long after the first is not there."""
+
+
+class Gripper(Protocol):
+    """All that is asked of a gripper."""
+
+    def close(self) -> None:
+        """Begin to close slowly, and return at once."""
+        ...
+
+    def stop(self) -> None:
+        """Stop where it is, at once; may be called at any time, and again."""
+        ...
+
+
+class PrintedGripper:
+    """Says what a gripper would do."""
+
+    def __init__(self) -> None:
+        self._moves = False
+
+    def close(self) -> None:
+        """Say so."""
+        self._moves = True
+        print("gripper: closing", flush=True)
+
+    def stop(self) -> None:
+        """Say so, once."""
+        moved, self._moves = self._moves, False
+        if moved:
+            print("gripper: stopped", flush=True)
+
+
+class Grip:
+    """One closing of a gripper, from when every pad is known to be well and free to whatever ends it.
+
+    Attributes:
+        why: it ended.
+        reached: it ended because the area was large enough.
+    """
+
+    def __init__(
+        self, gripper: Gripper, area_mm2: float, *, most_counts: float, oldest_ms: float, name: str | None = None
+    ) -> None:
+        """Prepare to grip.
+
+        Args:
+            gripper: stands still.
+            area_mm2: touched area at which to stop.
+            most_counts: summed z over the baseline at which to stop in any case.
+            oldest_ms: age of a reading, or time without one, that is no ground to go on.
+            name: of the one sensor to go by; None goes by all.
+        """
+        self.why = "it never began: nothing was heard"
+        self.reached = False
+        self._gripper = gripper
+        self._area_mm2 = area_mm2
+        self._most_counts = most_counts
+        self._oldest_ms = oldest_ms
+        self._name = name
+        self._missing = frozenset[str]() if name is None else frozenset({name})
+        self._first_ns: int | None = None
+        self._heard_ns: dict[str, int] = {}
+        self._free: set[str] = set()
+        self._closing = False
+        self._ended = threading.Event()
+
+    def run(self, source: Source, model: str, duration_s: float) -> None:
+        """Grip; the gripper stands still when this returns, and however else it is left."""
+        runtime = open_runtime(model, source)
+        if self._name is None:
+            self._missing = runtime.expected
+        stream = Stream(
+            source,
+            runtime,
+            on_event=self._hear,
+            on_wait=self._mind_silence,
+            stop=self._ended,
+            duration_s=duration_s,
+        )
+        try:
+            for result in stream:
+                self.follow(result)
+                if self._ended.is_set():
+                    return
+            self._end("no more readings: the time is over, or the source")
+        finally:
+            self._gripper.stop()
+
+    def follow(self, result: Result) -> None:
+        """Go by one reading: begin, go on, or end."""
+        scan = result.scan
+        if self._name not in (None, scan.sensor):
+            return
+        self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
+        self._heard_ns[scan.sensor] = scan.time_ns if scan.device_ns is None else scan.device_ns
+        self._free.discard(scan.sensor)
+        wrong = self._what_is_wrong(result)
+        if wrong is not None:
+            self._end(wrong)
+        elif result.area_mm2 is not None and result.area_mm2 >= self._area_mm2:
+            self.reached = self._closing
+            self._end(f"{result.area_mm2:.0f} mm2 touch, as felt {self._age_ms(scan.sensor):.1f} ms ago")
+        elif result.state == "idle":  # zeroed, every taxel heard, nothing touches
+            self._free.add(scan.sensor)
+            self._begin(scan.time_ns - self._first_ns)
+
+    def _begin(self, after_ns: int) -> None:
+        """Close if every sensor that there is was heard, and its pad is free."""
+        settled = after_ns >= SETTLING_NS and self._heard_ns.keys() >= self._missing
+        if settled and self._free == self._heard_ns.keys() and not self._closing:
+            self._closing = True
+            self._gripper.close()
+
+    def _hear(self, event: Event) -> None:
+        """Lost, silent, in trouble: each is reason enough, but of a sensor that is not gone by."""
+        if self._name is None or event.sensor in (None, self._name):
+            self._end(event.text)
+
+    def _what_is_wrong(self, result: Result) -> str | None:
+        age_ms = self._age_ms(result.scan.sensor)
+        if age_ms > self._oldest_ms:  # this loop, or the adapter, is too slow
+            return f"the reading is {age_ms:.0f} ms old"
+        silent = self._silent()
+        if silent is not None:
+            return silent
+        if result.dead:
+            return f"taxels {sorted(result.dead)} are dead"
+        if result.state in ("zeroing", "incomplete") or result.force_counts is None:
+            return f"the sensor is not ready: {result.note or result.state}"
+        if result.force_counts > self._most_counts:
+            return f"the force is {result.force_counts:.0f} counts"
+        return None
+
+    def _mind_silence(self) -> None:
+        silent = self._silent()
+        if silent is not None:
+            self._end(silent)
+
+    def _silent(self) -> str | None:
+        """Which sensor nothing was heard of for too long; None if that is so of none."""
+        for sensor in self._heard_ns:
+            if self._age_ms(sensor) > self._oldest_ms:
+                return f"no reading of sensor {sensor} for {self._age_ms(sensor):.0f} ms"
+        return None
+
+    def _age_ms(self, sensor: str) -> float:
+        return (time.monotonic_ns() - self._heard_ns[sensor]) / 1e6
+
+    def _end(self, why: str) -> None:
+        if not self._closing:  # there is nothing to end; it waits until all is well
+            self.why = f"it never began: {why}"
+        elif not self._ended.is_set():
+            self._gripper.stop()
+            self.why = why
+            self._ended.set()
+
+
+def end(number: int, frame: object) -> None:
+    """Make an exception of a kill, so that `finally` stops the gripper, which it would leave moving else."""
+    sys.exit(128 + number)
+
+
+def positive(text: str) -> float:
+    """A limit, which a number that is none would take away."""
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise ValueError
+    return number
+
+
+def main() -> None:
+    """Open, grip, say why it stopped."""
+    parser = argparse.ArgumentParser(description="Close a gripper until enough of it touches.")
+    source_help = "as of edge-sr; may be repeated, with names (default: the adapter that is plugged in)"
+    parser.add_argument("--source", action="append", default=[], help=source_help)
+    parser.add_argument("--name", help="of the one sensor to go by, such as 4 or left/4 (default: all)")
+    parser.add_argument("--sensor", help="what edge-sr doctor wrote")
+    parser.add_argument("--model", default="stsr-int8", help="file, or bundled model")
+    parser.add_argument("--area-mm2", type=positive, required=True, help="touched area at which to stop")
+    parser.add_argument("--most-counts", type=positive, default=20_000, help="summed z at which to stop in any case")
+    parser.add_argument("--oldest-ms", type=positive, default=100, help="age of a reading at which to stop in any case")
+    parser.add_argument("--duration-s", type=positive, default=60, help="stop after this time in any case")
+    parser.add_argument("--pretend", action="store_true", help="go also by a sensor that is none")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, end)
+    limits = {"most_counts": options.most_counts, "oldest_ms": options.oldest_ms}
+    grip = Grip(PrintedGripper(), options.area_mm2, **limits, name=options.name)
+    try:
+        with open_source(*options.source, sensor=options.sensor) as source:
+            if source.kind != "device" and not options.pretend:
+                sys.exit(f"stop_on_area: {source.name} is {source.kind}, no sensor: --pretend goes by it all the same")
+            grip.run(source, options.model, options.duration_s)
+        print(f"why: {grip.why}", flush=True)
+    except BrokenPipeError:  # who read has gone; point stdout elsewhere, or Python complains at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except (BridgeError, EdgeError) as error:
+        sys.exit(f"stop_on_area: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
+    sys.exit(0 if grip.reached else 1)
+
+
+if __name__ == "__main__":
+    main()

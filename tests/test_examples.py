@@ -1,0 +1,307 @@
+"""The examples as a user runs them: from an empty directory, without hardware."""
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+import trimesh
+from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_model
+from test_cli import write_recording
+
+from edge.api import Result
+from edge.source import Source
+from firmware_bridge.errors import LinkLostError
+from firmware_bridge.links.base import Notice
+from firmware_bridge.sensor_file import SensorEntry, SensorFile
+from firmware_bridge.sensor_file_text import save_sensor_file
+
+TIMEOUT_S = 120
+PATIENT = ("--oldest-ms", "20000")
+"""For a machine that has other things to do; what 100 ms do is tested with scans of any age."""
+
+
+def start(folder, name, *arguments):
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run(folder, name, *arguments):
+    process = start(folder, name, *arguments)
+    out, errors = process.communicate(timeout=TIMEOUT_S)
+    return process.returncode, out.splitlines(), errors.splitlines()
+
+
+@pytest.fixture
+def empty(tmp_path):
+    (tmp_path / "empty").mkdir()
+    return tmp_path / "empty"
+
+
+@pytest.mark.parametrize("name", ["print_force.py", "stop_on_area.py"])
+def test_what_cannot_be_opened_is_one_line(empty, name):
+    area = ["--area-mm2", "9"] if name == "stop_on_area.py" else []
+    code, out, errors = run(empty, name, *area, "--source", "slcan:/dev/none")
+    assert code == 1 and out == [] and len(errors) == 1 and errors[0].startswith(f"{name[:-3]}: ")
+
+
+def test_the_force_is_printed_scan_by_scan(empty):
+    code, out, errors = run(empty, "print_force.py", "--source", "demo", "--duration-s", "3")
+    assert code == 0 and len(out) > 150 and {line.split()[0] for line in out} == {"EMULATED"}
+    assert "zeroing" in out[0] and "idle" in out[-1] + out[110] and " counts" in out[110]
+    assert len(errors) == 1 and errors[0].startswith("sensor 4: ") and errors[0].endswith(" scans a second")
+    assert list(empty.iterdir()) == []
+
+
+def test_the_gripper_stops_on_contact_and_never_moves_by_what_is_emulated_unasked(empty):
+    demo = ("stop_on_area.py", "--source", "demo", "--area-mm2", "20", *PATIENT)
+    code, out, errors = run(empty, *demo)
+    assert (
+        code == 1
+        and out == []
+        and errors == ["stop_on_area: demo is emulated, no sensor: --pretend goes by it all the same"]
+    )
+    code, out, errors = run(empty, *demo, "--pretend")
+    assert (code, errors) == (0, []) and out[:2] == ["gripper: closing", "gripper: stopped"]
+    assert " mm2 touch, as felt " in out[2] and len(out) == 3
+
+
+def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
+    process = start(empty, "print_force.py", "--source", "demo")
+    assert "zeroing" in process.stdout.readline()
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait(TIMEOUT_S)) == ("", 0)
+    write_recording(tmp_path / "rest.npz", [0] * 100)
+    write_model(tmp_path / "tiny.onnx")
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
+    known = ("--model", tmp_path / "tiny.onnx", "--sensor", tmp_path / "s.toml", *PATIENT, "--pretend")
+    process = start(empty, "stop_on_area.py", "--source", f"replay:{tmp_path}/rest.npz", "--area-mm2", "20", *known)
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait(TIMEOUT_S)) == ("", 1)
+
+
+@pytest.fixture
+def closing(empty, tmp_path):
+    """A gripper that closes on nothing, and the emulator whose cable can be pulled."""
+    write_recording(tmp_path / "rest.npz", [0] * 100)
+    write_model(tmp_path / "tiny.onnx")
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
+    command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", "--loop"]
+    with subprocess.Popen(
+        [*command, str(tmp_path / "rest.npz")], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as emulator:
+        source = f"slcan:{emulator.stdout.readline().strip()}"
+        known = ("--model", tmp_path / "tiny.onnx", "--sensor", tmp_path / "s.toml", *PATIENT)
+        process = start(empty, "stop_on_area.py", "--source", source, "--area-mm2", "20", "--pretend", *known)
+        assert process.stdout.readline() == "gripper: closing\n"
+        yield process, emulator
+        process.kill()
+        process.communicate()
+        emulator.stdin.close()
+
+
+def test_a_pulled_cable_stops_the_gripper(closing):
+    process, emulator = closing
+    emulator.kill()
+    out, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 1 and errors == ""
+    assert out.startswith("gripper: stopped\nwhy: ") and "lost" in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_kill_stops_the_gripper(closing, number):
+    process, _ = closing
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=TIMEOUT_S)
+    assert out == "gripper: stopped\n" and process.returncode == 128 + number
+
+
+@pytest.fixture(scope="module")
+def stop_on_area():
+    spec = importlib.util.spec_from_file_location("stop_on_area", ROOT / "examples" / "stop_on_area.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def at_once(stop_on_area, monkeypatch):
+    """The example, which knows with the first reading which sensors there are."""
+    monkeypatch.setattr(stop_on_area, "SETTLING_NS", 0)
+    return stop_on_area
+
+
+class Gripper:
+    def __init__(self):
+        self.done = []
+
+    def close(self):
+        self.done.append("close")
+
+    def stop(self):
+        self.done.append("stop")
+
+
+def grip_of(module, **settings):
+    gripper = Gripper()
+    return module.Grip(gripper, 20.0, **({"most_counts": 20_000, "oldest_ms": 100} | settings)), gripper
+
+
+def reading(state="idle", sensor="4", **said):
+    scan = replace(make_scan(sensor=sensor), time_ns=time.monotonic_ns() - said.pop("age_ms", 0) * 1_000_000)
+    return Result(scan, "device", "tiny", state, **({"force_counts": 10.0} | said))
+
+
+WRONG = {
+    "the reading is 50": {"age_ms": 5000},
+    "taxels [5] are dead": {"dead": {5: "stuck"}},
+    "not ready: taxel 3 was not heard": {"state": "incomplete", "note": "taxel 3 was not heard", "force_counts": None},
+    "not ready: zeroing": {"state": "zeroing", "force_counts": None},
+    "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_the_gripper_neither_begins_nor_goes_on_by_a_reading_that_is_no_ground(at_once, words):
+    grip, gripper = grip_of(at_once, oldest_ms=2000)
+    grip.follow(reading(**WRONG[words]))
+    assert gripper.done == [] and grip.why.startswith("it never began: ") and words in grip.why
+    grip.follow(reading())
+    grip.follow(reading("contact", area_mm2=19.0))
+    assert gripper.done == ["close"]
+    grip.follow(reading(**WRONG[words]))
+    assert gripper.done == ["close", "stop"] and words in grip.why and not grip.reached
+
+
+def test_a_pad_that_is_touched_already_is_not_closed_further(at_once):
+    grip, gripper = grip_of(at_once)
+    grip.follow(reading("contact", area_mm2=50.0))
+    assert gripper.done == [] and not grip.reached
+
+
+def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
+    grip, gripper = grip_of(stop_on_area, oldest_ms=20_000)
+    grip.follow(reading(sensor="left", age_ms=1000))
+    grip.follow(reading(sensor="left", age_ms=600))
+    assert gripper.done == []  # the other one may not have been heard yet
+    grip.follow(reading("zeroing", "right", force_counts=None))
+    grip.follow(reading(sensor="left"))
+    grip.follow(reading("contact", "right", area_mm2=5.0))
+    grip.follow(reading(sensor="left"))
+    assert gripper.done == []
+    grip.follow(reading(sensor="right"))
+    assert gripper.done == ["close"]
+    grip.follow(reading("contact", "right", area_mm2=20.0))
+    assert gripper.done == ["close", "stop"] and grip.reached
+
+
+def test_a_sensor_that_falls_silent_stops_it_though_the_other_is_heard(at_once):
+    grip, gripper = grip_of(at_once, oldest_ms=2000)
+    for age_ms in (1000, 900):
+        for sensor in ("left", "right"):
+            grip.follow(reading(sensor=sensor, age_ms=age_ms))
+    assert gripper.done == ["close"]
+    grip._oldest_ms = 500
+    grip.follow(reading(sensor="left"))
+    assert gripper.done == ["close", "stop"] and grip.why.startswith("no reading of sensor right for 9")
+
+
+def test_of_several_sensors_one_alone_may_be_gone_by(at_once):
+    grip, gripper = grip_of(at_once, name="left")
+    grip.follow(reading("contact", "right", area_mm2=50.0))
+    grip.follow(reading(sensor="left"))
+    grip.follow(reading("zeroing", "right", force_counts=None))
+    assert gripper.done == ["close"]
+
+
+def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
+    known = {name: SensorEntry(baseline=replace(BASELINE, sensor=name)) for name in ("4", "6")}
+    grip, gripper = grip_of(at_once, oldest_ms=20_000)
+    with Source(Live([[make_scan(n)] for n in range(10)]), sensor_file=SensorFile(sensors=known)) as source:
+        grip.run(source, FakeModel(), 60)
+    assert set(gripper.done) == {"stop"} and grip.why.startswith("it never began: ")
+
+
+def test_while_nothing_was_heard_it_says_so(at_once):
+    grip, gripper = grip_of(at_once)
+    grip._mind_silence()
+    assert gripper.done == [] and grip.why == "it never began: nothing was heard"
+
+
+@pytest.mark.parametrize("limit", ["--area-mm2", "--most-counts", "--oldest-ms", "--duration-s"])
+@pytest.mark.parametrize("value", ["nan", "-1", "0", "much"])
+def test_a_limit_is_a_positive_number(stop_on_area, monkeypatch, capsys, limit, value):
+    monkeypatch.setattr(sys, "argv", ["stop_on_area.py", "--area-mm2", "20", f"{limit}={value}"])
+    with pytest.raises(SystemExit, match="2"):
+        stop_on_area.main()
+    assert f"argument {limit}: invalid positive value: '{value}'" in capsys.readouterr().err
+
+
+class Live(FakeLink):
+    """Gives scans of this moment, and tells something after ten."""
+
+    told: tuple[str, ...] = ()
+
+    def notices(self):
+        return [Notice(0, kind, "fake", f"fake is {kind}") for kind in self.told] if self.reads == 11 else []
+
+    def read(self, timeout_s):
+        time.sleep(0.005)
+        return [replace(scan, time_ns=time.monotonic_ns()) for scan in super().read(timeout_s)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"endless": True}, "no reading of sensor 4 for "),
+        ({"error": LinkLostError("gone")}, None),
+        ({}, "no more readings"),
+        ({"told": ("lost",)}, "fake is lost"),
+        ({"told": ("trouble",)}, "fake is trouble"),
+    ],
+)
+def test_the_gripper_stands_still_however_it_ends(at_once, settings, words):
+    told = settings.pop("told", ())
+    link = Live([[make_scan(n)] for n in range(30 if told else 10)], **settings)
+    link.told = told
+    grip, gripper = grip_of(at_once, oldest_ms=500)
+    with Source(link, sensor_file=SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)})) as source:
+        if words is None:
+            with pytest.raises(LinkLostError):
+                grip.run(source, FakeModel(), 60)
+        else:
+            grip.run(source, FakeModel(), 60)
+            assert words in grip.why
+    assert gripper.done[0] == "close" and gripper.done[1:] and set(gripper.done[1:]) == {"stop"}
+
+
+def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
+    trimesh.creation.icosphere(radius=6, subdivisions=3).export(tmp_path / "ball.stl")
+    tiny = ("--sequences", 4, "--figures", 2, "--steps", 2)
+    code, out, errors = run(
+        empty,
+        "train_and_deploy.py",
+        tmp_path / "ball.stl",
+        "--out",
+        "ball",
+        *tiny,
+        "--source",
+        "demo",
+        "--duration-s",
+        3,
+    )
+    assert code == 0, errors
+    assert (empty / "ball" / "ball.onnx").is_file() and {path.name for path in empty.iterdir()} == {"ball"}
+    assert any(line.startswith("emulated sensor 4: pattern (40, 40) in mm, ") for line in out)
+    assert out[-1].endswith(" patterns; from now on: edge-sr --model ball/ball.onnx")
