@@ -14,6 +14,9 @@ from typing import Final
 from firmware_bridge.errors import DeviceError
 
 LINE_SPEED_BAUD: Final = 3_000_000
+COUNTED_LATE_NS: Final = 10_000_000
+"""What was sent is counted as unread up to so much later, where the kernel has other work."""
+_COUNTS: Final = 4
 _SPEEDS_BAUD: Final = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
@@ -113,6 +116,14 @@ class PseudoPort:
         # there is less than the client wants at once (VMIN); asking for the number alone says none too early.
         select.select([self._client_fd], [], [], 0)
         return struct.unpack("i", fcntl.ioctl(self._client_fd, termios.FIONREAD, bytes(4)))[0]
+
+    def left_bytes(self) -> int:
+        """What a client has left that fetches no more."""
+        counted = 0
+        for _ in range(_COUNTS):
+            counted = max(counted, self.unread_bytes())
+            time.sleep(COUNTED_LATE_NS / _COUNTS / 1e9)
+        return counted
 
     def _through_line(self, data: bytes) -> bytes:
         """What arrives at the other end: bytes of another speed are read as fewer or more, and as noise."""

@@ -15,7 +15,7 @@ from typing import Final, Self
 from firmware_bridge.controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.faults.injector import Injector
 from firmware_bridge.faults.lines import Piece
-from firmware_bridge.pseudo_port import PseudoPort
+from firmware_bridge.pseudo_port import COUNTED_LATE_NS, PseudoPort
 from firmware_bridge.recording import Recording
 from firmware_bridge.slcan import CanFrame
 from firmware_bridge.xela import USPA44_MAP
@@ -176,7 +176,7 @@ class Emulator:
                     truth.lose(sent._replace(fate="unheard"), now_ns)
                 else:
                     pieces += faults.corrupt(self.adapter.encode(sent.frame, sent.time_s), sent)
-        truth.settle(self._line.unread_bytes())
+        truth.settle(self._line.unread_bytes(), now_ns - COUNTED_LATE_NS)
         self._send(pieces, now_ns)
         if faults.resets > self._resets:
             self._resets = faults.resets
@@ -216,7 +216,8 @@ class Emulator:
         if self._faults is None:
             self._line.write(self.adapter.feed(heard))
             return
-        was_open, unread_bytes = self.adapter.channel_open, self._line.unread_bytes()
+        was_open = self.adapter.channel_open
+        unread_bytes = self._line.left_bytes() if b"C" in heard else self._line.unread_bytes()
         answer = self.adapter.feed(heard)
         if self.adapter.channel_open != was_open:  # who closes or opens drops what is old, answers as well
             self._faults.truth.close_channel(unread_bytes)

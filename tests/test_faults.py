@@ -16,6 +16,7 @@ from firmware_bridge.faults.injector import BURST_S, Injector
 from firmware_bridge.faults.lines import LINE_FAULTS, Piece
 from firmware_bridge.faults.stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
 from firmware_bridge.faults.truth import FATES, ROW, Truth
+from firmware_bridge.pseudo_port import PseudoPort
 from firmware_bridge.recording import Track
 from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
@@ -211,6 +212,22 @@ def test_what_lies_unread_when_a_reader_leaves_was_never_read(unread):
     counted = reader.counters()
     assert truth.counters() == {name: counted[name] for name in truth.counters()}
     assert truth.fates["unread"] == 2 - counted["frames"] == -(-unread // 22)
+
+
+def test_what_the_kernel_may_not_have_counted_yet_is_not_taken_for_read():
+    truth, frame = Truth(), CanFrame(0x004, bytes(8))
+    for time_ns in (0, 5, 10):
+        truth.hand_on(Piece(encode_frame(frame), BusFrame(0.0, frame, 0)), 22, time_ns)
+    truth.settle(22, counted_ns=5)  # one is counted; the last may be that one, or lie there beside it
+    assert truth.frames == 1
+    truth.close_channel(44)
+    assert truth.fates == Counter(intact=1, unread=2)
+
+
+def test_what_a_client_left_is_counted_whenever_the_kernel_counts_it(monkeypatch):
+    port, counts = PseudoPort(), iter([3, 20, 44, 44])
+    monkeypatch.setattr(port, "unread_bytes", lambda: next(counts))
+    assert port.left_bytes() == 44
 
 
 def test_answers_are_no_bad_lines_unless_they_end_one():

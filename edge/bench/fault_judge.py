@@ -74,12 +74,14 @@ class _Taxel:
 
     def __init__(self) -> None:
         self.rows: list[tuple[int, int, int]] = []  # fate, time on the bus in [us], time of handing on in [ns]
+        self._readings: list[tuple[int, int, int]] = []
         self.next = 0
         self.shown = -1
         self._places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
 
     def add(self, reading: tuple[int, int, int], fate: int, bus_us: int, handed_ns: int) -> None:
         self._places[reading].append(len(self.rows))
+        self._readings.append(reading)
         self.rows.append((fate, bus_us, handed_ns))
 
     def show(self, reading: tuple[int, int, int]) -> bool:
@@ -90,6 +92,19 @@ class _Taxel:
             return False
         self.shown, self.next = places[at], places[at] + 1
         return True
+
+    def catch_up(self, bus_us: int) -> None:
+        """A stuck taxel's readings are all alike, and one that an outage swallowed is not told from the next.
+
+        Args:
+            bus_us: go on, as far as it sent the same again, to the first that was not on the bus before, in [us].
+        """
+        while self.rows[self.shown][1] < bus_us and self.next < len(self.rows) and self._sent_again:
+            self.shown, self.next = self.next, self.next + 1
+
+    @property
+    def _sent_again(self) -> bool:
+        return self.rows[self.next][0] == _STUCK and self._readings[self.next] == self._readings[self.shown]
 
 
 def judge(seen: Sequence[Seen], told: Told) -> Found:
@@ -125,8 +140,7 @@ def _follow(one: Seen, taxels: Mapping[tuple[str, int], _Taxel], found: Found) -
     trouble: list[str] = []
     fates: Counter[int] = Counter()
     unheard = 0
-    bus_us: list[int] = []
-    handed: list[int] = []
+    shown: dict[int, _Taxel] = {}
     for taxel in range(16):
         if not fresh >> taxel & 1:
             found.missing += 1
@@ -138,11 +152,15 @@ def _follow(one: Seen, taxels: Mapping[tuple[str, int], _Taxel], found: Found) -
             trouble.append(f"taxel {taxel} reads {x}, {y}, {z}, which it never sent")
             continue
         found.shown += 1
-        fate, at_us, at_ns = rows.rows[rows.shown]
-        bus_us.append(at_us)
-        handed.append(at_ns)
+        shown[taxel] = rows
+    newest_us = max((rows.rows[rows.shown][1] for rows in shown.values()), default=0)
+    for taxel, rows in shown.items():
+        rows.catch_up(newest_us - STALE_US)
+        fate = rows.rows[rows.shown][0]
         fates[fate] += 1
         unheard += fate == _STUCK and bool(renewed >> taxel & 1) and str(taxel) not in one.head["dead"]
+    bus_us = [rows.rows[rows.shown][1] for rows in shown.values()]
+    handed = [rows.rows[rows.shown][2] for rows in shown.values()]
     if bus_us:
         found.first_us.setdefault(sensor, min(bus_us))
         found.last_us[sensor] = max(bus_us)

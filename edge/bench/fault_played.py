@@ -1,7 +1,5 @@
 """What two fingers send in a run among faults: readings that each tell when they were taken."""
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,8 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bench.errors import BenchError
-from edge.bench.program import CONTROLLERS, PRESS_COUNTS, REST_COUNTS, environment
+from edge.bench.program import CONTROLLERS, PRESS_COUNTS, REST_COUNTS, emulating
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 
 TELLING: Final = 70
@@ -54,15 +51,5 @@ def playing_emulator(folder: Path, faults: str, seed: int) -> Iterator[str]:
     link, truth = folder / "usb-adapter", folder / "truth"
     options = ["--loop", "--rate-hz", "100", "--link", str(link), "--truth", str(truth), "--seed", str(seed)]
     options += ["--faults", faults] if faults else []
-    command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", *options, *files]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
-    ) as emulator:
-        try:
-            port = emulator.stdout.readline().decode().strip() if emulator.stdout else ""
-            if not port:
-                raise BenchError("the emulator did not start")
-            yield port
-        finally:
-            if emulator.stdin:
-                emulator.stdin.close()
+    with emulating(*options, *files) as port:
+        yield port

@@ -18,6 +18,7 @@ from edge.bench.fault_played import playing_emulator
 from edge.bench.fault_records import Ran, Seen, Size, in_thread, keep_lines, read_records
 from edge.bench.fault_sinks import failing_sinks, fill_up, look_into_files, read_and_go, read_slowly
 from edge.bench.program import CONTROLLERS, REST_COUNTS, environment
+from edge.progress import SECONDS, Progress
 from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.faults.stretches import parse_stretches
 from firmware_bridge.truth_files import EVENTS, read_truth
@@ -59,7 +60,9 @@ def run_among_faults(faults: str, seed: int, folder: Path, *, options: Sequence[
         talker = in_thread(keep_lines, process.stderr, errors)
         slow = in_thread(read_slowly, folder / "slow.fifo", ran)
         gone = in_thread(read_and_go, folder / "gone.fifo")
-        _watch(process, f'"stretch": "{parse_stretches(faults, seed)[-1]}"', folder / "truth" / EVENTS, ran)
+        last = parse_stretches(faults, seed)[-1]
+        with Progress("faults", last.start_s, SECONDS) as bar:
+            _watch(process, f'"stretch": "{last}"', folder / "truth" / EVENTS, ran, bar)
         process.send_signal(signal.SIGINT)
         try:
             ran.exit_code = process.wait(END_TIMEOUT_S)
@@ -111,7 +114,7 @@ def _program(folder: Path, port: str, options: Sequence[str]) -> Iterator[subpro
             process.kill()
 
 
-def _watch(process: subprocess.Popen[bytes], last_fault: str, events: Path, ran: Ran) -> None:
+def _watch(process: subprocess.Popen[bytes], last_fault: str, events: Path, ran: Ran, bar: Progress) -> None:
     """Let it run until the last fault has begun and no record comes any more, or until it ends."""
     start_s = time.monotonic()
     while process.poll() is None and not ran.seen:
@@ -126,6 +129,7 @@ def _watch(process: subprocess.Popen[bytes], last_fault: str, events: Path, ran:
         if over or time.monotonic() < looked_s + WATCH_S:
             continue
         looked_s = time.monotonic()
+        bar.reach(looked_s - start_s)
         over = last_fault in events.read_text()
         try:
             resident_mb = int((proc / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

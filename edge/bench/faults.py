@@ -10,7 +10,6 @@ import math
 import sys
 import tempfile
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -58,11 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if ran.told is None or found is None:
                 raise BenchError("nothing is known of what was injected")
             kept = show(ran, found, ran.told, page.say)
-            if find_spec("websockets") is None:
-                page.say("\n## Server\n\nLeft out: websockets, of the extra `xela-server`, is not installed.")
-            else:
-                served = run_against_server(max(SERVER_S, 6 * options.minutes), options.seed, Path(folder))
-                kept &= show_server(served, judge_server(served), page.say)
+            served = run_against_server(max(SERVER_S, 6 * options.minutes), options.seed, Path(folder))
+            kept &= show_server(served, judge_server(served), page.say)
     except BenchError as error:
         sys.stderr.write(f"faults: {error}\n")
         return 1

@@ -4,9 +4,11 @@ It reads no line: it knows by its own bookkeeping where in the stream whole fram
 it is. So it cannot share a mistake with the decoder.
 """
 
+import math
 import struct
 from collections import Counter, deque
 from collections.abc import Callable
+from itertools import takewhile
 from typing import Final
 
 import numpy as np
@@ -85,8 +87,15 @@ class Truth:
         self._on_the_way.append((piece, written_bytes, time_ns))
         self._on_the_way_bytes += written_bytes
 
-    def settle(self, unread_bytes: int) -> None:
-        """The reader has fetched all but so many bytes."""
+    def settle(self, unread_bytes: int, counted_ns: float = math.inf) -> None:
+        """The reader has fetched all but so many bytes, and but for what of the newest was not counted yet.
+
+        Args:
+            unread_bytes: as they were counted.
+            counted_ns: monotonic, in [ns]; of what was handed on later, the kernel may not have counted all.
+        """
+        young = takewhile(lambda one: one[2] > counted_ns, reversed(self._on_the_way))
+        unread_bytes += sum(written_bytes for _, written_bytes, _ in young)
         while self._on_the_way and self._on_the_way_bytes - self._on_the_way[0][1] >= unread_bytes:
             piece, written_bytes, time_ns = self._on_the_way.popleft()
             self._on_the_way_bytes -= written_bytes
