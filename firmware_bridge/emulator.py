@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of jitter and unused bytes (default: 0)")
     parser.add_argument("--stamps", metavar="FILE", help="of each scan controller and time of its last frame, ns")
     parser.add_argument("--link", type=Path, metavar="PATH", help="keep a link to the terminal, whatever its name")
-    parser.add_argument("--faults", default="", metavar="F", help="such as lost@2+3 or mixed@5+600; see README")
+    parser.add_argument("--faults", default="", metavar="F", help="such as lost@2+3 or mixed@5+600; see docs/run.md")
     parser.add_argument("--truth", type=Path, metavar="DIR", help="what became of each frame")
     parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started it")
     options = parser.parse_args(arguments)

@@ -3,7 +3,7 @@
     python -m firmware_bridge.server_emulator FILE [FILE]
     python -m firmware_bridge.server_emulator --sim
 
-The first line it prints is the URL, of this machine alone. It needs the extra `xela-server`, as the link does.
+The first line it prints is the URL, of this machine alone.
 """
 
 import argparse

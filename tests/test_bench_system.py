@@ -98,7 +98,7 @@ def test_the_page_the_json_and_the_table_tell_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(system_section, "rows", lambda scans, tell: iter(ROWS.values()))
     monkeypatch.setattr(system_section, "start_up", lambda: STARTED)
     soaked = Soak(1.0, 0.01, 0.02, 1.1, (Window(5.0, 70.0, 900.0, 2, 9, 0),))
-    monkeypatch.setattr(system_section, "soak", lambda minutes, tell: soaked if minutes == 0.5 else None)
+    monkeypatch.setattr(system_section, "soak", lambda minutes: soaked if minutes == 0.5 else None)
     assert main(["bench", "--system", "--soak", "0.5", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert out.count("| yes |") == 8 and "+0.010 MB a minute" in out and "0.90, 0.30, 0.40 s" in out

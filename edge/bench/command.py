@@ -143,7 +143,7 @@ def _facts(subject: Subject) -> Facts:
 def _errors(everyone: Sequence[Subject], frozen: FrozenSet, record: Record, page: Page, *, by_surface: bool) -> None:
     record.force_floor_percent = round(force_floor_percent(frozen), 4)
     page.section("Error", tables.error_text(record.force_floor_percent), tables.head(tables.ERROR_COLUMNS))
-    for subject in everyone:
+    for subject in page.tracked(everyone, "error"):
         page.progress(f"error of {subject.name}")
         try:
             for row in error_rows(subject, frozen):
@@ -168,8 +168,8 @@ def _run_times(everyone: Sequence[Subject], frozen: FrozenSet, settings: Setting
         for threads in settings.threads
         for subject in everyone
     ]
-    for number, (subject, threads, load) in enumerate(rows):
-        page.progress(tables.progress_text(number, len(rows), subject.name, threads, load))
+    for subject, threads, load in page.tracked(rows, "run times"):
+        page.progress(tables.progress_text(subject.name, threads, load))
         fact = record.fact(subject.name)
         with busy_core() if load else contextlib.nullcontext():
             row = _run_time(subject, fact, threads, load, window, settings, record.peak_gmac_s[threads])
@@ -220,7 +220,7 @@ def _front(record: Record, page: Page) -> None:
 def _against(everyone: Sequence[Subject], peer: Subject, record: Record, page: Page) -> None:
     text = tables.against_text(peer.name, record.fact(peer.name).weights)
     page.section("Against a peer", text, tables.head(tables.AGAINST_COLUMNS))
-    for subject in everyone:
+    for subject in page.tracked(everyone, "against"):
         page.progress(f"{subject.name} against {peer.name}")
         told = measured(against.job(asdict(subject), asdict(peer)))
         ratio = intervals.ratio_of(told["subject_us"], told["peer_us"], paired=True)

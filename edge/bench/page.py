@@ -1,6 +1,12 @@
 """Where a bench is shown while it goes on: the page on stdout, kept for the file, and one line of progress."""
 
-from typing import TextIO
+from collections.abc import Iterable, Iterator, Sized
+from typing import Final, TextIO, TypeVar
+
+from edge.progress import Progress
+
+_CLEAR_LINE: Final = "\r\x1b[K"
+_Thing = TypeVar("_Thing")
 
 
 class Page:
@@ -15,13 +21,12 @@ class Page:
         self._out = out
         self._err = err
         self._watched = err.isatty()
+        self._bar: Progress | None = None
 
     def say(self, text: str) -> None:
         """Show a line, or several, and keep it."""
-        self.progress("")
         self.lines.append(text)
-        self._out.write(text + "\n")
-        self._out.flush()
+        self._write(self._out, text)
 
     def section(self, title: str, text: str, table_head: str) -> None:
         """Begin a section and its table."""
@@ -29,12 +34,37 @@ class Page:
 
     def warn(self, text: str) -> None:
         """Show a line on stderr."""
-        self.progress("")
-        self._err.write(f"edge-sr: {text}\n")
-        self._err.flush()
+        self._write(self._err, f"edge-sr: {text}")
 
     def progress(self, text: str) -> None:
-        """Show what is being done, over what was shown before."""
-        if self._watched:
-            self._err.write(f"\r\x1b[K{text}")
+        """Show what is being done: behind the bar where there is one, else over what was shown before."""
+        if self._bar is not None:
+            self._bar.note(text, at_once=True)
+        elif self._watched:
+            self._err.write(f"{_CLEAR_LINE}{text}")
             self._err.flush()
+
+    def tracked(
+        self, things: Iterable[_Thing], what: str, unit: str = "row", total: int | None = None
+    ) -> Iterator[_Thing]:
+        """The things, one after the other, followed by a bar that makes room for what is said meanwhile."""
+        self.progress("")
+        count = len(things) if total is None and isinstance(things, Sized) else total
+        with Progress(what, count or 0, unit, stream=self._err) as bar:
+            self._bar = bar
+            try:
+                for thing in things:
+                    yield thing
+                    bar.advance()
+            finally:
+                self._bar = None
+
+    def _write(self, stream: TextIO, text: str) -> None:
+        if self._bar is None:
+            self.progress("")
+            stream.write(text + "\n")
+            stream.flush()
+            return
+        with self._bar.aside():
+            stream.write(text + "\n")
+            stream.flush()

@@ -7,6 +7,7 @@ from typing import Final
 from edge.bench.errors import BenchError
 from edge.bench.front import front
 from edge.bench.record import FrontRow
+from firmware_bridge.extras import how_to_install
 
 _LABELS: Final = 34
 """As many labels, one above the other, as fill the picture's height."""
@@ -23,7 +24,7 @@ def draw(rows: Sequence[FrontRow], path: Path, title: str) -> None:
         from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
     except ImportError as error:
         raise BenchError(
-            f"{path.name} is not written, as matplotlib is not installed: pip install 'tactile-edge-sr[bench]'"
+            f"{path.name} is not written, as matplotlib is not installed: {how_to_install('bench')}"
         ) from error
     figure = Figure(figsize=(12, 6), layout="constrained")
     figure.suptitle(title, fontsize=9)

@@ -156,7 +156,18 @@ def _emulator(folder: Path, play: Play) -> Iterator[tuple[str, Path]]:
     rest = _rest_counts().astype(np.float32)
     save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in CONTROLLERS])
     options = ["--loop", "--rate-hz", str(play.rate_hz), "--frame-us", str(play.frame_us), "--stamps", str(stamps)]
-    command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", *options, *map(str, files)]
+    with emulating(*options, *map(str, files)) as port:
+        yield port, stamps
+
+
+@contextmanager
+def emulating(*arguments: str) -> Iterator[str]:
+    """The port of an emulator in a process of its own, given these arguments.
+
+    Raises:
+        BenchError: it did not start.
+    """
+    command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", *arguments]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
     ) as emulator:
@@ -164,7 +175,7 @@ def _emulator(folder: Path, play: Play) -> Iterator[tuple[str, Path]]:
             port = emulator.stdout.readline().decode().strip() if emulator.stdout else ""
             if not port:
                 raise BenchError("the emulator did not start")
-            yield port, stamps
+            yield port
         finally:
             if emulator.stdin:
                 emulator.stdin.close()

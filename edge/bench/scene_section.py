@@ -27,7 +27,7 @@ def show_savings(everyone: Sequence[Subject], frozen: FrozenSet, record: Record,
     if not shown:
         return
     page.section("What a scene spares", _TEXT, head(COLUMNS))
-    for path in shown:
+    for path in page.tracked(shown, "scenes", "model"):
         page.progress(f"what a scene spares {path.stem}")
         for saving in savings(ModelSession(path), frozen):
             record.savings.append(saving)

@@ -11,7 +11,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -20,6 +20,7 @@ import numpy as np
 
 from edge.bench.errors import BenchError
 from edge.bench.program import Play, Program, edge_sr
+from edge.progress import tracked
 
 WARM_UP_S: Final = 6.0
 """Both phases, so that everything has been used once."""
@@ -69,18 +70,16 @@ class Soak:
     windows: tuple[Window, ...]
 
 
-def soak(minutes: float, tell: Callable[[str], None] = lambda text: None) -> Soak:
-    """Run the program for so long; at least three windows.
+def soak(minutes: float) -> Soak:
+    """Run the program for so long; at least three windows, followed by a bar.
 
     Raises:
         BenchError: it ended before.
     """
     with tempfile.TemporaryDirectory() as folder, edge_sr(Path(folder), _PLAY) as program:
         program.lines(WARM_UP_S)
-        windows: list[Window] = []
-        for window in _windows(program, max(3, round(60 * minutes / WINDOW_S))):
-            windows.append(window)
-            tell(f"soak: {window.end_s / 60:.1f} of {minutes:g} minutes")
+        count = max(3, round(60 * minutes / WINDOW_S))
+        windows = list(tracked(_windows(program, count), "soak", "window", count))
     return judged(windows)
 
 

@@ -80,6 +80,10 @@ class StartUp:
     resident_mb: float
 
 
+ROWS: Final = 9
+"""That `rows` gives."""
+
+
 def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
     """Every row, of so many scans at 100 Hz and as much time at 1000; `tell` hears what is being measured.
 

@@ -5,7 +5,7 @@ from typing import Final
 from edge.bench.page import Page
 from edge.bench.record import Record, SystemRecord
 from edge.bench.soak import Soak, soak
-from edge.bench.system import SystemRow, rows, start_up
+from edge.bench.system import ROWS, SystemRow, rows, start_up
 from edge.bench.tables import head, line
 from edge.bench.timing import Times
 from edge.bench.verdicts import Verdict, verdicts
@@ -34,7 +34,7 @@ def show_system(scans: int, soak_minutes: float | None, record: Record, page: Pa
     """
     told = record.system = SystemRecord()
     page.section("The whole program", _TEXT, head(COLUMNS))
-    for row in rows(scans, page.progress):
+    for row in page.tracked(rows(scans, page.progress), "the program", total=ROWS):
         told.rows.append(row)
         page.say(row_line(row))
     page.progress("start-up")
@@ -46,7 +46,7 @@ def show_system(scans: int, soak_minutes: float | None, record: Record, page: Pa
     for verdict in told.verdicts:
         page.say(verdict_line(verdict))
     if soak_minutes is not None:
-        told.soak = soak(soak_minutes, page.progress)
+        told.soak = soak(soak_minutes)
         page.say(f"\n## Soak\n\n{soak_text(told.soak)}")
 
 

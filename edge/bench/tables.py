@@ -178,9 +178,9 @@ def compare_line(row: Compared) -> str:
     return line((row.name, str(row.threads), "busy" if row.load else "idle", *ratios))
 
 
-def progress_text(done: int, of: int, name: str, threads: int, load: bool) -> str:
+def progress_text(name: str, threads: int, load: bool) -> str:
     """What is being measured."""
-    return f"run time {done + 1} of {of}: {told(name, threads, load)}"
+    return f"run time of {told(name, threads, load)}"
 
 
 def _percentiles(times: Times) -> tuple[str, str, str, str]:
