@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-NOT_IN_THE_RUNTIME = {"torch", "onnx", "onnxscript", "trimesh", "scipy", "shapely", "tqdm"}
+OURS = ("edge", "export", "firmware_bridge", "train")
+NOT_IN_THE_RUNTIME = {"torch", "onnx", "onnxscript", "trimesh", "scipy", "shapely"}
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,11 @@ def test_the_demo_runs_from_the_wheel(fresh, tmp_path):
     assert {line["source"] for line in lines} == {"emulated"}
     assert max(line["taps_used"] or 0 for line in lines) == 4
     assert any(line["pattern"] for line in lines)
+
+
+def test_a_users_type_checker_may_look_into_every_package(fresh):
+    (packages,) = fresh.parent.glob("lib/python*/site-packages")
+    assert sorted(path.parent.name for path in packages.glob("*/py.typed") if path.parent.name in OURS) == sorted(OURS)
 
 
 def test_the_models_are_in_the_wheel(fresh):

@@ -1,28 +1,306 @@
-"""Commands that README.md and the Makefile give are commands that there are."""
+"""Commands, options and Python that README.md, docs/ and the Makefile give are what there is: they are run here.
 
+What nobody sorted into PARSED or LEFT_OUT is run as it stands, against emulated sensors, and must succeed.
+"""
+
+import argparse
 import importlib
+import json
+import os
 import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import threading
+import tomllib
+from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
-from edge_samples import ROOT
+import written_samples
+from bridge_samples import write_recording
+from doctor_samples import healthy_counts
+from edge_samples import BASELINE, ROOT, ListSink
 
-WRITTEN = {
-    (source, module)
-    for source in ("README.md", "Makefile")
-    for module in re.findall(
-        r"python\s+-m\s+((?:edge|export|firmware_bridge|train)\.[\w.]*\w)", (ROOT / source).read_text()
-    )
+from edge import cli, run
+from edge.bundle import demo_recording, find_model
+from firmware_bridge.baseline import save_baselines
+from firmware_bridge.links import devices, source
+from firmware_bridge.links.ports import Port
+from firmware_bridge.recording import Recording, Track
+from firmware_bridge.sensor_file import SensorEntry, SensorFile
+from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.vendor_server import VendorServer
+from firmware_bridge.xela_server_emulator import ServerEmulator
+
+COMMANDS = written_samples.commands()
+RATE_HZ = 500
+ENOUGH = 60
+"""Results of a sensor that would go on for ever."""
+
+PARSED = {
+    r"edge-sr bench .*": "measures for minutes; test_bench runs it",
+    r"edge-sr .*--budget-us .*": "measures run times for seconds; test_run_times runs it",
+    r"edge-sr .*--realtime.*": "takes a processor from the other tests; test_realtime runs it",
+    r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
+    r"torchrun .*": "trains",
+    r"python -m edge\.bench\..*": "takes minutes; test_fault_bench and test_soak run them",
+    r"python -m firmware_bridge\.emulator .*--loop.*": "plays until it is ended; test_emulator runs it",
+    r"python tests/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
+    r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
+    r"edge-sr (record |replay |--source replay:)FILE( --view)?": "a name is to be filled in; press.mcap is run",
+}
+LEFT_OUT = {
+    r"git clone .*": "needs the network",
+    r"\. \.venv/bin/activate": "is of the shell; the environment is made by make",
+    r"(echo .*\| )?sudo .*": "needs root, and the machine that the adapter is plugged into",
+    r"(cmake|export) .*|pip install [\w-]+": "makes, or fetches, what is of others",
+    r"ros2 .*": "needs ROS",
+    r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm runs it",
+    r"python examples/zenoh_listen\.py .*": "goes on until it is ended; test_zenoh runs it",
+    r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
+    r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
+    r"tensorboard .*": "serves until it is ended, and is not ours",
+    r"python docs/live_pictures\.py": "takes pictures of a browser for half a minute; test_view_page takes one of them",
+    r"mkdocs build .*": "test_site builds the site",
 }
 
 
-def test_they_were_found():
-    assert {("README.md", "train.fit"), ("Makefile", "export.to_onnx")} <= WRITTEN
+def is_of(table: dict[str, str], command: str) -> bool:
+    return not command.endswith(" --help") and any(re.fullmatch(pattern, command) for pattern in table)
 
 
-@pytest.mark.parametrize(("source", "module"), sorted(WRITTEN))
-def test_a_module_has_its_command_line_and_help(source, module, capsys):
-    package = hasattr(importlib.import_module(module), "__path__")
-    with pytest.raises(SystemExit) as left:
-        importlib.import_module(f"{module}.__main__" if package else module).main(["--help"])
-    assert left.value.code == 0
-    assert f"python -m {module}" in capsys.readouterr().out
+RUN = [one for one in COMMANDS if not is_of(PARSED, one) and not is_of(LEFT_OUT, one)]
+TYPED = [one for one in RUN if one.startswith("edge-sr ")]
+
+
+class Parsed(Exception):  # noqa: N818, no error
+    """Arguments were taken by the program's own parser."""
+
+
+@pytest.fixture
+def only_parsed(monkeypatch):
+    """Programs that end where they have understood their arguments."""
+    parse = argparse.ArgumentParser.parse_args
+
+    def parse_args(self, args=None, namespace=None):
+        parse(self, args, namespace)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_args)
+
+
+def entry(words: list[str]):
+    """Main function and arguments of a command of this repository."""
+    if words[0] == "torchrun":
+        words = ["python", *words[words.index("-m") :]]
+    if words[0] == "edge-sr":
+        return cli.main, words[1:]
+    assert words[0] == "python", f"{words[0]}: who runs this?"
+    if words[1] == "-m":
+        package = hasattr(importlib.import_module(words[2]), "__path__")
+        return importlib.import_module(f"{words[2]}.__main__" if package else words[2]).main, words[3:]
+    assert Path(words[1]).parent.name == "tests", f"{words[1]}: who runs this?"
+    return importlib.import_module(Path(words[1]).stem).main, words[2:]
+
+
+def first_of_pipe(command: str) -> list[str]:
+    words = shlex.split(command)
+    return words[: words.index("|")] if "|" in words else words
+
+
+@pytest.fixture(scope="module")
+def emulated():
+    """Two adapters of a sensor each, and the vendor's server."""
+    free = Recording(Path("free.csv"), (Track("4", healthy_counts(200), None),), float(RATE_HZ))
+    with (
+        Emulator([free], loop=True, frame_s=1e-6) as left,
+        Emulator([free], loop=True, frame_s=1e-6) as right,
+        ServerEmulator(VendorServer([free], loop=True), message_hz=200) as server,
+    ):
+        yield left, right, server
+
+
+@pytest.fixture
+def world(emulated, tmp_path, monkeypatch):
+    """A folder with what the pages take for granted, and adapters where they say they are."""
+    left, right, server = emulated
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    shutil.copy(demo_recording(), "press.npz")
+    for name in ("left", "right"):
+        write_recording(tmp_path / f"{name}.csv", healthy_counts(150))
+    save_baselines("zero.json", [BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")])
+    save_sensor_file("sensor.toml", SensorFile(sensors={"4": SensorEntry()}))
+    (tmp_path / "mine").mkdir()
+    shutil.copy(find_model("stsr"), "mine/stsr.onnx")
+
+    def prepare(command: str) -> list[str]:
+        ports = [Port(left.port, (0x0403, 0x6015), "D30BL366", "VScom USB-CAN Plus")]
+        if "D30BL401" in command:
+            ports.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
+        monkeypatch.setattr(source, "serial_ports", lambda: ports)
+        monkeypatch.setattr(devices, "serial_ports", lambda: ports)
+        if "press.mcap" in command and " record " not in command:
+            cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
+        if "npz:press.npz" in command:
+            Path("press.npz").unlink()
+        for written, real in (
+            ("/dev/ttyUSB0", left.port),
+            ("/tmp/skin", left.port),
+            ("ws://192.168.0.21", server.url),
+            ("tcp/10.0.0.5", "tcp/127.0.0.1"),
+            ("shm:skin", f"shm:skin-{os.getpid()}"),
+        ):
+            command = command.replace(written, real)
+        return [] if "\n" in command else first_of_pipe(command)
+
+    return prepare
+
+
+def shortened(words: list[str]) -> list[str]:
+    """The same for less long, at a port that is free."""
+    if "--view" in words:
+        at = words.index("--view") + 1
+        words = [*words[:at], "0", *words[at + (words[at : at + 1] != [] and words[at].isdigit()) :]]
+    if words[1] == "doctor":
+        return [*words, "--drift-s", "0.5"]
+    if words[1] in ("baseline", "models", "devices", "bench"):
+        return words
+    if words[1] == "demo" or "demo" in words or any(word.startswith("replay:") for word in words):
+        return [*words, "--rate-hz", str(RATE_HZ)]
+    return words
+
+
+def end_with_enough(monkeypatch) -> None:
+    """Ends a run as Ctrl-C would, once it gave results: however busy this machine is."""
+    stop, pump = threading.Event(), run.pump
+
+    def counting(source, runtime, sinks, statistics, **settings):
+        counted = ListSink(lambda result: stop.set() if len(counted.results) >= ENOUGH else None)
+        pump(source, runtime, [*sinks, counted], statistics, **settings)
+        assert len(counted.results) >= ENOUGH
+
+    monkeypatch.setattr(run, "stop_on_signals", lambda: nullcontext(stop))
+    monkeypatch.setattr(run, "pump", counting)
+
+
+@pytest.mark.parametrize("command", TYPED)
+def test_edge_sr_does_what_is_typed(command, world, monkeypatch, capfd):
+    words = shortened(world(command))
+    if "replay" not in command and "demo" not in command:  # which end by themselves
+        end_with_enough(monkeypatch)
+    code = cli.main(words[1:])
+    out, err = capfd.readouterr()
+    assert code in ((0, 1) if words[1] == "doctor" else (0,)), err
+    if "jsonl:-" in words:
+        states = [json.loads(line)["state"] for line in out.splitlines()]
+        assert states and set(states) <= {"zeroing", "incomplete", "idle", "contact", "dropped", "event"}
+    for written in (word.rpartition(":")[2] for word in words if word.endswith((".npz", ".toml", ".json"))):
+        assert Path(written).is_file(), written
+    assert out or err
+
+
+@pytest.mark.parametrize("command", [one for one in RUN if one.startswith("python ")])
+def test_programs_run(command, world, monkeypatch, capfd):
+    words = world(command)
+    if words[1].startswith("docs/"):  # such a program writes beside itself
+        Path("docs").mkdir()
+        shutil.copy(ROOT / words[1], words[1])
+        monkeypatch.setattr(sys, "argv", words[1:])
+        runpy.run_path(str(Path(words[1]).resolve()), run_name="__main__")
+        assert {path.suffix for path in Path("docs").iterdir()} > {".py"}
+        return
+    main, arguments = entry(words)
+    try:
+        code = main(arguments)
+    except SystemExit as left:
+        code = left.code
+    assert code in (0, None), capfd.readouterr().err
+
+
+@pytest.mark.parametrize("command", [one for one in COMMANDS if is_of(PARSED, one)])
+def test_what_takes_long_is_understood(command, only_parsed):
+    main, arguments = entry(first_of_pipe(command))
+    with pytest.raises(Parsed):
+        main(arguments)
+
+
+@pytest.mark.parametrize("command", [one for one in RUN if one.startswith("make ")])
+def test_make_knows_the_target(command):
+    told = subprocess.run(["make", "--dry-run", *command.split()[1:]], cwd=ROOT, capture_output=True, text=True)
+    assert told.returncode == 0 and "$(" not in told.stdout, told.stderr
+
+
+@pytest.mark.parametrize("command", [one for one in RUN if one.startswith("pip install ")])
+def test_extras_that_are_to_be_installed_are_declared(command):
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    asked = re.search(r"\[([\w,-]+)\]", command)
+    assert asked and set(asked[1].split(",")) <= set(declared)
+
+
+def test_every_command_is_run_by_one_of_these_tests():
+    ours = ("edge-sr ", "python ", "make ", "pip install ")
+    assert [one for one in RUN if not one.startswith(ours)] == []
+
+
+@pytest.mark.parametrize("table", [PARSED, LEFT_OUT], ids=["parsed", "left out"])
+def test_what_is_excused_because_another_test_runs_it_is_named_there(table):
+    for pattern, why in table.items():
+        tests = [ROOT / "tests" / f"{name}.py" for name in re.findall(r"\btest_\w+", why)]
+        scripts = re.findall(r"([\w|()]+)\\.py", pattern)
+        for name in (one for script in scripts for one in script.strip("()").split("|")):
+            assert any(name in test.read_text() for test in tests), f"{name}: which test runs it?"
+        assert all(test.is_file() for test in tests), why
+
+
+@pytest.mark.parametrize("table", [PARSED, LEFT_OUT], ids=["parsed", "left out"])
+def test_what_is_excused_is_still_written(table):
+    stale = [pattern for pattern in table if not any(re.fullmatch(pattern, one) for one in COMMANDS)]
+    assert stale == []
+
+
+def test_every_block_tells_its_language_so_that_no_command_hides():
+    assert [block for block in written_samples.blocks() if block.language not in written_samples.LANGUAGES] == []
+
+
+def test_commands_that_are_spoken_of_exist():
+    spoken = {
+        match[1]
+        for page in written_samples.PAGES
+        for text in written_samples.inline(page)
+        if (match := written_samples.NAMED.fullmatch(text))
+    }
+    assert spoken >= {"doctor"} and spoken <= set(cli.COMMANDS)
+
+
+def test_options_that_are_spoken_of_exist():
+    known = {
+        option
+        for package in ("edge", "examples", "export", "firmware_bridge", "train")
+        for path in (ROOT / package).rglob("*.py")
+        for option in re.findall(r'"(--[a-z][a-z0-9-]*)"', path.read_text())
+    }
+    known |= {"--help", "--nproc-per-node"}  # argparse's, torchrun's
+    for page in written_samples.PAGES:
+        for text in written_samples.inline(page):
+            for option in re.findall(r"(?<!\S)(--[a-z][a-z0-9-]*)", text):
+                assert option in known, f"{page.name}: {text}"
+
+
+@pytest.mark.parametrize(
+    "snippet",
+    [
+        pytest.param(one.text, id=f"{one.page}-{at}")
+        for at, one in enumerate(written_samples.blocks())
+        if one.language == "python"
+    ],
+)
+def test_python_of_the_pages_runs(snippet, world):
+    world(snippet)
+    exec(compile(snippet, "snippet", "exec"), {"__name__": "snippet"})

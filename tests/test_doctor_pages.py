@@ -1,0 +1,77 @@
+"""Every finding of the doctor, and what it says is to be done, is on the page for those who look for help."""
+
+import ast
+
+import pytest
+from edge_samples import ROOT
+
+from edge.doctor.line_checks import LATENCY_LIMIT_MS
+from edge.doctor.time_checks import USUAL_HZ
+from edge.doctor.verdicts import USUAL_COUNTS_PER_NEWTON
+from edge.doctor.watch import SILENCE_S
+from edge.taps import ON_COUNTS
+from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS
+
+PAGE = (ROOT / "docs" / "trouble.md").read_text()
+REMEDIES = {"remedy", "off", "busy", "_LOSS_REMEDY", "_OVERLOADED", "_AGAIN"}
+WORDS = " ".join(PAGE.replace("`", "").replace("\\|", "|").split())
+
+
+def trees() -> list[ast.AST]:
+    return [ast.parse(path.read_text()) for path in sorted((ROOT / "edge" / "doctor").glob("*.py"))]
+
+
+def findings() -> list[ast.Call]:
+    return [
+        node
+        for tree in trees()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Finding"
+    ]
+
+
+def texts(node: ast.AST) -> list[str]:
+    return [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+
+
+def remedies() -> set[str]:
+    """What is said, as far as it does not depend on what was measured."""
+    said = {text for call in findings() for one in call.args[4:5] for text in texts(one)}
+    assigned = [node for tree in trees() for node in ast.walk(tree) if isinstance(node, (ast.Assign, ast.AnnAssign))]
+    for node in assigned:
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        if node.value is not None and {target.id for target in targets if isinstance(target, ast.Name)} & REMEDIES:
+            said |= set(texts(node.value))
+    return {text.strip(" ;,") for text in said if len(text) > 20}
+
+
+def test_each_finding_has_a_row():
+    names = {text for call in findings() for text in texts(call.args[0])}
+    assert {"link", "noise", "taxel order"} <= names
+    rows = {
+        name.strip() for line in PAGE.splitlines() if line.startswith("| ") for name in line.split("|")[1].split(",")
+    }
+    assert names <= rows, names - rows
+
+
+def test_what_is_to_be_done_can_be_looked_up_as_it_was_said():
+    said = remedies()
+    assert len(said) > 30
+    assert [one for one in sorted(said) if one not in WORDS] == []
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        f"scans | fewer than {FEWEST_SCANS} of any sensor",
+        f"latency timer | a timer above {LATENCY_LIMIT_MS} ms",
+        f"rate | under {USUAL_HZ[0]:g} Hz",
+        f"rate | above {USUAL_HZ[1]:g} Hz",
+        f"drift | more than {CREEP_LIMIT_COUNTS:g} counts on a taxel",
+        f"guided press | broken off | no scan for {SILENCE_S:g} s",
+        f"force | outside {USUAL_COUNTS_PER_NEWTON[0]:g} to {USUAL_COUNTS_PER_NEWTON[1]:g} counts per newton",
+        f"a light touch (under {ON_COUNTS:g} counts",
+    ],
+)
+def test_bounds_are_those_that_are_checked(said):
+    assert said in WORDS

@@ -1,0 +1,106 @@
+"""Keys that docs/formats.md tells of are those that there are, and figures of the pages are those of the reports."""
+
+import csv
+import json
+import re
+import tomllib
+from dataclasses import fields
+
+import numpy as np
+from doctor_samples import healthy_counts
+from edge_samples import BASELINE, ROOT
+
+from edge import cli
+from edge.bundle import demo_recording, find_model
+from edge.contract import Contract
+from firmware_bridge.baseline import save_baselines
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.recording import load_recording
+from firmware_bridge.sensor_file import SensorEntry, SensorFile
+from firmware_bridge.sensor_file_text import save_sensor_file
+from train import dataset
+
+FORMATS = (ROOT / "docs" / "formats.md").read_text()
+MEASURED = "reports/bench.md"
+METHODS = {
+    "stsr-int8, the default": "stsr-int8",
+    "the paper's MTSR-4, trained alike": "peer seed-mtsr4 (run time only, weights random, of mtsr4, seed 0)",
+    "the paper's MTSR-4": "peer seed-mtsr4 (run time only, weights random, of mtsr4, seed 0)",
+    "MTSR-4 before": "peer mtsr4-before (run time only)",
+}
+"""Names that a page gives to a row of the report."""
+TRAINED_OUT = {"the paper's MTSR-4, trained alike": "mtsr4 40+20", "the paper's MTSR-4": "mtsr4 40+20"}
+"""Names of rows whose error is of reports/trained_out.csv."""
+
+
+def told(heading: str) -> set[str]:
+    """Keys of the table under a heading."""
+    section = FORMATS.split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    first = [re.split(r"(?<!\\)\|", line)[1] for line in section.splitlines() if line.startswith("| `")]
+    return {key for cell in first for key in re.findall(r"`([\w.]+)`", cell)}
+
+
+def test_keys_of_a_record(tmp_path):
+    path = tmp_path / "records.jsonl"
+    arguments = ["--source", f"replay:{demo_recording()}", "--rate-hz", "2000", "--sink", f"jsonl:{path}"]
+    assert cli.main([*arguments, "--sink", f"npz:{tmp_path / 'records.npz'}"]) == 0
+    keys = {key for line in path.read_text().splitlines() for key in json.loads(line)}
+    assert keys | {"vendor_force_n", "temperature_k"} == told("Records")
+    with np.load(tmp_path / "records.npz") as arrays:
+        assert set(arrays.files) == told("Recordings")
+    assert load_recording(tmp_path / "records.npz").tracks
+
+
+def test_keys_of_the_contract_and_of_datasets():
+    assert {field.name for field in fields(Contract)} == told("The contract in a model")
+    assert set(dataset._AXES) == told("Datasets")
+    assert find_model("stsr").read_bytes().count(b"tactile.") >= len(fields(Contract))
+
+
+def test_keys_of_baseline_and_sensor_files(tmp_path):
+    baseline = BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")
+    save_baselines(tmp_path / "zero.json", [baseline], {"4": tuple(range(16))})
+    document = json.loads((tmp_path / "zero.json").read_text())
+    assert set(document) == {"format", "version", "baselines"}
+    assert set(document["baselines"][0]) == told("Baseline file")
+    sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline)}
+    save_sensor_file(tmp_path / "sensor.toml", SensorFile(adapter="D30BL366", sensors=sensors))
+    document = tomllib.loads((tmp_path / "sensor.toml").read_text())
+    entry = document.pop("sensors")["4"]
+    assert set(entry.pop("baseline")) == {"id", "created_unix_s", "scans", "x", "y", "z"}
+    assert set(document) | set(entry) == told("Sensor file")
+
+
+def rows(text: str) -> list[list[str]]:
+    return [
+        [cell.strip().removeprefix("* ").strip("*") for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("| ")
+    ]
+
+
+def trained_out(method: str) -> set[str]:
+    """Errors of a network that another run judged, rounded as the pages have them."""
+    with (ROOT / "reports" / "trained_out.csv").open() as file:
+        for row in csv.DictReader(file):
+            if row["network"] == TRAINED_OUT.get(method):
+                digits = {"RMSE %": 2, "SSIM": 3, "SSIM global": 3, "IoU": 3, "boundary mm": 2}
+                errors = {f"{float(row[f'test {name}']):.{places}f}" for name, places in digits.items()}
+                return errors | {row["test PSNR dB"].split()[0]}
+    return set()
+
+
+def test_figures_of_methods_are_those_of_the_report():
+    """Each number of a row is in one of the rows that the report has of that method."""
+    report = [[cell.removesuffix(" of 3000") for cell in row] for row in rows((ROOT / MEASURED).read_text())]
+    names = {row[0] for row in report}
+    checked = 0
+    for page in ("README.md", "docs/models.md"):
+        for method, *cells in rows((ROOT / page).read_text()):
+            name = METHODS.get(method, method)
+            if name not in names or not any(re.fullmatch(r"[\d.]+", cell) for cell in cells):
+                continue
+            measured = {cell for row in report if row[0] == name for cell in row[1:]} | trained_out(method)
+            assert set(cells) - measured - {"-", "1", "2", "4"} == set(), f"{page}, {method}"
+            checked += 1
+    assert checked > 30

@@ -1,0 +1,82 @@
+"""Commands, snippets and options that the pages give, found in their text."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from edge_samples import ROOT
+
+PAGES = (ROOT / "README.md", *sorted(page for page in (ROOT / "docs").glob("*.md") if page.name != "log.md"))
+"""The log tells of commands as they were."""
+LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c"}
+_FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
+_INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
+_INDENTED = re.compile(r"(?<=\n\n)( {4,7})(?![-*] |\d+\. )\S.*\n(?:(?:\1.*|\n(?=\1))(?:\n|\Z))*")
+_RUNNABLE = re.compile(r"(?:edge-sr|make|pip install|python3?|sudo|torchrun|tensorboard|git|echo|ros2|ulimit) \S")
+NAMED = re.compile(r"edge-sr ([a-z]+)")
+"""A command that is spoken of, not one to be typed."""
+_MAKEFILE = re.compile(
+    r"^\t(?:\w+=\S+ )*\$\(BIN\)/((?:python -m (?!pip|pytest)|edge-sr|torchrun|mkdocs).*)$", re.MULTILINE
+)
+
+
+class Block(NamedTuple):
+    """A block of a page: fenced, or indented, which is of commands if one of its lines is."""
+
+    page: str
+    language: str
+    text: str
+
+
+def blocks() -> list[Block]:
+    found = []
+    for page in PAGES:
+        for indent, language, text in _FENCE.findall(page.read_text()):
+            lines = [line.removeprefix(indent) for line in text.splitlines()]
+            found.append(Block(page.name, language, "\n".join(lines)))
+        for block in _INDENTED.finditer(unfenced(page)):
+            lines = [line.removeprefix(block[1]) for line in block[0].splitlines()]
+            language = "sh" if any(map(_RUNNABLE.match, lines)) else "text"
+            found.append(Block(page.name, language, "\n".join(lines)))
+    return found
+
+
+def unfenced(page: Path) -> str:
+    """The text beside the blocks."""
+    return _FENCE.sub("", page.read_text())
+
+
+def inline(page: Path) -> list[str]:
+    """What stands between backticks."""
+    return [" ".join(text.replace("\\|", "|").split()) for text in _INLINE.findall(unfenced(page))]
+
+
+def commands() -> dict[str, list[str]]:
+    """Every command, and the pages that give it."""
+    found: dict[str, list[str]] = {}
+    for block in blocks():
+        if block.language == "sh":
+            for line in block.text.replace("\\\n", " ").splitlines():
+                command = " ".join(_without_comment(line).split())
+                if command:
+                    found.setdefault(command, []).append(block.page)
+    for page in PAGES:
+        for text in inline(page):
+            if _RUNNABLE.match(text) and "..." not in text and not NAMED.fullmatch(text):
+                found.setdefault(text, []).append(page.name)
+    for command in _MAKEFILE.findall((ROOT / "Makefile").read_text()):
+        found.setdefault(command.replace("$(NETWORKS)", "mine/stsr.pt").replace("$@", "out.npz"), []).append("Makefile")
+    return found
+
+
+def _without_comment(line: str) -> str:
+    """A line of shell up to a # that begins a word, outside quotes."""
+    quoted = ""
+    for at, letter in enumerate(line):
+        if quoted:
+            quoted = "" if letter == quoted else quoted
+        elif letter in "'\"":
+            quoted = letter
+        elif letter == "#" and (at == 0 or line[at - 1].isspace()):
+            return line[:at]
+    return line
