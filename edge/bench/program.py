@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.bench.errors import BenchError
+from edge.pump import uncollected
 from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 
@@ -183,19 +184,20 @@ def emulating(*arguments: str) -> Iterator[str]:
 
 @contextmanager
 def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
-    spawned_ns = time.monotonic_ns()
-    with subprocess.Popen(
-        [sys.executable, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=environment(),
-        start_new_session=True,
-    ) as process:
-        try:
-            yield Program(process, spawned_ns, stamps)
-        finally:
-            process.kill()  # its last records are of no interest, and nobody reads them
+    with uncollected():  # or a pause of ours would count as the program's
+        spawned_ns = time.monotonic_ns()
+        with subprocess.Popen(
+            [sys.executable, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment(),
+            start_new_session=True,
+        ) as process:
+            try:
+                yield Program(process, spawned_ns, stamps)
+            finally:
+                process.kill()  # its last records are of no interest, and nobody reads them
 
 
 def environment() -> dict[str, str]:
