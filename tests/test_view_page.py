@@ -21,6 +21,7 @@ from edge_samples import ROOT
 from view_samples import wait_for
 from websockets.sync.client import connect
 
+from edge import view as edge_view
 from edge.bundle import demo_recording
 from edge.draw import colours
 from edge.packed import unpack
@@ -420,6 +421,29 @@ class TestHeld:
         # A pad that is held draws a line: what was missed meanwhile is no hole of .7 s in it, as none is for the other.
         here, there = (max(np.diff(np.flatnonzero(part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
         assert here < there + 0.07 * part(page, "force-plot").evaluate("canvas => canvas.width")
+
+    def test_a_held_trace_stays_as_it_is_though_more_comes_for_its_last_point(self, page):
+        source = (Path(edge_view.__file__).parent / "page.html").read_text()
+        parts = r"^const (?:LONGEST_S|POINTS|STEP_S) .*\n|^class Trace \{\n(?:.*\n)*?\}\n"
+        before, held, after = page.evaluate(
+            f"""() => {{
+              {"".join(re.findall(parts, source, re.MULTILINE))}
+              const trace = new Trace();
+              const shown = () => {{
+                const points = [];
+                trace.each("force_counts", 10, (seconds, value) => points.push([seconds, value]));
+                return points;
+              }};
+              trace.add([[1, 5, 0, 0]]);
+              trace.hold(true);
+              const before = shown();
+              trace.add([[1, 9, 0, 0], [1.001, 8, 0, 0], [1.5, 7, 0, 0]]);
+              const held = shown();
+              trace.hold(false);
+              return [before, held, shown()];
+            }}"""
+        )
+        assert before == held == [[1, 5]] and after == [[1, 5], [1.001, 8], [1.5, 7]]
 
     def test_a_reconnect_tells_nothing_twice(self, page, held, open_page):
         other = open_page(held.url, script=WATCH_SOCKETS)
