@@ -11,8 +11,9 @@ from firmware_bridge.scan import Scan
 
 HOLD_SCANS: Final = 5
 """A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
-HOLD_NS: Final = 100_000_000
-"""And no longer than this, however few scans came meanwhile: what was pressed half a second ago is another press."""
+HOLD_NS: Final = 90_000_000
+"""And no longer than this from scan to scan, however few came meanwhile: what was pressed half a second ago is another
+press. A reading may have come 60 ms before the end of its scan, the longest pause in one: none is older than 150 ms."""
 SILENT_SCANS: Final = 50
 """A taxel not heard for so long is not lost for a moment: the user is told, and zeroing goes on without it."""
 STUCK_SCANS: Final = 20

@@ -120,7 +120,7 @@ def test_a_reading_that_is_held_for_too_long_is_found():
     for number in range(5, 30):
         forged.change(number, fresh=ALL & ~2, renewed=ALL & ~2)
     found = forged.judged()
-    assert len(found.false_patterns) == 30 - 20 and "taxel 1 is held for 162 ms" in found.false_patterns[0]
+    assert len(found.false_patterns) == 30 - 19 and "taxel 1 is held for 152 ms" in found.false_patterns[0]
     for number in range(5, 30):
         forged.change(number, dead={"1": "silent"})
     assert not forged.judged().false_patterns

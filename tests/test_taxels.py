@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, ROOT
 
+from edge.bench.fault_judge import HELD_US
 from edge.bundle import demo_recording
 from edge.taxels import (
     BACK_SCANS,
@@ -20,6 +21,7 @@ from edge.taxels import (
     STUCK_SCANS,
     TaxelWatch,
 )
+from firmware_bridge.assembler import LONGEST_PAUSE_NS
 from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
@@ -245,6 +247,11 @@ def test_one_at_its_end_among_others_that_are_pressed_is_held_from_the_first_sca
     pad.read(1, press, at_the_end)
     assert pad.watch.held[2, 1, 1] == before
     assert "its last reading is held, taxel 5 at the end of its range" in (pad.watch.note(None) or "")
+
+
+def test_no_reading_is_held_for_longer_than_the_judge_of_faults_allows():
+    """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
+    assert (HOLD_NS + LONGEST_PAUSE_NS) / 1e3 <= HELD_US
 
 
 @pytest.mark.parametrize(("pause_ns", "held"), [(HOLD_NS, True), (HOLD_NS + 1, False)])

@@ -41,7 +41,7 @@ def unpacked(frames):
 
 
 def look(viewer, heard, clock):
-    return unpacked(viewer.due(Frames(heard, clock())))
+    return unpacked(viewer.due(Frames(heard, clock(), "emulated")))
 
 
 def numbers(header):
@@ -132,7 +132,7 @@ def test_two_at_different_speeds_get_the_same_newest_and_what_each_has_missed(he
 def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
     press, viewer = Press(), Viewer()
     heard.add(press.next(), {})
-    frames = Frames(heard, clock())
+    frames = Frames(heard, clock(), "emulated")
     heard.add(press.next(), {})
     [(first, _)] = unpacked(viewer.due(frames))
     [(second, _)] = look(viewer, heard, clock)
@@ -141,7 +141,7 @@ def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
 
 def test_who_looks_at_the_same_shares_its_bytes(heard, clock):
     heard.add(Press().next(), {})
-    frames = Frames(heard, clock())
+    frames = Frames(heard, clock(), "emulated")
     assert Viewer().due(frames)[0] is Viewer().due(frames)[0]
 
 
@@ -202,7 +202,7 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
         "state": "event",
         "event": "lost",
         "sensor": None,
-        "source": None,
+        "source": "emulated",
         "time_ns": EVENTS + 4,
         "note": f"gone {EVENTS + 4}",
         "counters": {"outages": EVENTS + 4},
@@ -249,9 +249,9 @@ def test_state_tells_the_silence_of_a_sensor(heard, clock):
     heard.add(Press("4").next(), {})
     clock.now_ns += 700_000_000
     heard.add(Press("6").next(), {})
-    assert Frames(heard, clock()).silent() == {"4": 0.7}
+    assert Frames(heard, clock(), "emulated").silent() == {"4": 0.7}
     clock.now_ns += 500_000_000
-    assert Frames(heard, clock()).silent() == {"4": 1.2}
+    assert Frames(heard, clock(), "emulated").silent() == {"4": 1.2}
     header, _ = unpack(state(Path("edge.mcap"), 3, {"4": 1.2}))
     assert header == {"kind": "state", "recording": "edge.mcap", "viewers": 3, "silent": {"4": 1.2}, "maps": []}
 
@@ -266,7 +266,7 @@ def test_a_name_of_any_bytes_can_be_shown(heard, clock):
 
 
 def test_what_is_refused_is_an_event():
-    header, _ = unpack(refused(7, "no command"))
+    header, _ = unpack(refused(7, "no command", "emulated"))
     assert (header["kind"], header["event"], header["note"], header["time_ns"]) == ("event", "refused", "no command", 7)
     assert "number" not in header and header["sensor"] is None
 

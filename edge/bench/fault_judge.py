@@ -9,8 +9,6 @@ from typing import Final
 import numpy as np
 
 from edge.bench.fault_records import Seen
-from edge.taxels import HOLD_NS
-from firmware_bridge.assembler import LONGEST_PAUSE_NS
 from firmware_bridge.faults.frames import READ
 from firmware_bridge.faults.truth import FATES
 from firmware_bridge.truth_files import Told
@@ -18,9 +16,8 @@ from firmware_bridge.xela import USPA44_MAP
 
 STALE_US: Final = 100_000
 """What a record gives as one reading of the pad was on the bus within this time."""
-HELD_US: Final = (HOLD_NS + LONGEST_PAUSE_NS) / 1e3
-"""Of a taxel that did not come, the last reading is held for HOLD_NS from scan to scan; a pause may lie between it and
-the end of its own."""
+HELD_US: Final = 150_000
+"""Of a taxel that did not come, the last reading is held for as long as that, by times of arrival."""
 _FLIPPED, _STUCK = (FATES.index(name) for name in ("flipped", "stuck"))
 
 

@@ -44,8 +44,9 @@ class Frames:
         now_ns: the moment, in [ns].
     """
 
-    def __init__(self, heard: Heard, now_ns: int) -> None:
+    def __init__(self, heard: Heard, now_ns: int, source: SourceKind | None) -> None:
         self.now_ns = now_ns
+        self._source = source
         self._heard = heard
         self._newest = dict(heard.newest)
         self._packed: dict[tuple[str, int], bytes] = {}
@@ -72,7 +73,8 @@ class Frames:
         return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SILENT_NS}
 
     def _event(self, told: Told) -> bytes:
-        return _event(told.event, told.counters, self.now_ns - told.heard_ns, {"number": told.number})
+        said = event_record(told.event, told.counters, self._source)
+        return _event(said, self.now_ns - told.heard_ns, {"number": told.number})
 
     def _pack(self, newest: Newest, since: int) -> bytes:
         result = newest.result
@@ -125,13 +127,12 @@ def state(recording: Path | None, viewers: int, silent: dict[str, float]) -> byt
     return pack({"kind": "state", "recording": _path(recording), "viewers": viewers, "silent": silent}, {})
 
 
-def refused(time_ns: int, why: str) -> bytes:
+def refused(time_ns: int, why: str, source: SourceKind | None) -> bytes:
     """The answer to what was no command: without a number, since it is none of the run's events."""
-    return _event(Event(time_ns, "refused", None, why), {}, 0, {})
+    return _event(event_record(Event(time_ns, "refused", None, why), {}, source), 0, {})
 
 
-def _event(event: Event, counters: Mapping[str, int], age_ns: int, number: Mapping[str, int]) -> bytes:
-    said = event_record(event, counters, None)  # hello has told the source
+def _event(said: Mapping[str, Any], age_ns: int, number: Mapping[str, int]) -> bytes:
     return pack({**said, **number, "kind": "event", "age_s": _seconds(age_ns)}, {})
 
 

@@ -31,6 +31,7 @@ from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
 from edge.view.heard import Heard
 from edge.view.page import load_page
 from edge.view.viewer import Viewer
+from firmware_bridge.links.base import SourceKind
 
 MOST_VIEWERS: Final = 16
 MOST_CONNECTIONS: Final = 64
@@ -95,9 +96,11 @@ class Server:
         self._news = asyncio.Event()
         self._ending = False
         self._requests = 0
+        self._source: SourceKind | None = None
 
     def begin(self, run: Run) -> None:
         """Answer pages and sockets; `run` is what they are told of it first."""
+        self._source = run.kind
         ready = threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(run, ready), name="live-view")
         self._thread.start()
@@ -158,7 +161,7 @@ class Server:
                     async with asyncio.timeout(STATE_S if self._viewers or self._requests else None):
                         await self._news.wait()
                 self._news.clear()
-                frames = Frames(self._heard, time.monotonic_ns())
+                frames = Frames(self._heard, time.monotonic_ns(), self._source)
                 silent, recording = frames.silent(), self._recording()
                 to_say = (recording, len(self._viewers), tuple(silent))
                 now_s = time.monotonic()
@@ -202,7 +205,7 @@ class Server:
                         break  # what was asked before it closed may be much, and takes its time
                     why = self._asked.hear(message, attended.viewer)
                     if why is not None:
-                        broadcast([connection], refused(time.monotonic_ns(), why))
+                        broadcast([connection], refused(time.monotonic_ns(), why, self._source))
                     await asyncio.sleep(COMMAND_PAUSE_S)
             finally:
                 del self._viewers[connection]
