@@ -1,0 +1,1 @@
+"""Datasets to learn from, and the batches drawn from them."""
