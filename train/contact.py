@@ -9,6 +9,7 @@ A cell that a surface's edge runs through carries as much as it is covered: read
 surface moves, where whole cells alone make them jump by 1 to 2 % (docs/log.md).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 from typing import Final
@@ -64,18 +65,27 @@ class ContactSolver:
         cell_mm: their size, in [mm].
         dtype: torch.float32 or torch.float64.
         boxed: work on boxes; else on the whole pad, for comparison.
+        compliance: surface displacement per pressure at wave numbers, in [mm/MPa], where something gives way beside the
+            layer; the layer's alone if None.
     """
 
     def __init__(
-        self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32, boxed: bool = True
+        self,
+        layer: Layer,
+        size: int,
+        cell_mm: float,
+        dtype: torch.dtype = torch.float32,
+        boxed: bool = True,
+        compliance: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
         padded = 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
         q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
         q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
-        compliance = surface_compliance(layer, np.hypot(q_x[None, :], q_y[:, None]))
-        self._kernel = np.fft.irfft2(compliance, s=(padded, padded))
+        q = np.hypot(q_x[None, :], q_y[:, None])
+        answers = surface_compliance(layer, q) if compliance is None else compliance(q)
+        self._kernel = np.fft.irfft2(answers, s=(padded, padded))
         self._dtype = dtype
         # Powers of two: the FFT is at its best, and there are few shapes, so that many poses share one.
         self._sides = [side for side in (8, 16, 32, 64, 128, 256) if side < size and boxed] + [size]

@@ -131,22 +131,33 @@ class MagnetArray:
         geometry: the taxels.
         magnet: what each of them holds.
         field: a name in FIELDS.
+        rest: where each magnet sits and how it leans at rest, as a movement, (taxels, 5); None for all alike.
+        moments: of each magnet as a share of the nominal one, (taxels,); None for all alike.
 
     Raises:
-        ValueError: no field of that name, or the magnet is too near to its chip for a dipole.
+        ValueError: no field of that name, or a magnet is too near to its chip for a dipole.
     """
 
-    def __init__(self, geometry: SensorGeometry, magnet: Magnet, field: str = "dipole") -> None:
+    def __init__(
+        self,
+        geometry: SensorGeometry,
+        magnet: Magnet,
+        field: str = "dipole",
+        rest: NDArray[np.floating] | None = None,
+        moments: NDArray[np.floating] | None = None,
+    ) -> None:
         if field not in FIELDS:
             raise ValueError(f"no field {field!r}, expected one of {', '.join(FIELDS)}")
         self.magnet = magnet
         self._field = FIELDS[field]
         self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm if field == "dipole" else 0.0
-        self._check_clear(magnet.clearance_mm)
+        nowhere = np.zeros((geometry.taxel_count, len(MOVEMENT)))
+        self._rest = (nowhere if rest is None else rest).astype(np.float32)
+        self._moments = None if moments is None else moments.astype(np.float32)
+        self._check_clear(magnet.clearance_mm - float(self._rest[:, _DOWN].max()))
         centres_mm = geometry.taxel_centres_mm().T
         # (2, chips, magnets): from each magnet to each chip, at rest.
         self._apart_mm = (centres_mm[:, :, None] - centres_mm[:, None, :]).astype(np.float32)
-        self._nowhere = np.zeros((geometry.taxel_count, len(MOVEMENT)), dtype=np.float32)
 
     def change_mt(self, movement: NDArray[np.floating]) -> NDArray[np.floating]:
         """What the movement of the magnets changes at the chips; none changes exactly nothing.
@@ -160,8 +171,10 @@ class MagnetArray:
         Raises:
             ValueError: a magnet would be pressed through its chip, or too near to it for a dipole.
         """
-        self._check_clear(self.magnet.clearance_mm - float(movement[..., _DOWN].max(initial=0.0)))
-        return self.flux_mt(movement) - self.flux_mt(self._nowhere.astype(movement.dtype))
+        rest = self._rest.astype(movement.dtype)
+        placed = movement + rest
+        self._check_clear(self.magnet.clearance_mm - float(placed[..., _DOWN].max(initial=0.0)))
+        return self.flux_mt(placed) - self.flux_mt(rest)
 
     def _check_clear(self, clear_mm: float) -> None:
         if not clear_mm > 0:
@@ -182,4 +195,6 @@ class MagnetArray:
         gap_mm = down.dtype.type(self.magnet.gap_mm)
         away_mm = (self._apart_mm[0] - right, self._apart_mm[1] - back, down - gap_mm)
         flux = self._field(self.magnet, away_mm, (lean_x * upright, lean_y * upright, upright))
+        if self._moments is not None:
+            flux = tuple(part * self._moments for part in flux)
         return np.stack([part.sum(axis=-1) for part in flux], axis=-1, dtype=movement.dtype)
