@@ -35,6 +35,9 @@ class Skin:
         magnet: of every taxel.
         field: how the magnets' field is worked out, a name in train.magnets.FIELDS.
         in_plane_share: factor on the magnets' in-plane movement.
+        rest: where each magnet sits and how it leans, see train.magnets.MagnetArray.
+        moments: of each magnet, see train.magnets.MagnetArray.
+        counts_per_newton: of the sum of z under an even load.
 
     Attributes:
         counts_per_mt: of every chip and axis.
@@ -52,6 +55,9 @@ class Skin:
         magnet: Magnet | None = None,
         field: str = "dipole",
         in_plane_share: float = IN_PLANE_SHARE,
+        rest: NDArray[np.floating] | None = None,
+        moments: NDArray[np.floating] | None = None,
+        counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z,
     ) -> None:
         magnet = Magnet() if magnet is None else magnet
         if magnet.height_mm + magnet.thickness_mm / 2 > layer.thickness_mm:
@@ -61,14 +67,14 @@ class Skin:
             )
         self.geometry = geometry
         self.size = size
-        self._magnets = MagnetArray(geometry, magnet, field)
+        self._magnets = MagnetArray(geometry, magnet, field, rest, moments)
         response = _magnet_response(geometry, layer, size, cell_mm, magnet)
         response[:, :2] *= in_plane_share
         self._response = response.astype(np.float32)
         # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.
         even_mpa = np.full((size, size), _CALIBRATION_N / (size * cell_mm) ** 2)
         z_sum_mt = self._magnets.change_mt(self.movement(even_mpa))[:, 2].sum()
-        self.counts_per_mt = float(_CALIBRATION_N / NEWTONS_PER_COUNT_Z / z_sum_mt)
+        self.counts_per_mt = float(_CALIBRATION_N * counts_per_newton / z_sum_mt)
 
     def movement(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.floating]:
         """How pressures (..., size, size) in [MPa] move the magnets: (..., taxels, 5), train.magnets.MOVEMENT.

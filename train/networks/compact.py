@@ -2,7 +2,8 @@
 
 Against the seed's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force from
 the newest one, and leaves out the work at full resolution and batch normalisation, which cost 8 dB after
-1000 steps here (docs/log.md). It adds how far each pixel may be off.
+1000 steps here (docs/log.md). It adds the uncertainty of each pixel, the traction on the pad, and what is known of the
+pad as an input; and it is exactly symmetric under quarter turns, of one tap under mirror images as well.
 """
 
 from math import expm1, log, sqrt
@@ -12,28 +13,43 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from train.networks.blocks import PatternNet, Residual
+from train.data.batch import Batch
+from train.networks.blocks import PatternNet
+from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
 from train.objectives import relative_error, truth_size
 
 _QUIET_UNITS: Final = 0.02
-"""Added to a tap's amplitude before it divides the tap, in network units: noise and absent taps stay small."""
+"""Amplitude in network units, added before a tap is divided by its own: noise and absent taps stay small."""
 
 _LEAST_DEVIATION: Final = 1e-4
-"""Of a tap of amplitude 1, in [mm]: .05 % of what such a tap presses in."""
+"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of what such a tap presses in."""
 
-_FIRST_DOUBT: Final = log(expm1(0.02))
-"""Added before the softplus: before training a tap of amplitude 1 is believed to about 0.02 mm."""
+_FIRST_UNCERTAINTY: Final = log(expm1(0.02))
+"""Offset before the softplus: before training a tap of amplitude 1 is believed to about 0.02 mm."""
 
 _LEAST_SHARE: Final = 1e-3
-"""Added to deviations in the loss, as a share of the truth's RMS: a pixel that is right by chance decides nothing."""
+"""Deviation added in the loss, as a share of the truth's RMS: a pixel that is right by chance decides nothing."""
+
+_TRACTION_KPA: Final = 30.0
+"""Traction of an output of 1 and a tap of amplitude 1."""
+
+_TRACTION_SHARE: Final = 0.2
+"""Weight of the traction's relative error in the loss."""
+
+_LEAST_KPA: Final = 0.05
+"""RMS traction below which a truth counts as this large."""
+
+TRACTION_SCALE: Final = 2
+"""Traction pixels per taxel pitch: 2.35 mm. A finer wave than twice that loses 97 % of itself in the layer."""
 
 
 class CompactNet(PatternNet):
-    """Window of K taps to a pattern, and to the standard deviation of each of its pixels.
+    """Window of K taps to a pattern, the standard deviation of each of its pixels, and the traction on the pad.
 
     A tap enters the pattern branch divided by its own amplitude, and the newest tap's amplitude multiplies the
-    result: a flat contact's pattern is linear in its force, so the trunk has to learn shapes alone, and no force is out
-    of its range. An absent tap is all zeros and stays so.
+    result: a flat contact's pattern is nearly linear in its force, so the trunk has to learn shapes alone, and no force
+    is out of its range. The amplitude itself enters as a bounded number, for what is not linear. An absent tap is all
+    zeros and stays so.
 
     The deviation is read off the features from which the pattern is made, and teaches them nothing: the pattern comes
     out as if there were no deviation.
@@ -41,107 +57,122 @@ class CompactNet(PatternNet):
     Args:
         taps: K.
         scale: pattern pixels per taxel pitch, even.
-        channels: of the trunk.
+        channels: of the trunk, a multiple of the symmetries.
         blocks: residual blocks of the trunk.
+        known: numbers that say what is known of the pad, see train.physics.pads.
+        group: symmetries; None takes quarter turns and mirror images of one tap, of several quarter turns alone, since
+            a mirrored pad is turned the other way from tap to tap.
 
     Attributes:
         deviation_scale: factor on the deviation, found after training by `train.calibration.calibrate`.
 
     Raises:
-        ValueError: no taps, or an odd scale.
+        ValueError: no taps, an odd scale, or channels that do not divide.
     """
 
     deviation_scale: Tensor
 
-    def __init__(self, taps: int, scale: int, channels: int = 64, blocks: int = 6) -> None:
+    def __init__(
+        self, taps: int, scale: int, channels: int = 64, blocks: int = 6, known: int = 0, group: Group | None = None
+    ) -> None:
         super().__init__()
         if taps < 1:
             raise ValueError(f"{taps} taps asked for, expected at least 1")
         if scale < 2 or scale % 2:
             raise ValueError(f"scale is {scale}, expected an even number: the trunk works at twice the taxel grid")
-        self.taps, self.scale = taps, scale
+        self.taps, self.scale, self.known = taps, scale, known
+        self.group: Group = ("p4m" if taps == 1 else "p4") if group is None else group
         self._width = (channels, blocks)
-        merged, force_channels, grow = channels * 3 // 2, channels // 2, scale // 2
+        grow = scale // 2
+        wide, narrow = fields(self.group, channels), fields(self.group, channels // 2)
+        merged, left, doubted = (
+            fields(self.group, channels * 3 // 2),
+            fields(self.group, 2 * channels),
+            fields(self.group, channels // 2),
+        )
+        about, pixel = scalars(self.group, known + 1), scalars(self.group, 1).shuffled(grow)
         # Two 3 x 3 convolutions see nearly all of 4 x 4 taxels: where taps are brought together, turned as they are.
-        self.enter = nn.Conv2d(3 * taps, merged, 3, padding=1)
+        self.enter = SymmetricConv2d(vectors(self.group, taps) + about, merged, 3)
         self.merge = nn.Sequential(
             nn.ReLU(),
-            nn.Conv2d(merged, merged, 3, padding=1),
+            SymmetricConv2d(merged, merged, 3),
             nn.ReLU(),
-            nn.Conv2d(merged, 4 * channels, 1),
+            SymmetricConv2d(merged, wide.shuffled(2), 1),
             nn.PixelShuffle(2),
             nn.ReLU(),
         )
-        self.trunk = nn.Sequential(*(Residual(channels) for _ in range(blocks)))
+        self.trunk = nn.Sequential(*(SymmetricResidual(wide) for _ in range(blocks)))
         self.force = nn.Sequential(
-            nn.Conv2d(3, force_channels, 3, padding=1),
+            SymmetricConv2d(vectors(self.group) + about, narrow, 3),
             nn.ReLU(),
-            Residual(force_channels),
-            nn.Conv2d(force_channels, 4 * force_channels, 1),
+            SymmetricResidual(narrow),
+            SymmetricConv2d(narrow, narrow.shuffled(2), 1),
             nn.PixelShuffle(2),
         )
         self.leave = nn.Sequential(
-            nn.Conv2d(channels + force_channels, 2 * channels, 3, padding=1),
+            SymmetricConv2d(wide + narrow, left, 3),
             nn.ReLU(),
-            nn.Conv2d(2 * channels, grow * grow, 3, padding=1),
+            SymmetricConv2d(left, pixel, 3),
             nn.PixelShuffle(grow),
         )
-        self.doubt = nn.Sequential(
-            nn.Conv2d(channels + force_channels, 3 * channels // 4, 1),
+        self.uncertainty = nn.Sequential(
+            SymmetricConv2d(wide + narrow, doubted, 1),
             nn.ReLU(),
-            nn.Conv2d(3 * channels // 4, grow * grow, 3, padding=1),
+            SymmetricConv2d(doubted, pixel, 3),
             nn.PixelShuffle(grow),
         )
+        self.traction = SymmetricConv2d(wide + narrow, vectors(self.group), 3)
         self.register_buffer("deviation_scale", torch.tensor(1.0))
 
-    def forward(self, window: Tensor) -> tuple[Tensor, Tensor]:
-        """Patterns and their deviations, both (n, H, W) in [mm], of windows (n, 3K, rows, cols) in network units.
+    def forward(self, window: Tensor, pad: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
 
         Patterns are cut at zero in use but not in training: a sub-pixel that is cut everywhere would never learn again.
         Deviations are above zero always.
+
+        Args:
+            window: (n, 3K, rows, cols) in network units.
+            pad: (n, known), what is known of the pads; None for nothing.
         """
         count, _, rows, cols = window.shape
         taps = window.view(count, self.taps, 3, rows, cols)
         amplitude = taps.square().mean(dim=(2, 3, 4), keepdim=True).sqrt() + _QUIET_UNITS
         shapes = (taps / amplitude).view(count, 3 * self.taps, rows, cols)
         newest = amplitude[:, 0, 0]
-        with torch.autocast(window.device.type, enabled=False):
-            entered = self.enter(shapes)  # what a turned tap reads otherwise is a few parts in a thousand
-        features = torch.cat([self.trunk(self.merge(entered)), self.force(shapes[:, :3])], dim=1)
-        pattern = self.leave(features)[:, 0].float() * newest
+        size = newest / (newest + 1)
+        about = size[:, :, 0] if pad is None else torch.cat([pad, size[:, :, 0]], dim=1)
+        if pad is None and self.known:
+            about = F.pad(about, (self.known, 0))
+        planes = about[:, :, None, None].expand(count, self.known + 1, rows, cols)
+        entered = self.enter(torch.cat([shapes, planes], dim=1))
+        felt = self.force(torch.cat([shapes[:, :3], planes], dim=1))
+        features = torch.cat([self.trunk(self.merge(entered)), felt], dim=1)
+        pattern = self.leave(features)[:, 0] * newest
+        traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
         # Not an exponential: on a window unlike all others it would know no bounds.
-        doubt = F.softplus(self.doubt(features.detach())[:, 0].float() + _FIRST_DOUBT)
-        deviation = (doubt + _LEAST_DEVIATION) * newest * self.deviation_scale
-        return (pattern if self.training else torch.relu(pattern)), deviation
+        uncertainty = F.softplus(self.uncertainty(features.detach())[:, 0] + _FIRST_UNCERTAINTY)
+        deviation = (uncertainty + _LEAST_DEVIATION) * newest * self.deviation_scale
+        return (pattern if self.training else torch.relu(pattern)), deviation, traction
 
-    def with_fewer_taps(self, taps: int) -> "CompactNet":
-        """The same function of the newest `taps` taps, the others absent; its own weights.
+    def with_taps(self, taps: int) -> "CompactNet":
+        """The same function of the newest taps, further ones ignored until it is trained; its own weights.
 
-        Raises:
-            ValueError: more taps asked for than there are, or none.
-        """
-        if not 1 <= taps <= self.taps:
-            raise ValueError(f"{taps} taps asked for, expected 1 to {self.taps}")
-        state = {name: value.clone() for name, value in self.state_dict().items()}
-        state["enter.weight"] = state["enter.weight"][:, : 3 * taps]
-        smaller = CompactNet(taps, self.scale, *self._width)
-        smaller.load_state_dict(state)
-        return smaller
-
-    def with_more_taps(self, taps: int) -> "CompactNet":
-        """The same function of the newest taps, deaf to the further ones until it is trained; its own weights.
+        A network of several taps has fewer symmetries than one of one tap: it can be made of that one, and one of one
+        tap can be made of it but for its mirrored half.
 
         Raises:
-            ValueError: fewer taps asked for than there are.
+            ValueError: no taps asked for.
         """
-        if taps < self.taps:
-            raise ValueError(f"{taps} taps asked for, expected {self.taps} or more")
-        state = {name: value.clone() for name, value in self.state_dict().items()}
-        known = state["enter.weight"]
-        state["enter.weight"] = F.pad(known, (0, 0, 0, 0, 0, 3 * (taps - self.taps)))
-        larger = CompactNet(taps, self.scale, *self._width)
-        larger.load_state_dict(state)
-        return larger
+        channels, blocks = self._width
+        other = CompactNet(taps, self.scale, channels, blocks, self.known, self.group)
+        state = {name: value.clone() for name, value in self.state_dict().items() if not name.startswith("enter.")}
+        other.load_state_dict(state, strict=False)
+        kept, known = 3 * min(taps, self.taps), self.known + 1
+        weight = torch.zeros_like(other.enter.weight)
+        weight[:, :kept] = self.enter.weight[:, :kept]
+        weight[:, -known:] = self.enter.weight[:, -known:]
+        other.enter.assign(weight, self.enter.bias)
+        return other
 
 
 class HeteroscedasticError:
@@ -150,10 +181,14 @@ class HeteroscedasticError:
     def __init__(self, beta: float = 1.0) -> None:
         self._beta = beta
 
-    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
-        """Relative error of the patterns, and how badly the deviations tell it."""
-        pattern, deviation = net(window)
-        return heteroscedastic_loss(pattern, deviation, truth, self._beta)
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
+        """Relative error of the patterns and of the tractions, and how badly the deviations state the patterns'."""
+        pattern, deviation, traction = net(batch.window, batch.pad)
+        loss = heteroscedastic_loss(pattern, deviation, batch.pattern, self._beta)
+        if batch.traction is not None:
+            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)
+            loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()
+        return loss
 
     def after_step(self) -> None:
         """Nothing of its own to train."""
