@@ -80,15 +80,14 @@ class ContactSolver:
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
-        padded = 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
+        padded = period_cells(layer, size, cell_mm)
         q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
         q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
         q = np.hypot(q_x[None, :], q_y[:, None])
         answers = surface_compliance(layer, q) if compliance is None else compliance(q)
         self._kernel = np.fft.irfft2(answers, s=(padded, padded))
         self._dtype = dtype
-        # Powers of two: the FFT is at its best, and there are few shapes, so that many poses share one.
-        self._sides = [side for side in (8, 16, 32, 64, 128, 256) if side < size and boxed] + [size]
+        self._sides = [*(box_sides(size) if boxed else ()), size]
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
 
     @property
@@ -140,7 +139,7 @@ class ContactSolver:
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
         steps = 0
-        for (height, width), poses, top, left in self._boxes(depth_mm < REACH * indentation[:, None, None]):
+        for (height, width), poses, top, left in boxes(depth_mm < REACH * indentation[:, None, None], self._sides):
             rows = (top[:, None] + np.arange(height))[:, :, None]
             columns = (left[:, None] + np.arange(width))[:, None, :]
             place = (poses[:, None, None], rows, columns)
@@ -153,25 +152,6 @@ class ContactSolver:
             residual[poses] = error.numpy()
             steps = max(steps, taken)
         return ContactResult(pressure_mpa, steps, residual, self)
-
-    def _boxes(
-        self, within: NDArray[np.bool_]
-    ) -> list[tuple[tuple[int, int], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
-        """Poses by shape of box: (shape, their indices, first row and first column of each one's box)."""
-        sides = np.array(self._sides)
-        shapes, starts = [], []
-        for axis in (1, 2):
-            used = np.asarray(within.any(axis=3 - axis))
-            first, last = used.argmax(axis=1), self.size - 1 - used[:, ::-1].argmax(axis=1)
-            side = sides[np.searchsorted(sides, last - first + 1)]
-            shapes.append(side)
-            starts.append(np.minimum(first, self.size - side))
-        kinds, kind = np.unique(np.stack(shapes, axis=1), axis=0, return_inverse=True)
-        groups = [np.flatnonzero(kind.reshape(-1) == i) for i in range(len(kinds))]
-        return [
-            ((int(height), int(width)), poses, starts[0][poses], starts[1][poses])
-            for (height, width), poses in zip(kinds, groups, strict=True)
-        ]
 
     def _give(self, cover: torch.Tensor) -> torch.Tensor:
         """How much further a cell sinks under its own pressure because a share of it alone carries that, in [mm/MPa].
@@ -252,6 +232,41 @@ class ContactSolver:
             self._spectra[height, width] = torch.fft.rfft2(kernel).real
         spectrum = torch.fft.rfft2(pressure, s=padded) * self._spectra[height, width]
         return torch.fft.irfft2(spectrum, s=padded)[:, :height, :width]
+
+
+def period_cells(layer: Layer, size: int, cell_mm: float) -> int:
+    """Cells after which the grid repeats itself that kernels of a pad are worked out on."""
+    return 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
+
+
+def box_sides(size: int) -> list[int]:
+    """Sides of boxes on a pad: powers of two, where the FFT is at its best, and few, so that many poses share one."""
+    return [side for side in (8, 16, 32, 64, 128, 256) if side < size]
+
+
+def boxes(
+    within: NDArray[np.bool_], sides: list[int]
+) -> list[tuple[tuple[int, int], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
+    """Poses by shape of their bounding box: (shape, their indices, first row and first column of each one's box).
+
+    Args:
+        within: (n, size, size), the cells that a box must hold.
+        sides: what a box may measure, rising; the last is the pad's.
+    """
+    size = within.shape[-1]
+    shapes, starts = [], []
+    for axis in (1, 2):
+        used = np.asarray(within.any(axis=3 - axis))
+        first, last = used.argmax(axis=1), size - 1 - used[:, ::-1].argmax(axis=1)
+        side = np.array(sides)[np.searchsorted(sides, last - first + 1)]
+        shapes.append(side)
+        starts.append(np.minimum(first, size - side))
+    kinds, kind = np.unique(np.stack(shapes, axis=1), axis=0, return_inverse=True)
+    groups = [np.flatnonzero(kind.reshape(-1) == i) for i in range(len(kinds))]
+    return [
+        ((int(height), int(width)), poses, starts[0][poses], starts[1][poses])
+        for (height, width), poses in zip(kinds, groups, strict=True)
+    ]
 
 
 def _total(maps: torch.Tensor) -> torch.Tensor:

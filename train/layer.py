@@ -70,6 +70,22 @@ def inner_displacement(
         q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
         height_mm: height above the board, 0 to thickness, in [mm].
     """
+    up, along = inner_waves(layer, q_per_mm, height_mm, normal_mpa=-1.0, shear_mpa=0.0)
+    return -up, along
+
+
+def inner_waves(
+    layer: Layer, q_per_mm: NDArray[np.float64], height_mm: float, normal_mpa: float, shear_mpa: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Displacement (w, u) inside the layer of a wave u_z = w exp(i q x) upwards, u_x = i u exp(i q x), in [mm].
+
+    Args:
+        layer: the pad.
+        q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
+        height_mm: height above the board, 0 to thickness, in [mm].
+        normal_mpa: sigma_zz on top, times exp(i q x).
+        shear_mpa: sigma_xz on top, times i exp(i q x).
+    """
     shape = q_per_mm.shape
     q = np.maximum(q_per_mm.ravel(), 1e-6 / layer.thickness_mm)
     top = _waves(layer, q, layer.thickness_mm)
@@ -79,12 +95,13 @@ def inner_displacement(
     shear = top.slope_u + q[:, None] * top.w
     conditions = np.stack([bottom.u, bottom.w, normal, shear], axis=1)
     load = np.zeros((q.size, 4, 1))
-    load[:, 2] = -1.0
+    load[:, 2] = normal_mpa
+    load[:, 3] = shear_mpa / layer.shear_modulus_mpa
     amplitudes = np.linalg.solve(conditions, load)[:, :, 0]
     inside = _waves(layer, q, height_mm)
-    down = -np.sum(inside.w * amplitudes, axis=1)
+    up = np.sum(inside.w * amplitudes, axis=1)
     along = np.sum(inside.u * amplitudes, axis=1)
-    return down.reshape(shape), along.reshape(shape)
+    return up.reshape(shape), along.reshape(shape)
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,6 +57,12 @@ class Magnet:
         return self.gap_mm - self.thickness_mm / 2
 
     @property
+    def shape(self) -> float:
+        """Jeffery's factor of a spheroid of its aspect a = thickness / diameter: (a^2 - 1)/(a^2 + 1)."""
+        aspect = self.thickness_mm / self.diameter_mm
+        return (aspect**2 - 1) / (aspect**2 + 1)
+
+    @property
     def strength_mt_mm3(self) -> float:
         """Strength k of the far field: on the axis B = 2 k / distance^3."""
         volume_mm3 = np.pi / 4 * self.diameter_mm**2 * self.thickness_mm

@@ -1,10 +1,11 @@
-"""The simulated skin: pressure on the pad to counts of the taxels, zeroed and clean.
+"""The simulated skin: pressure and traction on the pad to counts of the taxels, zeroed and clean.
 
-Under each taxel a magnet sits in the pad, and a Hall chip on the board below it. Pressure moves and tilts the
+Under each taxel a magnet sits in the pad, and a Hall chip on the board below it. Loads move and tilt the
 magnets with the material around them, in proportion (the pad is linear); the field at the chips follows, and is not in
 proportion. One factor, counts per mT, the same on all axes, is set by the data sheet's newtons per count.
 """
 
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import SensorGeometry
 from train.layer import Layer, inner_displacement
 from train.magnets import MOVEMENT, Magnet, MagnetArray
+from train.physics.magnet_response import traction_response
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
 IN_PLANE_SHARE: Final = 0.4
@@ -34,6 +36,7 @@ class Skin:
         cell_mm: their size, in [mm].
         magnet: of every taxel.
         field: how the magnets' field is worked out, a name in train.magnets.FIELDS.
+        self._pad = (geometry, layer, size, cell_mm, magnet)
         in_plane_share: factor on the magnets' in-plane movement.
         rest: where each magnet sits and how it leans, see train.magnets.MagnetArray.
         moments: of each magnet, see train.magnets.MagnetArray.
@@ -67,6 +70,7 @@ class Skin:
             )
         self.geometry = geometry
         self.size = size
+        self._pad = (geometry, layer, size, cell_mm, magnet)
         self._magnets = MagnetArray(geometry, magnet, field, rest, moments)
         response = _magnet_response(geometry, layer, size, cell_mm, magnet)
         response[:, :2] *= in_plane_share
@@ -76,25 +80,49 @@ class Skin:
         z_sum_mt = self._magnets.change_mt(self.movement(even_mpa))[:, 2].sum()
         self.counts_per_mt = float(_CALIBRATION_N * counts_per_newton / z_sum_mt)
 
-    def movement(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.floating]:
-        """How pressures (..., size, size) in [MPa] move the magnets: (..., taxels, 5), train.magnets.MOVEMENT.
+    @cached_property
+    def _traction_response(self) -> NDArray[np.float32]:
+        """MOVEMENT per traction to the right and back in each cell, (taxels, 5, 2, cells); for who has tractions."""
+        return traction_response(*self._pad).astype(np.float32)
+
+    def movement(
+        self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
+    ) -> NDArray[np.floating]:
+        """How loads on the pad move the magnets: (..., taxels, 5), train.magnets.MOVEMENT.
+
+        Args:
+            pressure_mpa: (..., size, size), in [MPa].
+            traction_mpa: on the pad's surface, to the right and back, (..., 2, size, size), in [MPa]; none if None.
 
         Raises:
-            ValueError: the pressures are on another grid.
+            ValueError: the pressures are on another grid, or the tractions are not those of the pressures.
         """
         if pressure_mpa.shape[-2:] != (self.size, self.size):
             raise ValueError(f"pressures of shape {pressure_mpa.shape}, expected (..., {self.size}, {self.size})")
-        lead = pressure_mpa.shape[:-2]
-        moved = pressure_mpa.reshape(-1, self.size**2) @ self._response.reshape(-1, self.size**2).T
+        lead, cells = pressure_mpa.shape[:-2], self.size**2
+        moved = pressure_mpa.reshape(-1, cells) @ self._response.reshape(-1, cells).T
+        if traction_mpa is not None:
+            if traction_mpa.shape != (*lead, 2, self.size, self.size):
+                raise ValueError(
+                    f"tractions of shape {traction_mpa.shape} with pressures of shape {pressure_mpa.shape}, expected "
+                    f"{(*lead, 2, self.size, self.size)}: two for every pressure, to the right and back"
+                )
+            moved += traction_mpa.reshape(-1, 2 * cells) @ self._traction_response.reshape(-1, 2 * cells).T
         return moved.reshape(*lead, *self._response.shape[:2])
 
-    def frames(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Readings (n, F, 3, rows, cols) in counts, zeroed and clean, of pressures (n, F, size, size) in [MPa].
+    def frames(
+        self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
+    ) -> NDArray[np.float32]:
+        """Readings (n, F, 3, rows, cols) in counts, zeroed and clean, of loads on the pad.
+
+        Args:
+            pressure_mpa: (n, F, size, size), in [MPa].
+            traction_mpa: on the pad's surface, to the right and back, (n, F, 2, size, size), in [MPa]; none if None.
 
         Raises:
-            ValueError: the pressures are on another grid, or press a magnet through its chip.
+            ValueError: loads are on another grid, or press a magnet through its chip.
         """
-        return self._counts(self.movement(pressure_mpa))
+        return self._counts(self.movement(pressure_mpa, traction_mpa))
 
     def flat_frames(
         self, unit_pressure_mpa: NDArray[np.floating], indentation_mm: NDArray[np.floating]
@@ -144,8 +172,7 @@ def _magnet_response(
     down, along = inner_displacement(layer, q, magnet.height_mm)
     along_above = inner_displacement(layer, q, magnet.height_mm + _SLOPE_STEP_MM)[1]
     along_below = inner_displacement(layer, q, magnet.height_mm - _SLOPE_STEP_MM)[1]
-    aspect = magnet.thickness_mm / magnet.diameter_mm
-    shape = (aspect**2 - 1) / (aspect**2 + 1)
+    shape = magnet.shape
     lean = (1 + shape) / 2 * (along_above - along_below) / (2 * _SLOPE_STEP_MM) + (1 - shape) / 2 * q * down
     turn_along, turn_lean = (
         np.divide(1j * part, q, out=np.zeros_like(q, dtype=complex), where=q > 0) for part in (along, lean)

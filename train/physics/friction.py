@@ -1,0 +1,231 @@
+"""Friction between a rigid surface and the pad: where the contact sticks, where it slips, at what traction.
+
+Given are the pressure and how far the surface has slid and turned since it came down. A cell in contact sticks, and
+moves with the surface, or slips, and bears the traction mu p against its slip (Coulomb; Cattaneo 1938 and Mindlin
+1949 for spheres). One step of monotone loading: pressure first, then slide and twist together, with no memory.
+
+That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's
+compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
+2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.contact.
+
+What traction does to pressure is left out (Goodman 1962). That is exact in the limit of a thick layer of nu = 0.5; a
+bonded layer's surface rises before a slide and sinks behind it, by a quarter of the slide at most at nu = .45, and the
+pressure under a wide contact would lean by some tens of per cent. Slopes of the surface are taken as small.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from train.contact import box_sides, boxes, period_cells
+from train.layer import Layer
+from train.physics.tangential_layer import surface_tensor
+
+_MAX_STEPS: Final = 60
+_REMEMBERED: Final = 4
+"""Energies back that a step may not exceed: this method is fast because it does not fall at every step."""
+_STICKS: Final = 1 - 1e-4
+"""Share of mu p below which a cell sticks."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrictionResult:
+    """Tractions of a batch of poses.
+
+    Attributes:
+        traction_mpa: on the pad, to the right and back, (n, 2, size, size), in [MPa].
+        stick: (n, size, size), the cells in contact that do not slip.
+        residual: (n,) root mean square, over the contact, of the movement that cells are short of sticking or of
+            slipping against their traction, as a share of the surface's movement.
+        force_n: (n, 2), to the right and back, in [N].
+        moment_nmm: (n,), about the pad's centre, from right to back, in [N mm].
+        steps: of the slowest pose.
+    """
+
+    traction_mpa: NDArray[np.float32]
+    stick: NDArray[np.bool_]
+    residual: NDArray[np.float32]
+    force_n: NDArray[np.float64]
+    moment_nmm: NDArray[np.float64]
+    steps: int
+
+
+class FrictionSolver:
+    """Solves poses on a square grid over one pad.
+
+    Args:
+        layer: the pad.
+        size: cells along a side.
+        cell_mm: their size, in [mm].
+        dtype: torch.float32 or torch.float64.
+        boxed: work on boxes; else on the whole pad, for comparison.
+    """
+
+    def __init__(
+        self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32, boxed: bool = True
+    ) -> None:
+        self.size = size
+        self.cell_mm = cell_mm
+        self._dtype = dtype
+        self._sides = [*(box_sides(size) if boxed else ()), size]
+        self._kernels = _kernels(layer, period_cells(layer, size, cell_mm), cell_mm)
+        self._spectra: dict[tuple[int, int], torch.Tensor] = {}
+
+    def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Surface displacement to the right and back, (n, 2, size, size) in [mm], under tractions of that shape."""
+        return self._displace(torch.as_tensor(traction_mpa, dtype=self._dtype)).numpy().astype(np.float32)
+
+    def solve(
+        self,
+        pressure_mpa: NDArray[np.floating],
+        slide_mm: NDArray[np.floating],
+        twist_rad: NDArray[np.floating],
+        friction: NDArray[np.floating],
+        tolerance: float = 1e-3,
+    ) -> FrictionResult:
+        """Slide and turn surfaces that touch with the given pressures.
+
+        Args:
+            pressure_mpa: (n, size, size), in contact where it is above 0, in [MPa].
+            slide_mm: (n, 2), of the surface to the right and back, in [mm].
+            twist_rad: (n,), of the surface about the pad's centre, from right to back.
+            friction: (n,), coefficients mu, >= 0.
+            tolerance: residual at which a pose is done.
+
+        Raises:
+            ValueError: shapes or values do not fit.
+        """
+        self._check(pressure_mpa, slide_mm, twist_rad, friction)
+        count = len(pressure_mpa)
+        along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
+        moved_mm = np.empty((count, 2, self.size, self.size))
+        moved_mm[:, 0] = slide_mm[:, 0, None, None] - twist_rad[:, None, None] * along_mm[:, None]
+        moved_mm[:, 1] = slide_mm[:, 1, None, None] + twist_rad[:, None, None] * along_mm
+        limit_mpa = np.maximum(pressure_mpa, 0) * friction[:, None, None]
+        traction_mpa = np.zeros((count, 2, self.size, self.size), dtype=np.float32)
+        residual = np.zeros(count, dtype=np.float32)
+        steps = 0
+        bears = (limit_mpa > 0).any(axis=(1, 2))  # else there is nothing to solve
+        working = np.flatnonzero(bears)
+        for (height, width), rows, top, left in boxes(limit_mpa[working] > 0, self._sides) if len(working) else ():
+            poses = working[rows]
+            down = (top[:, None] + np.arange(height))[:, :, None]
+            across = (left[:, None] + np.arange(width))[:, None, :]
+            in_box = (poses[:, None, None, None], np.arange(2)[:, None, None], down[:, None], across[:, None])
+            found, error, taken = self._projected_gradients(
+                torch.as_tensor(limit_mpa[poses[:, None, None], down, across], dtype=self._dtype)[:, None],
+                torch.as_tensor(moved_mm[in_box], dtype=self._dtype),
+                tolerance,
+            )
+            traction_mpa[in_box] = found.numpy()
+            residual[poses] = error.numpy()
+            steps = max(steps, taken)
+        size = np.hypot(traction_mpa[:, 0], traction_mpa[:, 1])
+        stick = (limit_mpa > 0) & (size < _STICKS * limit_mpa)
+        area = self.cell_mm**2
+        force_n = traction_mpa.sum(axis=(2, 3), dtype=np.float64) * area
+        turning = along_mm * traction_mpa[:, 1] - along_mm[:, None] * traction_mpa[:, 0]
+        return FrictionResult(traction_mpa, stick, residual, force_n, turning.sum(axis=(1, 2)) * area, steps)
+
+    def _check(
+        self,
+        pressure_mpa: NDArray[np.floating],
+        slide_mm: NDArray[np.floating],
+        twist_rad: NDArray[np.floating],
+        friction: NDArray[np.floating],
+    ) -> None:
+        count = len(pressure_mpa)
+        found = (pressure_mpa.shape, np.shape(slide_mm), np.shape(twist_rad), np.shape(friction))
+        expected = ((count, self.size, self.size), (count, 2), (count,), (count,))
+        if found != expected:
+            raise ValueError(f"pressure, slide, twist and friction of shapes {found}, expected {expected}")
+        if not (np.asarray(friction) >= 0).all():
+            raise ValueError(f"friction is {np.min(friction)}, expected 0 or more")
+        for name, given in (("pressure", pressure_mpa), ("slide", slide_mm), ("twist", twist_rad)):
+            if not np.isfinite(given).all():
+                raise ValueError(f"a {name} is not finite, expected numbers")
+
+    def _projected_gradients(
+        self, limit: torch.Tensor, moved: torch.Tensor, tolerance: float
+    ) -> tuple[torch.Tensor, torch.Tensor, int]:
+        """Tractions (n, 2, height, width), residuals and steps, of limits (n, 1, height, width) and movements."""
+        touching = limit > 0
+        wanted = torch.where(touching, moved, 0.0)
+        cells = touching.sum(dim=(1, 2, 3)).clamp_min(1)
+        scale = torch.sqrt(_dot(wanted, wanted)[:, 0, 0, 0] / cells).clamp_min(1e-30)
+        cell = float(self._kernels[0, 0, 0])  # [mm/MPa]: how far a cell gives way to its own traction
+        # As if the contact moved as one: what an even traction moves is about g, then.
+        response = self._displace(wanted)
+        length = _dot(wanted, wanted) / _dot(wanted, response).clamp_min(1e-30)
+        traction = _project(length * wanted, limit)
+        slip = torch.where(touching, self._displace(traction) - wanted, 0.0)
+        result, residual = traction.clone(), torch.zeros(len(traction), dtype=self._dtype)
+        working = torch.arange(len(traction))
+        energies = (_dot(traction, slip - wanted) / 2).expand(-1, _REMEMBERED, 1, 1).clone()
+        steps = 0
+        while True:
+            short = cell * (traction - _project(traction - slip / cell, limit))
+            error = torch.sqrt(_dot(short, short)[:, 0, 0, 0] / cells) / scale
+            done = error < tolerance
+            if steps == _MAX_STEPS:
+                done[:] = True
+            if bool(done.any()):
+                result[working[done]], residual[working[done]] = traction[done], error[done]
+                if bool(done.all()):
+                    break
+                more = ~done
+                working, limit, touching, wanted = working[more], limit[more], touching[more], wanted[more]
+                cells, scale, traction, slip = cells[more], scale[more], traction[more], slip[more]
+                length, energies = length[more], energies[more]
+            steps += 1
+            direction = _project(traction - length * slip, limit) - traction
+            response = torch.where(touching, self._displace(direction), 0.0)
+            curve = _dot(direction, response).clamp_min(1e-30)
+            descent = _dot(direction, slip)
+            before = _dot(traction, slip - wanted) / 2
+            whole = before + descent + curve / 2
+            # A whole step, unless it climbs above all of the last energies: then the best one on its way.
+            share = torch.where(whole <= energies.amax(dim=1, keepdim=True), 1.0, (-descent / curve).clamp(0.0, 1.0))
+            traction = traction + share * direction
+            slip = slip + share * response
+            energies[:, steps % _REMEMBERED] = (before + share * descent + share**2 * curve / 2)[:, 0]
+            length = _dot(direction, direction) / curve
+        return result, residual, steps
+
+    def _displace(self, traction: torch.Tensor) -> torch.Tensor:
+        """Displacement within boxes (n, 2, height, width) under tractions in them."""
+        height, width = traction.shape[2:]
+        padded = (2 * height, 2 * width)
+        if (height, width) not in self._spectra:
+            rows, columns = (np.fft.ifftshift(np.arange(-side, side)) for side in (height, width))
+            kernels = torch.as_tensor(self._kernels[:, rows[:, None], columns], dtype=self._dtype)
+            # Even, or odd in both axes: their transforms are real.
+            self._spectra[height, width] = torch.fft.rfft2(kernels).real
+        xx, yy, xy = self._spectra[height, width]
+        wave = torch.fft.rfft2(traction, s=padded)
+        right, back = wave[:, 0], wave[:, 1]
+        moved = torch.stack([xx * right + xy * back, xy * right + yy * back], dim=1)
+        return torch.fft.irfft2(moved, s=padded)[:, :, :height, :width]
+
+
+def _kernels(layer: Layer, period: int, cell_mm: float) -> NDArray[np.float64]:
+    """Displacement around one cell under its traction, (3, period, period) in [mm/MPa]: xx, yy and xy."""
+    q_x = 2 * np.pi * np.fft.rfftfreq(period, cell_mm)[None, :]
+    q_y = 2 * np.pi * np.fft.fftfreq(period, cell_mm)[:, None]
+    xx, yy, xy = surface_tensor(layer, q_x, q_y)
+    # The highest wave is its own mirror image: an odd transfer has none of it.
+    xy[period // 2] = xy[:, -1] = 0.0
+    return np.fft.irfft2(np.stack([xx, yy, xy]), s=(period, period))
+
+
+def _project(traction: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:
+    """The nearest tractions that friction can bear."""
+    size = torch.sqrt(traction[:, :1] ** 2 + traction[:, 1:] ** 2)
+    return traction * (limit / torch.maximum(size, limit).clamp_min(1e-30))
+
+
+def _dot(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    return (one * other).sum(dim=(1, 2, 3), keepdim=True)

@@ -1,0 +1,93 @@
+"""How tangential traction on the pad's surface moves its magnets: Fourier sums, straight at the magnets' places.
+
+As train.skin does for pressure, on a domain four pads wide. A transfer is even or odd in each axis, so that a quarter
+of its waves, with real sines and cosines, stands for all: a tenth of the products of whole complex waves.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.geometry import SensorGeometry
+from train.layer import Layer
+from train.magnets import MOVEMENT, Magnet
+from train.physics.tangential_layer import inner_tangential
+
+_PADS_WIDE: Final = 4
+_SLOPE_STEP_MM: Final = 1e-3
+
+_EVEN: Final = 0
+_ODD: Final = 1
+
+_Array = NDArray[np.float64]
+_Transfer = tuple[int, int, _Array]
+"""Whether it is even or odd in x and in y, and the amplitudes (q_y, q_x) of its quarter of waves."""
+
+
+def traction_response(
+    geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet
+) -> NDArray[np.float64]:
+    """MOVEMENT of each magnet per tangential traction in each cell, (taxels, 5, 2, cells) in [mm/MPa] and [1/MPa].
+
+    The third axis is the traction's: to the right, back.
+
+    Args:
+        geometry: the taxels.
+        layer: the pad.
+        size: cells along a side of the grid of tractions.
+        cell_mm: their size, in [mm].
+        magnet: of every taxel.
+    """
+    q_x, q_y, q = _quarter(size, cell_mm)
+    here = inner_tangential(layer, q, magnet.height_mm)
+    above = inner_tangential(layer, q, magnet.height_mm + _SLOPE_STEP_MM)
+    below = inner_tangential(layer, q, magnet.height_mm - _SLOPE_STEP_MM)
+    bend, turn = (1 + magnet.shape) / 2, (1 - magnet.shape) / 2
+    lean_along = bend * (above.along - below.along) / (2 * _SLOPE_STEP_MM) - turn * q * here.sunk
+    lean_across = bend * (above.across - below.across) / (2 * _SLOPE_STEP_MM)
+    # u_i = across t_i + (along - across) q_i q_j / q^2 t_j, and the lean likewise.
+    move = _per_wave(_per_wave(here.along - here.across, q), q)
+    lean = _per_wave(_per_wave(lean_along - lean_across, q), q)
+    sunk = _per_wave(here.sunk, q)
+    under_right = (
+        (_EVEN, _EVEN, here.across + move * q_x**2),
+        (_ODD, _ODD, -move * q_x * q_y),
+        (_ODD, _EVEN, -sunk * q_x),
+        (_EVEN, _EVEN, lean_across + lean * q_x**2),
+        (_ODD, _ODD, -lean * q_x * q_y),
+    )
+    # Under traction back the same, with x and y changed over.
+    changed = [(y, x, amplitude.T) for x, y, amplitude in under_right]
+    under_back = (changed[1], changed[0], changed[2], changed[4], changed[3])
+    both = [transfer for pair in zip(under_right, under_back, strict=True) for transfer in pair]
+    response = _sums(geometry, size, cell_mm, both)
+    return response.reshape(len(response), len(MOVEMENT), 2, size * size)
+
+
+def _quarter(size: int, cell_mm: float) -> tuple[_Array, _Array, _Array]:
+    """Wave numbers 0 to the highest: to the right (1, m), back (m, 1), and their length (m, m), in [1/mm]."""
+    q = 2 * np.pi * np.fft.rfftfreq(_PADS_WIDE * size, cell_mm)
+    return q[None, :], q[:, None], np.hypot(q[None, :], q[:, None])
+
+
+def _per_wave(part: _Array, q: _Array) -> _Array:
+    """Its share per wave number, 0 for the wave that is even and has no direction."""
+    return np.divide(part, q, out=np.zeros_like(part), where=q > 0)
+
+
+def _sums(geometry: SensorGeometry, size: int, cell_mm: float, transfers: list[_Transfer]) -> _Array:
+    """Responses (taxels, transfers, cells) of the magnets to the cells."""
+    q = _quarter(size, cell_mm)[1]
+    # All waves but the first and the last of an axis stand for two, of q and of -q.
+    twice = np.full_like(q, 2.0)
+    twice[[0, -1]] = 1.0
+    cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+    response = np.empty((geometry.taxel_count, len(transfers), size * size))
+    for taxel, (x_mm, y_mm) in enumerate(geometry.taxel_centres_mm()):
+        waves_x, waves_y = (
+            [twice * wave(q * (place_mm - cells_mm)) for wave in (np.cos, np.sin)] for place_mm in (x_mm, y_mm)
+        )  # each (waves, size), even and odd
+        for row, (in_x, in_y, amplitude) in enumerate(transfers):
+            response[taxel, row] = (waves_y[in_y].T @ amplitude @ waves_x[in_x]).ravel()
+    return response / (_PADS_WIDE * size) ** 2
