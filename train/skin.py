@@ -36,8 +36,7 @@ class Skin:
         cell_mm: their size, in [mm].
         magnet: of every taxel.
         field: how the magnets' field is worked out, a name in train.magnets.FIELDS.
-        self._pad = (geometry, layer, size, cell_mm, magnet)
-        in_plane_share: factor on the magnets' in-plane movement.
+        in_plane_share: factor on the magnets' in-plane movement under pressure; tractions keep all of theirs.
         rest: where each magnet sits and how it leans, see train.magnets.MagnetArray.
         moments: of each magnet, see train.magnets.MagnetArray.
         counts_per_newton: of the sum of z under an even load.
