@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from train.data.batch import Batch
 from train.dataset import Sequences, quarter_turns, windows
 from train.nuisances import Nuisances
 from train.surfaces import is_random_figure
@@ -57,10 +58,10 @@ class WindowBatches:
         self._seed = seed
         self._streams = _streams(sequences.surfaces, draw, seed)
 
-    def __call__(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Windows (batch, 3K, rows, cols) in network units and patterns (batch, H, W) in [mm]."""
+    def __call__(self, number: int) -> Batch:
+        """The batch of a number; nothing is known of its pads."""
         readings, patterns = self.draw(number)
-        return network_input(readings), torch.from_numpy(patterns)
+        return Batch(network_input(readings), torch.from_numpy(patterns))
 
     def draw(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Windows (batch, K, 3, rows, cols) in zeroed counts and patterns (batch, H, W) in [mm]."""

@@ -28,11 +28,12 @@ from torch.utils.tensorboard import SummaryWriter
 
 from edge.progress import Progress
 from train.ahead import drawn_ahead
+from train.data.batch import Batch
 from train.errors import TrainError
 from train.networks.blocks import PatternNet
 
-Batches = Callable[[int], tuple[Tensor, Tensor]]
-"""Windows (batch, 3K, rows, cols) and patterns (batch, H, W) of a batch number; one number is always one batch."""
+Batches = Callable[[int], Batch]
+"""The batch of a number; one number is always one batch."""
 Course = list[dict[str, float]]
 """Figures of a network at some steps of its training."""
 
@@ -54,7 +55,7 @@ class DivergedError(TrainError, ArithmeticError):
 class Objective(Protocol):
     """What is made small. One with networks of its own, such as a discriminator, trains and keeps them itself."""
 
-    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
         """The scalar to descend."""
         ...
 
@@ -217,9 +218,9 @@ def train(
             rate = recipe.learning_rate * learning_rate_share(progress)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            window, truth = (part[rank::world].to(device) for part in next(drawn))
+            batch = next(drawn).share(rank, world, device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
-                descended = objective.loss(parallel, window, truth)
+                descended = objective.loss(parallel, batch)
             optimizer.zero_grad()
             descended.backward()
             norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))

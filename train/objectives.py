@@ -4,6 +4,8 @@ from typing import Any, Final
 
 from torch import Tensor, nn
 
+from train.data.batch import Batch
+
 _LEAST_TRUTH_MM: Final = 1e-4
 """RMS below which a truth counts as this large: a micrometre's contact is no contact."""
 
@@ -21,9 +23,9 @@ def truth_size(truth: Tensor) -> Tensor:
 class RelativeError:
     """Objective of a network that gives a pattern alone."""
 
-    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
         """Relative error of the patterns."""
-        return relative_error(net(window).float(), truth)
+        return relative_error(net(batch.window).float(), batch.pattern)
 
     def after_step(self) -> None:
         """Nothing of its own to train."""

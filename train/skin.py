@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import SensorGeometry
-from train.layer import Layer, inner_displacement
+from train.layer import Layer
 from train.magnets import MOVEMENT, Magnet, MagnetArray
-from train.physics.magnet_response import traction_response
+from train.physics.magnet_response import pressure_response, traction_response
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
 IN_PLANE_SHARE: Final = 0.4
@@ -23,7 +23,6 @@ from under a figure that in truth holds it. Recordings of grips show an in-plane
 this factor the simulated one is .57."""
 
 _CALIBRATION_N: Final = 1.0
-_SLOPE_STEP_MM: Final = 1e-3
 
 
 class Skin:
@@ -71,7 +70,7 @@ class Skin:
         self.size = size
         self._pad = (geometry, layer, size, cell_mm, magnet)
         self._magnets = MagnetArray(geometry, magnet, field, rest, moments)
-        response = _magnet_response(geometry, layer, size, cell_mm, magnet)
+        response = pressure_response(geometry, layer, size, cell_mm, magnet)
         response[:, :2] *= in_plane_share
         self._response = response.astype(np.float32)
         # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.
@@ -149,39 +148,3 @@ class Skin:
             changed = self._magnets.change_mt(moved) * moved.dtype.type(self.counts_per_mt)
             tap[:] = changed.swapaxes(1, 2).reshape(tap.shape)
         return counts
-
-
-def _magnet_response(
-    geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet
-) -> NDArray[np.float64]:
-    """MOVEMENT of each magnet per pressure in each cell, (taxels, 5, cells) in [mm/MPa] and [1/MPa].
-
-    By Fourier sums over a domain four pads wide, straight at the magnets' places, which lie between cells.
-
-    The magnet is stiff and turns with the pad around it as a spheroid of its aspect a = thickness / diameter does:
-    its axis leans by (1 + L)/2 du_x/dz - (1 - L)/2 du_z/dx, L = (a^2 - 1)/(a^2 + 1). A flat disc (L = -1) follows the
-    slope of its plane, a sphere (L = 0) half the curl, a needle (L = 1) the material along it.
-
-    Source: Jeffery 1922, the turning of a spheroid in Stokes flow, whose equations an incompressible solid shares.
-    """
-    padded = 4 * size
-    q_x = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)[None, :]
-    q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)[:, None]
-    q = np.hypot(q_x, q_y)
-    down, along = inner_displacement(layer, q, magnet.height_mm)
-    along_above = inner_displacement(layer, q, magnet.height_mm + _SLOPE_STEP_MM)[1]
-    along_below = inner_displacement(layer, q, magnet.height_mm - _SLOPE_STEP_MM)[1]
-    shape = magnet.shape
-    lean = (1 + shape) / 2 * (along_above - along_below) / (2 * _SLOPE_STEP_MM) + (1 - shape) / 2 * q * down
-    turn_along, turn_lean = (
-        np.divide(1j * part, q, out=np.zeros_like(q, dtype=complex), where=q > 0) for part in (along, lean)
-    )
-    transfers = (turn_along * q_x, turn_along * q_y, down, turn_lean * q_x, turn_lean * q_y)
-    cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
-    response = np.empty((geometry.taxel_count, len(MOVEMENT), size * size))
-    for taxel, (x_mm, y_mm) in enumerate(geometry.taxel_centres_mm()):
-        wave_x = np.exp(1j * q_x.T * (x_mm - cells_mm))  # (padded, size)
-        wave_y = np.exp(1j * q_y * (y_mm - cells_mm))  # (padded, size)
-        for axis, transfer in enumerate(transfers):
-            response[taxel, axis] = (wave_y.T @ transfer @ wave_x).real.ravel() / padded**2
-    return response

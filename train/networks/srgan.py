@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from train.networks.srcnn import TactileSRCNN
+from train.data.batch import Batch
 from train.objectives import relative_error, truth_size
 
 _CHANNELS: Final = (32, 64, 128)
@@ -75,9 +76,9 @@ class SrganObjective:
         self._rng = torch.Generator().manual_seed(seed)
         self._seen: tuple[Tensor, Tensor] | None = None
 
-    def loss(self, net: nn.Module, window: Tensor, truth: Tensor) -> Tensor:
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
         """Relative error, less a share of what the discriminator thinks of the patterns."""
-        patterns = net(window).float()
+        patterns, truth = net(batch.window).float(), batch.pattern
         size = truth_size(truth)
         self._seen = (patterns.detach() / size, truth / size)
         self.critic.requires_grad_(False)

@@ -1,7 +1,12 @@
-"""How tangential traction on the pad's surface moves its magnets: Fourier sums, straight at the magnets' places.
+"""Response of the magnets to pressure and traction on the pad's surface: Fourier sums, straight at the magnets' places.
 
-As train.skin does for pressure, on a domain four pads wide. A transfer is even or odd in each axis, so that a quarter
+The domain is four pads wide, and magnets lie between cells. A magnet is stiff and turns with the pad around it as a
+spheroid of its aspect a = thickness / diameter does: its axis leans by (1 + L)/2 du_x/dz - (1 - L)/2 du_z/dx, with
+L = (a^2 - 1)/(a^2 + 1). A flat disc (L = -1) follows the slope of its plane, a sphere (L = 0) half the curl, a needle
+(L = 1) the material along it. A transfer is even or odd in each axis, so that a quarter
 of its waves, with real sines and cosines, stands for all: a tenth of the products of whole complex waves.
+
+Source: Jeffery 1922, the turning of a spheroid in Stokes flow, whose equations an incompressible solid shares.
 """
 
 from typing import Final
@@ -10,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import SensorGeometry
-from train.layer import Layer
+from train.layer import Layer, inner_displacement
 from train.magnets import MOVEMENT, Magnet
 from train.physics.tangential_layer import inner_tangential
 
@@ -23,6 +28,34 @@ _ODD: Final = 1
 _Array = NDArray[np.float64]
 _Transfer = tuple[int, int, _Array]
 """Whether it is even or odd in x and in y, and the amplitudes (q_y, q_x) of its quarter of waves."""
+
+
+def pressure_response(
+    geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet
+) -> NDArray[np.float64]:
+    """MOVEMENT of each magnet per pressure in each cell, (taxels, 5, cells) in [mm/MPa] and [1/MPa].
+
+    Args:
+        geometry: the taxels.
+        layer: the pad.
+        size: cells along a side of the grid of pressures.
+        cell_mm: their size, in [mm].
+        magnet: of every taxel.
+    """
+    q_x, q_y, q = _quarter(size, cell_mm)
+    down, along = inner_displacement(layer, q, magnet.height_mm)
+    above = inner_displacement(layer, q, magnet.height_mm + _SLOPE_STEP_MM)[1]
+    below = inner_displacement(layer, q, magnet.height_mm - _SLOPE_STEP_MM)[1]
+    lean = (1 + magnet.shape) / 2 * (above - below) / (2 * _SLOPE_STEP_MM) + (1 - magnet.shape) / 2 * q * down
+    move, lean = _per_wave(along, q), _per_wave(lean, q)
+    transfers: list[_Transfer] = [
+        (_ODD, _EVEN, -move * q_x),
+        (_EVEN, _ODD, -move * q_y),
+        (_EVEN, _EVEN, down),
+        (_ODD, _EVEN, -lean * q_x),
+        (_EVEN, _ODD, -lean * q_y),
+    ]
+    return _sums(geometry, size, cell_mm, transfers)
 
 
 def traction_response(
@@ -78,16 +111,21 @@ def _per_wave(part: _Array, q: _Array) -> _Array:
 
 def _sums(geometry: SensorGeometry, size: int, cell_mm: float, transfers: list[_Transfer]) -> _Array:
     """Responses (taxels, transfers, cells) of the magnets to the cells."""
-    q = _quarter(size, cell_mm)[1]
+    q = _quarter(size, cell_mm)[0][0]
     # All waves but the first and the last of an axis stand for two, of q and of -q.
     twice = np.full_like(q, 2.0)
     twice[[0, -1]] = 1.0
     cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+    centres_mm = geometry.taxel_centres_mm().reshape(geometry.rows, geometry.cols, 2)
+    waves_x, waves_y = (
+        [
+            twice[:, None] * wave(q[:, None] * (places_mm[:, None] - cells_mm).reshape(1, -1))
+            for wave in (np.cos, np.sin)
+        ]
+        for places_mm in (centres_mm[0, :, 0], centres_mm[:, 0, 1])
+    )  # each (waves, columns or rows of taxels times cells), even and odd
     response = np.empty((geometry.taxel_count, len(transfers), size * size))
-    for taxel, (x_mm, y_mm) in enumerate(geometry.taxel_centres_mm()):
-        waves_x, waves_y = (
-            [twice * wave(q * (place_mm - cells_mm)) for wave in (np.cos, np.sin)] for place_mm in (x_mm, y_mm)
-        )  # each (waves, size), even and odd
-        for row, (in_x, in_y, amplitude) in enumerate(transfers):
-            response[taxel, row] = (waves_y[in_y].T @ amplitude @ waves_x[in_x]).ravel()
+    for row, (in_x, in_y, amplitude) in enumerate(transfers):
+        sums = (waves_y[in_y].T @ amplitude @ waves_x[in_x]).reshape(geometry.rows, size, geometry.cols, size)
+        response[:, row] = sums.swapaxes(1, 2).reshape(geometry.taxel_count, -1)
     return response / (_PADS_WIDE * size) ** 2

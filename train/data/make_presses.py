@@ -1,0 +1,132 @@
+"""Make a set of presses on all cores; a run that was cut short goes on where it was.
+
+    python -m train.data.make_presses data/gripped.npz --count 24000
+    python -m train.data.make_presses data/parts.npz --mesh part.stl --count 2000
+
+Every pad's presses are solved by one of joblib's workers and written beside the file as they come, in
+`data/gripped.npz.parts`; at the end they are joined and removed.
+"""
+
+import argparse
+import os
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import joblib
+
+from edge.progress import Progress
+from train.data.presses import PressSet, join_presses, load_presses
+from train.data.world import World, solve_pad
+from train.errors import DatasetError, TrainError
+from train.families.catalogue import FIGURES, SHARES
+
+_INTERRUPTED: Final = 130
+_AT_ONCE: Final = 16
+
+
+def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
+    """Solve what a world asks for, and write it; called again after a kill, go on.
+
+    Raises:
+        DatasetError: what lies at `path` or beside it was made otherwise, or cannot be written.
+        SurfaceError: a family's name means nothing.
+        MeshError: a user's mesh cannot be used.
+    """
+    facts = world.facts()
+    if path.exists():
+        if (there := load_presses(path)).config != facts:
+            raise DatasetError(f"{path} is there and was made otherwise: delete it, or write to another file")
+        return there
+    folder = path.with_name(path.name + ".parts")
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [number for number in range(world.chunks) if not _part(folder, number).exists()]
+    with Progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
+        pool = joblib.Parallel(n_jobs=jobs)
+        for start in range(0, len(missing), _AT_ONCE):
+            numbers = missing[start : start + _AT_ONCE]
+            for number, part in zip(numbers, pool(joblib.delayed(solve_pad)(world, one) for one in numbers), strict=True):
+                replace(part, config=facts).save(_part(folder, number))
+                bar.advance()
+    parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
+    if any(part.config != facts for part in parts):
+        raise DatasetError(f"{folder} holds parts that were made otherwise: delete it")
+    made = replace(join_presses(parts), config=facts)
+    made.save(path, compressed=compressed)
+    shutil.rmtree(folder)
+    return made
+
+
+def _part(folder: Path, number: int) -> Path:
+    return folder / f"{number:06d}.npz"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
+    options = _parser().parse_args(arguments)
+    os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker:UserWarning"
+    started_s = time.monotonic()
+    try:
+        world = _world(options)
+        made = make_presses(world, options.out, options.jobs, compressed=options.compress)
+    except TrainError as error:
+        sys.stderr.write(f"train.data.make_presses: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("train.data.make_presses: interrupted; the same command goes on from here\n")
+        return _INTERRUPTED
+    rate = len(made) * made.taps / (time.monotonic() - started_s)
+    sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
+    return 0
+
+
+def _world(options: argparse.Namespace) -> World:
+    families = dict(SHARES)
+    if options.families == "figures":
+        families = {name: SHARES[name] for name in FIGURES}
+    elif options.families == "even":
+        families = dict.fromkeys(SHARES, 1.0)
+    elif options.families != "all":
+        names = [name for name in options.families.split(",") if name != "none"]
+        families = {name: SHARES.get(name, 1.0) for name in names}
+    families |= {f"mesh:{path.resolve()}": options.mesh_share for path in options.mesh}
+    return World(
+        count=options.count,
+        taps=options.taps,
+        per_pad=options.per_pad,
+        families=families,
+        spread=options.spread,
+        seed=options.seed,
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m train.data.make_presses", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("out", type=Path, metavar="OUT.npz")
+    parser.add_argument("--count", type=int, default=24_000, help="sequences (24000)")
+    parser.add_argument("--taps", type=int, default=1, help="presses in each, turned by 5 degrees (1)")
+    parser.add_argument("--per-pad", type=int, default=24, help="sequences of one pad (24)")
+    parser.add_argument(
+        "--families",
+        default="all",
+        help=f"all; even, as many of each; figures; none; or names with commas: {', '.join(SHARES)} (all)",
+    )
+    parser.add_argument(
+        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="an STL, OBJ or PLY to add"
+    )
+    parser.add_argument("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 110 (20)")
+    parser.add_argument("--spread", type=float, default=1.0, help="of the pads' constants; 0: the nominal pad (1)")
+    parser.add_argument("--seed", type=int, default=1, help="of pads, shapes and drags (1)")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes, -1 for one on each core (-1)")
+    parser.add_argument("--compress", action="store_true", help="a smaller file, slower to write")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,176 @@
+"""Presses to learn from and to be evaluated on, each with a pad of its own, as one npz file with a hash."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.npz import read_npz
+from train.errors import DatasetError
+
+SCHEMA: Final = "tactile-edge-sr presses"
+VERSION: Final = 1
+_MOST_FACTS_BYTES: Final = 1 << 22
+_AXES: Final[Mapping[str, tuple[str, str]]] = {
+    "family": ("U", "n"),
+    "pad": ("int64", "n"),
+    "constants": ("float32", "np"),
+    "counts": ("float32", "nk3rc"),
+    "angle_deg": ("float32", "nk"),
+    "patterns": ("float16", "nhw"),
+    "touching": ("bool", "nhw"),
+    "traction_kpa": ("float16", "n3ab"),
+    "force_n": ("float32", "n3"),
+    "twist_nmm": ("float32", "n"),
+    "indentation_mm": ("float32", "n"),
+}
+"""Type and axes of each array; a letter is the same length everywhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class PressSet:
+    """n sequences of K presses, newest first, each at one moment, with the newest one's truth.
+
+    Attributes:
+        family: (n,) names, see train.families.catalogue.
+        pad: (n,), number of the pad within the set.
+        constants: (n, p) of the pads, over their spread, see train.physics.pads.
+        counts: (n, K, 3, rows, cols), zeroed, without nuisances.
+        angle_deg: (n, K), turn of the pad.
+        patterns: (n, H, W) in [mm].
+        touching: (n, H, W).
+        traction_kpa: (n, 3, h, w).
+        force_n: (n, 3).
+        twist_nmm: (n,).
+        indentation_mm: (n,).
+        config: what they were made with, as JSON gives it back.
+    """
+
+    family: NDArray[np.str_]
+    pad: NDArray[np.int64]
+    constants: NDArray[np.float32]
+    counts: NDArray[np.float32]
+    angle_deg: NDArray[np.float32]
+    patterns: NDArray[np.float16]
+    touching: NDArray[np.bool_]
+    traction_kpa: NDArray[np.float16]
+    force_n: NDArray[np.float32]
+    twist_nmm: NDArray[np.float32]
+    indentation_mm: NDArray[np.float32]
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.family)
+
+    @property
+    def taps(self) -> int:
+        """K."""
+        return self.counts.shape[1]
+
+    def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PressSet":
+        """The sequences of the given indices."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _AXES})
+
+    def with_taps(self, taps: int) -> "PressSet":
+        """The same with the newest `taps` taps; those that are not there are absent, all zeros."""
+        more = max(taps - self.taps, 0)
+        counts = np.pad(self.counts[:, :taps], [(0, 0), (0, more), (0, 0), (0, 0), (0, 0)])
+        return replace(self, counts=counts, angle_deg=np.pad(self.angle_deg[:, :taps], [(0, 0), (0, more)]))
+
+    def sha256(self) -> str:
+        """Hash over all that is here, whatever file it lies in."""
+        digest = hashlib.sha256(json.dumps(self.config, sort_keys=True).encode())
+        for name in _AXES:
+            array = np.ascontiguousarray(getattr(self, name))
+            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+            digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
+        return digest.hexdigest()
+
+    def save(self, path: Path, *, compressed: bool = False) -> None:
+        """Write as one npz, whole or not at all.
+
+        Raises:
+            DatasetError: the file cannot be written.
+        """
+        arrays = {name: getattr(self, name) for name in _AXES}
+        arrays["touching"] = np.packbits(self.touching, axis=-1)
+        facts = json.dumps({"config": self.config, "sha256": self.sha256()})
+        draft = path.with_name(path.name + ".draft")
+        write = np.savez_compressed if compressed else np.savez
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with draft.open("wb") as file:
+                write(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
+            draft.replace(path)
+        except OSError as error:
+            draft.unlink(missing_ok=True)
+            raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
+    """Read a file that `PressSet.save` has written.
+
+    Raises:
+        DatasetError: absent, not ours, of a newer schema, incomplete, or damaged.
+    """
+    try:
+        about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
+        if str(about["schema"]) != SCHEMA or int(about["version"]) > VERSION:
+            raise DatasetError(
+                f"{path} is {str(about['schema'])[:60]!r} of version {about['version']}, expected {SCHEMA!r} of at most "
+                f"{VERSION}: make it with 'python -m train.data.make_presses'"
+            )
+        facts: Any = json.loads(str(about["facts"]))
+        arrays = dict(read_npz(path, _AXES, most_bytes))
+        width = arrays["patterns"].shape[-1]
+        arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
+        _check_axes(path, arrays)
+        loaded = PressSet(**arrays, config=facts["config"])
+        hashed = str(facts["sha256"])
+    except FileNotFoundError:
+        raise DatasetError(
+            f"{path}: no such file; make one with 'python -m train.data.make_presses {path}'"
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path} is no file of presses, or a damaged one ({error}): make it again") from error
+    if (found := loaded.sha256()) != hashed:
+        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
+    return loaded
+
+
+def join_presses(parts: Sequence[PressSet]) -> PressSet:
+    """Sequences one after the other, of as many taps as the longest has; pads keep apart.
+
+    Raises:
+        DatasetError: there are none.
+    """
+    if not parts:
+        raise DatasetError("no presses to join: name at least one file")
+    taps = max(part.taps for part in parts)
+    first, pads = 0, []
+    for part in parts:
+        pads.append(part.pad + first)
+        first = int(pads[-1].max()) + 1
+    padded = [part.with_taps(taps) for part in parts]
+    arrays = {name: np.concatenate([getattr(part, name) for part in padded]) for name in _AXES}
+    arrays["pad"] = np.concatenate(pads)
+    return PressSet(**arrays, config={"parts": [part.config for part in parts]} if len(parts) > 1 else parts[0].config)
+
+
+def _check_axes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    lengths = {"3": 3}
+    for name, (kind, axes) in _AXES.items():
+        array = arrays[name]
+        fits = array.ndim == len(axes) and (array.dtype.kind == kind if kind == "U" else array.dtype == kind)
+        if not fits or any(
+            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
+        ):
+            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
+            raise DatasetError(f"{path}: {name} is {array.dtype} {array.shape}, expected {kind} ({expected})")

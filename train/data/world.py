@@ -1,0 +1,124 @@
+"""The world as it is gripped: which pads meet which families of shapes, how deep, and how they are dragged."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from math import ceil
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.data.presses import PressSet
+from train.errors import DatasetError
+from train.families.catalogue import SHARES, Tapped, draw_shape
+from train.generation import one_thread
+from train.nuisances import Nuisances
+from train.physics.gripped import GrippedPad
+from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
+from train.surfaces import surface_mesh
+
+INDENTATION_MM: Final = (0.03, 0.5)
+"""Bounds of the indentation, drawn uniformly; the upper one is what the layer is linear to."""
+_STILL: Final = 0.35
+"""Share of presses without any drag; of the others half are twisted as well."""
+_SLIDE_MM: Final = (0.02, 0.6)
+_TWIST_RAD: Final = 0.03
+_FRICTION: Final = (0.2, 1.2)
+"""Bounds of Coulomb's coefficient: polished steel to rubber on silicone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class World:
+    """All that decides a set of presses.
+
+    Attributes:
+        count: sequences.
+        taps: presses in each, the pad turned by a step from one to the next.
+        per_pad: sequences of one pad.
+        families: relative frequency of each family.
+        spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
+        seed: of everything.
+    """
+
+    count: int = 24_000
+    taps: int = 1
+    per_pad: int = 24
+    families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))
+    spread: float = 1.0
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("count", "taps", "per_pad"):
+            if getattr(self, name) < 1:
+                raise DatasetError(f"{name} is {getattr(self, name)}, expected 1 or more")
+        unknown = [name for name in self.families if name not in SHARES and not name.startswith("mesh:")]
+        if unknown or not self.families:
+            raise DatasetError(f"no family {unknown}: expected some of {', '.join(SHARES)}, or mesh:PATH")
+        if self.seed < 0:
+            raise DatasetError(f"seed is {self.seed}, expected 0 or more")
+        for name in self.families:
+            if name.startswith("mesh:"):
+                surface_mesh(name)  # before any work: the likeliest to fail
+
+    @property
+    def chunks(self) -> int:
+        """Pads, one a chunk."""
+        return ceil(self.count / self.per_pad)
+
+    def facts(self) -> dict[str, Any]:
+        """The configuration as JSON gives it back, with the ranges that pads are drawn from."""
+        ranges = {name: list(bounds) for name, bounds in RANGES.items()}
+        return asdict(self) | {"families": dict(self.families), "ranges": ranges, "inputs": list(INPUTS)}
+
+
+@one_thread()
+def solve_pad(world: World, number: int) -> PressSet:
+    """All sequences of one pad; the same whatever was solved before or beside it."""
+    rng = np.random.default_rng([world.seed, number])
+    pad = draw_pad(rng, world.spread) if world.spread else Pad()
+    gripped = GrippedPad(pad)
+    count = min(world.per_pad, world.count - number * world.per_pad)
+    shares = np.array(list(world.families.values()), dtype=float)
+    # Families come round in turn over the pads, so that a small set has all of them.
+    order = np.random.default_rng([world.seed, 0, 1]).permutation(world.count)[number * world.per_pad :][:count]
+    at = (order + 0.5) / world.count
+    family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
+    error = Nuisances()
+    tapped = [
+        draw_shape(rng, str(name), gripped, world.taps, (error.pose_error_mm, error.pose_error_deg)) for name in family
+    ]
+    return _pressed(rng, gripped, family, tapped, number)
+
+
+def _pressed(
+    rng: np.random.Generator, gripped: GrippedPad, family: NDArray[np.str_], tapped: list[Tapped], number: int
+) -> PressSet:
+    n, taps = len(tapped), len(tapped[0].heights_mm)
+    depth_mm = np.repeat(rng.uniform(*INDENTATION_MM, n), taps)
+    depth_mm[np.arange(n * taps) % taps > 0] *= rng.uniform(0.85, 1.15, n * (taps - 1))  # ends of taps differ
+    dragged = rng.random(n * taps) > _STILL
+    way = rng.uniform(0, 2 * np.pi, n * taps)
+    far = np.exp(rng.uniform(*np.log(_SLIDE_MM), n * taps)) * dragged
+    twist = rng.normal(0, _TWIST_RAD, n * taps) * (dragged & (rng.random(n * taps) < 0.5))
+    done = gripped.press(
+        np.concatenate([one.heights_mm for one in tapped]),
+        np.clip(depth_mm, *INDENTATION_MM),
+        np.stack([far * np.cos(way), far * np.sin(way)], axis=1),
+        twist,
+        rng.uniform(*_FRICTION, n * taps),
+        [one.cover for one in tapped for _ in range(taps)],
+    )
+    newest = slice(0, None, taps)
+    return PressSet(
+        family=family,
+        pad=np.full(n, number, dtype=np.int64),
+        constants=np.tile(constants(gripped.pad), (n, 1)),
+        counts=done.counts.reshape(n, taps, *done.counts.shape[1:]),
+        angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32),
+        patterns=done.patterns[newest].astype(np.float16),
+        touching=done.touching[newest],
+        traction_kpa=done.traction_kpa[newest].astype(np.float16),
+        force_n=done.force_n[newest],
+        twist_nmm=done.twist_nmm[newest],
+        indentation_mm=done.indentation_mm[newest],
+    )

@@ -1,0 +1,146 @@
+"""All families by name, how often each is met, and one shape of a family under the pad."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.depth import Relief, footprints
+from train.families import faces, rounds, solids
+from train.families.shape import Height, Lie, log_uniform
+from train.physics.gripped import BARE, SAMPLES, Cover, GrippedPad
+from train.poses import ANGLE_STEP_DEG, as_poses, random_targets, turned_back
+from train.surfaces import SURFACES, surface_mesh
+
+SHAPES: Final[Mapping[str, Callable[[np.random.Generator], Height]]] = {
+    **{maker.__name__: maker for maker in (faces.flat, faces.block, faces.edge, faces.corner, faces.slot, faces.step)},
+    **{maker.__name__: maker for maker in (rounds.dome, rounds.cylinder, rounds.cone, rounds.ridge, rounds.wire)},
+    **{maker.__name__: maker for maker in (rounds.saddle, rounds.relief, rounds.grating, solids.solid)},
+}
+FIGURES: Final = ("paper", "glyph", "polygon")
+"""Families of flat figures on a plate: the paper's 18, and random ones."""
+
+SHARES: Final[Mapping[str, float]] = {
+    **{"paper": 20, "glyph": 14, "polygon": 14},
+    **{"flat": 6, "block": 6, "edge": 4, "corner": 3, "slot": 4, "step": 2},
+    **{"dome": 3, "cylinder": 4, "cone": 2, "ridge": 2, "wire": 3, "saddle": 2, "relief": 4, "grating": 4, "solid": 6},
+    **{"two": 4, "soft": 5, "glove": 5},
+}
+"""Relative frequency of each family in training."""
+
+_LEVEL: Final = 0.4
+"""Share of shapes that lie level; the others are tilted by up to three degrees."""
+_REACH_MM: Final = 6.0
+_FIGURE_SLOPE: Final = float(np.tan(np.radians(0.5)))
+_FIGURES_PER_SEED: Final = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Tapped:
+    """One shape under K taps.
+
+    Attributes:
+        heights_mm: (K, m, m) at the pad's places, newest tap first.
+        cover: what gives way beside the pad.
+        angle_deg: (K,), the pad's turn in each tap.
+    """
+
+    heights_mm: NDArray[np.float32]
+    cover: Cover
+    angle_deg: NDArray[np.float64]
+
+
+def draw_shape(
+    rng: np.random.Generator, family: str, pad: GrippedPad, taps: int, pose_error: tuple[float, float]
+) -> Tapped:
+    """One shape of a family, tapped from poses that are a step of the paper's schedule apart.
+
+    Args:
+        rng: draws the shape and where it lies.
+        family: a key of SHARES, or `mesh:PATH`, a user's surface.
+        pad: that taps.
+        taps: K.
+        pose_error: standard deviations of where a tap lands, in [mm] and [deg].
+
+    Raises:
+        SurfaceError: no family of that name.
+    """
+    if family in FIGURES or family.startswith("mesh:"):
+        return _draw_figure(rng, family, pad, taps, pose_error)
+    if family == "soft":
+        inner = draw_shape(rng, _another(rng), pad, taps, pose_error)
+        return Tapped(inner.heights_mm, Cover(soft_mpa=round(log_uniform(rng, 0.05, 2), 3)), inner.angle_deg)
+    if family == "glove":
+        inner = draw_shape(rng, _another(rng), pad, taps, pose_error)
+        return Tapped(inner.heights_mm, Cover(0.0, rng.uniform(0.2, 1.0), log_uniform(rng, 0.3, 3)), inner.angle_deg)
+    parts = [SHAPES[family]] if family != "two" else [SHAPES[name] for name in rng.choice(_PAIRED, 2)]
+    heights = [maker(rng) for maker in parts]
+    places = [_lie(rng, family, index) for index in range(len(parts))]
+    angle = -ANGLE_STEP_DEG * np.arange(taps)
+    off = rng.standard_normal((taps, 3)).clip(-2, 2) * (pose_error[0], pose_error[0], pose_error[1])
+    x, y = np.broadcast_arrays(*pad.places_mm)
+    maps = []
+    for turn, (x_mm, y_mm, more) in zip(angle, off, strict=True):
+        seen = [_turned(lie, turn + more, x_mm, y_mm).seen(height, x, y) for height, lie in zip(heights, places, strict=True)]
+        maps.append(np.maximum.reduce(seen))
+    return Tapped(np.stack(maps), BARE, angle)
+
+
+_PAIRED: Final = ("block", "edge", "dome", "cylinder", "wire", "cone", "solid")
+"""Shapes of which two may be under the pad at once."""
+
+
+def _another(rng: np.random.Generator) -> str:
+    names = [name for name in SHARES if name not in ("soft", "glove")]
+    return str(rng.choice(names))
+
+
+def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
+    """Where a shape lies; the second of two on the other side of the pad, at nearly the same height."""
+    reach = _REACH_MM
+    x_mm, y_mm = rng.uniform(-reach, reach, 2)
+    if family == "two":
+        x_mm = (4 + rng.uniform(0, 4)) * (1 if index else -1)
+    slope = np.zeros(2) if rng.random() < _LEVEL else rng.uniform(-faces.SLOPE, faces.SLOPE, 2) / np.sqrt(2)
+    if family == "two":
+        slope = slope / 5
+    return Lie(float(x_mm), float(y_mm), float(rng.uniform(0, 360)), float(slope[0]), float(slope[1]))
+
+
+def _turned(lie: Lie, turn_deg: float, x_mm: float, y_mm: float) -> Lie:
+    """The same shape seen by a pad that was turned about its centre and then moved.
+
+    In the pad's axes, x to the right and y down, a shape turns as the pad does seen from above (train.depth.Pose).
+    """
+    turn = np.radians(turn_deg)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    right, down = cosine * lie.x_mm - sine * lie.y_mm, sine * lie.x_mm + cosine * lie.y_mm
+    slope_x, slope_y = cosine * lie.slope_x - sine * lie.slope_y, sine * lie.slope_x + cosine * lie.slope_y
+    return Lie(float(right - x_mm), float(down - y_mm), lie.angle_deg + turn_deg, float(slope_x), float(slope_y))
+
+
+def _draw_figure(
+    rng: np.random.Generator, family: str, pad: GrippedPad, taps: int, pose_error: tuple[float, float]
+) -> Tapped:
+    name = family
+    if family == "paper":
+        name = str(rng.choice(SURFACES))
+    elif family in FIGURES:
+        name = f"{family}:{int(rng.integers(_FIGURES_PER_SEED, 2**40))}"
+    poses = turned_back(random_targets(rng, 1, [name]), taps)[0]
+    poses = poses + rng.standard_normal((taps, 3)).clip(-2, 2) * (pose_error[0], pose_error[0], pose_error[1])
+    relief = _relief(name)
+    seen = footprints([relief] * taps, as_poses(poses), pad.size * SAMPLES, pad.cell_mm / SAMPLES)
+    heights = -seen.depth_mm
+    if rng.random() > _LEVEL:
+        slope = rng.uniform(-_FIGURE_SLOPE, _FIGURE_SLOPE, 2).astype(np.float32)
+        heights = heights + slope[0] * pad.places_mm[0] + slope[1] * pad.places_mm[1]
+    return Tapped(heights, BARE, poses[:, 2])
+
+
+@lru_cache(maxsize=64)
+def _relief(name: str) -> Relief:
+    return Relief(name, surface_mesh(name))

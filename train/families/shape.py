@@ -1,0 +1,58 @@
+"""A shape under the pad: its height at any place, and how it lies there."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Height = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
+"""Height in [mm] at x and y in [mm], NOWHERE_MM off the shape; higher parts meet the pad first."""
+
+NOWHERE_MM: Final = -1e3
+"""Height where there is no shape, out of any press's reach."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lie:
+    """How a shape lies under the pad.
+
+    Attributes:
+        x_mm: of the shape's origin, to the right of the pad's centre.
+        y_mm: of the shape's origin, below the pad's centre, down the rows.
+        angle_deg: turn of the shape.
+        slope_x: rise of the shape along the pad's x, in [mm/mm].
+        slope_y: rise of the shape along the pad's y, in [mm/mm].
+    """
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    angle_deg: float = 0.0
+    slope_x: float = 0.0
+    slope_y: float = 0.0
+
+    def seen(self, height: Height, x_mm: NDArray[np.float32], y_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Heights in [mm] of a shape that lies so, at places on the pad in [mm]."""
+        turn = np.radians(self.angle_deg)
+        cosine, sine = np.float32(np.cos(turn)), np.float32(np.sin(turn))
+        right, down = x_mm - np.float32(self.x_mm), y_mm - np.float32(self.y_mm)
+        raised = height(cosine * right + sine * down, cosine * down - sine * right)
+        if self.slope_x or self.slope_y:
+            raised = raised + np.float32(self.slope_x) * x_mm + np.float32(self.slope_y) * y_mm
+        return raised.astype(np.float32, copy=False)
+
+
+def where(inside: NDArray[np.bool_], height: NDArray[np.float32] | float) -> NDArray[np.float32]:
+    """Heights where a shape is, NOWHERE_MM elsewhere."""
+    return np.where(inside, height, np.float32(NOWHERE_MM)).astype(np.float32, copy=False)
+
+
+def raised(inside: NDArray[np.bool_], height_mm: float) -> NDArray[np.float32]:
+    """A figure raised by `height_mm` from a plate at height 0."""
+    return np.where(inside, np.float32(height_mm), np.float32(0))
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """A number drawn so that its logarithm is uniform."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
