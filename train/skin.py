@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import SensorGeometry
 from train.layer import Layer, inner_displacement
 from train.magnets import MOVEMENT, Magnet, MagnetArray
+from train.physics.free_sides import FreeSides
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
 IN_PLANE_SHARE: Final = 0.4
@@ -35,6 +36,7 @@ class Skin:
         magnet: of every taxel.
         field: how the magnets' field is worked out, a name in train.magnets.FIELDS.
         in_plane_share: factor on the magnets' in-plane movement.
+        sides: the pad's free sides; without, it goes on for ever.
 
     Attributes:
         counts_per_mt: of every chip and axis.
@@ -52,6 +54,7 @@ class Skin:
         magnet: Magnet | None = None,
         field: str = "dipole",
         in_plane_share: float = IN_PLANE_SHARE,
+        sides: FreeSides | None = None,
     ) -> None:
         magnet = Magnet() if magnet is None else magnet
         if magnet.height_mm + magnet.thickness_mm / 2 > layer.thickness_mm:
@@ -63,6 +66,10 @@ class Skin:
         self.size = size
         self._magnets = MagnetArray(geometry, magnet, field)
         response = _magnet_response(geometry, layer, size, cell_mm, magnet)
+        if sides is not None:
+            cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+            added = sides.movement(layer, cells_mm, geometry.taxel_centres_mm())
+            response += added.reshape(response.shape) * cell_mm**2
         response[:, :2] *= in_plane_share
         self._response = response.astype(np.float32)
         # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.

@@ -1,0 +1,1 @@
+"""Corrections of the simulated pad by what the infinite layer leaves out."""
