@@ -45,10 +45,10 @@ class Drift(NamedTuple):
     spread: float
 
 
-GIVES: Final = (Give(1.288, 0.297, 0.174), Give(0.0447, 1.341, 0.523))
-DOWN: Final = Drift(0.045, 0.66, 1.09, 0.427)
-OUT: Final = Drift(0.169, 1.115, 0.60, 0.595)
-LEAN: Final = Drift(0.99, 0.433, 0.325, 0.463)
+GIVES: Final = (Give(0.959, 0.3415, 0.2247), Give(0.0255, 1.590, 0.6034))
+DOWN: Final = Drift(0.0404, 0.690, 1.147, 0.420)
+OUT: Final = Drift(0.1703, 1.117, 0.592, 0.593)
+LEAN: Final = Drift(1.000, 0.431, 0.317, 0.463)
 
 
 @dataclass(frozen=True, slots=True)
