@@ -21,6 +21,7 @@ COLUMNS = {
     "angle": {"network", "angle deg", "test PSNR dB", "over STSR dB", "run time ms"},
     "taps": {"network", "taps given", "test PSNR dB", "over STSR dB", "run time ms"},
     "fig5": {"surface"},
+    "free_sides": {"contact", "stiffness, bare", "stiffness, corrected"},
     "curved": {"surface", "method"},
     "psf_speed": {"route", "times the direct"},
     "fig7": {"method", "error %", "ms a pattern"},

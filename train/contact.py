@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from train.layer import Layer, surface_compliance
+from train.physics.free_sides import FreeSides, SideGive
 
 _MAX_STEPS: Final = 200
 _DIES_WITHIN: Final = 8
@@ -67,6 +68,7 @@ class ContactSolver:
         boxed: work on boxes; else on the whole pad, for comparison.
         compliance: surface displacement per pressure at wave numbers, in [mm/MPa], where something gives way beside the
             layer; the layer's alone if None.
+        sides: the pad's free sides; without, it goes on for ever.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class ContactSolver:
         dtype: torch.dtype = torch.float32,
         boxed: bool = True,
         compliance: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+        sides: FreeSides | None = None,
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
@@ -89,6 +92,7 @@ class ContactSolver:
         self._dtype = dtype
         self._sides = [*(box_sides(size) if boxed else ()), size]
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
+        self._side_give = None if sides is None else SideGive.of(sides, layer, size, cell_mm, dtype)
 
     @property
     def cell_compliance_mm_per_mpa(self) -> float:
@@ -97,7 +101,8 @@ class ContactSolver:
 
     def displacement_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Surface displacement downwards under pressures (n, size, size), in [mm]."""
-        return self._displace(torch.as_tensor(pressure_mpa, dtype=self._dtype)).numpy().astype(np.float32)
+        pressure = torch.as_tensor(pressure_mpa, dtype=self._dtype)
+        return self._respond(pressure, torch.zeros(()), self._side_give).numpy().astype(np.float32)
 
     def solve(
         self,
@@ -147,7 +152,8 @@ class ContactSolver:
             depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
             start = None if start_mpa is None else torch.as_tensor(start_mpa[place], dtype=self._dtype)
             give = None if cover is None else self._give(torch.as_tensor(cover[place], dtype=self._dtype))
-            found, error, taken = self._conjugate_gradients(depth, press, tolerance, start, give)
+            sides = None if self._side_give is None else self._side_give.boxes(top, left, (height, width))
+            found, error, taken = self._conjugate_gradients(depth, press, tolerance, start, give, sides)
             pressure_mpa[place] = found.numpy()
             residual[poses] = error.numpy()
             steps = max(steps, taken)
@@ -167,6 +173,7 @@ class ContactSolver:
         tolerance: float,
         start: torch.Tensor | None,
         give: torch.Tensor | None,
+        sides: SideGive | None,
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
         """Pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1)."""
         reachable = depth < REACH * press
@@ -180,7 +187,7 @@ class ContactSolver:
             pressure = torch.where(known.amax(dim=(1, 2), keepdim=True) > 0, known, pressure)
         result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
         working = torch.arange(len(pressure))
-        gap = torch.where(reachable, self._displace(pressure) + give * pressure - wanted, 0.0)
+        gap = torch.where(reachable, self._respond(pressure, give, sides) - wanted, 0.0)
         direction = torch.zeros_like(pressure)
         energy_before = torch.ones_like(press)
         keep = torch.zeros_like(press)
@@ -199,14 +206,14 @@ class ContactSolver:
                     break
                 more = ~done
                 working, wanted, reachable, press = working[more], wanted[more], reachable[more], press[more]
-                give = give[more]
+                give, sides = give[more], None if sides is None else sides[more]
                 pressure, gap, direction, touching = pressure[more], gap[more], direction[more], touching[more]
                 gap_touching, energy_before, keep = gap_touching[more], energy_before[more], keep[more]
             steps += 1
             energy = _total(gap_touching**2)
             direction = torch.where(touching, gap + keep * (energy / energy_before) * direction, 0.0)
             energy_before = energy.clamp_min(1e-30)
-            response = self._displace(direction) + give * direction
+            response = self._respond(direction, give, sides)
             length = _total(gap_touching * direction) / _total(response * direction).clamp_min(1e-30)
             stepped = pressure - length * direction
             pressure = stepped.clamp_min(0.0)
@@ -218,9 +225,14 @@ class ContactSolver:
             bent = (returning | (stepped < 0)).flatten(1).any(dim=1)
             gap = torch.where(reachable, gap - length * response, 0.0)
             if bool(bent.any()):
-                again = self._displace(pressure[bent]) + give[bent] * pressure[bent] - wanted[bent]
+                again = self._respond(pressure[bent], give[bent], None if sides is None else sides[bent]) - wanted[bent]
                 gap[bent] = torch.where(reachable[bent], again, 0.0)
         return result, residual, steps
+
+    def _respond(self, pressure: torch.Tensor, give: torch.Tensor, sides: SideGive | None) -> torch.Tensor:
+        """Displacement with what single cells give and what free sides add."""
+        displacement = self._displace(pressure) + give * pressure
+        return displacement if sides is None else displacement + sides.displacement_mm(pressure)
 
     def _displace(self, pressure: torch.Tensor) -> torch.Tensor:
         """Displacement within boxes (n, height, width) under pressures in them."""

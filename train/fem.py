@@ -247,6 +247,21 @@ class _Press:
             ) from error
 
 
+def rest_tangent(
+    x_mm: NDArray[np.floating], y_mm: NDArray[np.floating], z_mm: NDArray[np.floating], layer: Layer
+) -> csr_matrix:
+    """Stiffness of a block at small strain, nothing held, in [N/mm].
+
+    Args:
+        x_mm: nodes along x, rising; with those of y and z they make a grid, x running fastest, (x, y, z) in each node.
+        y_mm: nodes along y.
+        z_mm: nodes along z.
+        layer: the material.
+    """
+    field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(felupe.Grid(x_mm, y_mm, z_mm)), dim=3)])
+    return _body(field, MooneyRivlin.of_layer(layer), mixed=True).assemble.matrix()
+
+
 def _body(field: Any, rubber: MooneyRivlin, mixed: bool) -> Any:
     """The pad's elements: they bring the volumetric part themselves if mixed, and take it from the rubber if not."""
     if mixed:

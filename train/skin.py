@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import SensorGeometry
 from train.layer import Layer
 from train.magnets import MOVEMENT, Magnet, MagnetArray
+from train.physics.free_sides import FreeSides
 from train.physics.magnet_response import pressure_response, traction_response
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
@@ -39,6 +40,7 @@ class Skin:
         rest: where each magnet sits and how it leans, see train.magnets.MagnetArray.
         moments: of each magnet, see train.magnets.MagnetArray.
         counts_per_newton: of the sum of z under an even load.
+        sides: the pad's free sides; without, it goes on for ever.
 
     Attributes:
         counts_per_mt: of every chip and axis.
@@ -59,6 +61,7 @@ class Skin:
         rest: NDArray[np.floating] | None = None,
         moments: NDArray[np.floating] | None = None,
         counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z,
+        sides: FreeSides | None = None,
     ) -> None:
         magnet = Magnet() if magnet is None else magnet
         if magnet.height_mm + magnet.thickness_mm / 2 > layer.thickness_mm:
@@ -71,6 +74,10 @@ class Skin:
         self._pad = (geometry, layer, size, cell_mm, magnet)
         self._magnets = MagnetArray(geometry, magnet, field, rest, moments)
         response = pressure_response(geometry, layer, size, cell_mm, magnet)
+        if sides is not None:
+            cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+            added = sides.movement(layer, cells_mm, geometry.taxel_centres_mm())
+            response += added.reshape(response.shape) * cell_mm**2
         response[:, :2] *= in_plane_share
         self._response = response.astype(np.float32)
         # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.

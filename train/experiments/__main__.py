@@ -31,6 +31,7 @@ EXPERIMENTS: Final = {
     "confidence": "expected error and early stop against what came out",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
+    "free_sides": "the pad with its free sides by FEM against the infinite layer",
     "curved": "several PSFs by height against FEM",
     "psf_speed": "patterns a second of the PSF by FFT and direct",
 }

@@ -115,6 +115,7 @@ class GrippedPad:
             rest=pad.rest(geometry.taxel_count),
             moments=pad.moments(geometry.taxel_count),
             counts_per_newton=pad.counts_per_newton,
+            sides=pad.sides,
         )
         across = ((np.arange(self.size * SAMPLES) + 0.5) / SAMPLES - self.size / 2) * self.cell_mm
         self.places_mm = (across[None, :].astype(np.float32), across[:, None].astype(np.float32))
@@ -289,7 +290,7 @@ class GrippedPad:
                 compliance = compliance + 0.5 / (cover.soft_mpa * np.hypot(q_per_mm, 2 / USPA44.width_mm))
             return compliance
 
-        return ContactSolver(self.pad.layer, self.size, self.cell_mm, compliance=extra)
+        return ContactSolver(self.pad.layer, self.size, self.cell_mm, compliance=extra, sides=self.pad.sides)
 
     def _passed_on(self, cover: Cover, pressure: NDArray[np.float32]) -> NDArray[np.float32]:
         """Pressure on the pad (size, size) under a cloth that spreads that on its upper side."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.layer import Layer
 from train.magnets import Magnet
+from train.physics.free_sides import FreeSides
 from train.skin import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
 
 _UNEVEN_MM: Final = 0.03
@@ -54,6 +55,11 @@ class Pad:
     def layer(self) -> Layer:
         """The soft layer."""
         return Layer(self.thickness_mm, self.shear_modulus_mpa, self.poisson)
+
+    @property
+    def sides(self) -> FreeSides | None:
+        """The pad's free sides, None where they do not give way."""
+        return FreeSides(self.free_sides) if self.free_sides else None
 
     @property
     def magnet(self) -> Magnet:

@@ -1,0 +1,121 @@
+import numpy as np
+import pytest
+import torch
+
+from firmware_bridge.geometry import USPA44
+from train.contact import ContactSolver
+from train.layer import Layer
+from train.physics.free_sides import FreeSides
+from train.skin import Skin
+
+SIZE, CELL_MM = 42, 0.47
+CELLS_MM = (np.arange(SIZE) - (SIZE - 1) / 2) * CELL_MM
+FLAT = np.zeros((1, SIZE, SIZE), dtype=np.float32)
+# Of train.physics.whole_pad: stiffness in N/mm, pressure over its mean at .235, 7.05 and 9.635 mm from the centre along
+# x, and per mm of indentation the inner, edge and corner magnets' way down, then outwards.
+ELEMENTS = {
+    0.45: (46.97, (1.33, 1.09, 0.60), (0.450, 0.438, 0.438), (0.189, 0.674, 0.535)),
+    0.48: (53.0, (1.42, 1.10, 0.52), (0.412, 0.404, 0.408), (0.249, 0.853, 0.656)),
+    0.49: (55.5, (1.46, 1.11, 0.49), (0.395, 0.390, 0.396), (0.275, 0.930, 0.706)),
+    0.495: (56.8, (1.48, 1.11, 0.48), (0.385, 0.382, 0.389), (0.290, 0.973, 0.734)),
+}
+
+
+def solver(layer, sides, **options):
+    return ContactSolver(layer, SIZE, CELL_MM, torch.float64, sides=sides, **options)
+
+
+def discs(count):
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    places = np.random.default_rng(5).uniform(6, SIZE - 7, (count, 2))
+    return np.array([np.where(np.hypot(rows - y, columns - x) < 5.3, 0, 1e3) for y, x in places], dtype=np.float32)
+
+
+@pytest.mark.parametrize("poisson", ELEMENTS)
+def test_a_flat_face_presses_as_the_finite_elements_have_it(poisson):
+    layer, (stiffness, shape, down, out) = Layer(poisson=poisson), ELEMENTS[poisson]
+    bare, corrected = (solver(layer, sides).solve(FLAT, 1.0, 1e-4) for sides in (None, FreeSides()))
+    assert bare.force_n[0] > 1.6 * stiffness  # so much is at stake
+    assert corrected.force_n[0] == pytest.approx(stiffness, rel=0.09)
+    pressure = corrected.pressure_mpa[0].astype(np.float64)
+    found = np.interp([0.235, 7.05, 9.635], CELLS_MM, pressure[SIZE // 2]) / pressure.mean()
+    assert np.abs(found - shape).max() < 0.09
+    skin = Skin(USPA44, layer, SIZE, CELL_MM, in_plane_share=1.0, sides=FreeSides())
+    quarter = skin.movement(pressure).reshape(4, 4, 5)[2:, 2:].reshape(4, 5)[[0, 1, 3]]
+    assert quarter[:, 2] == pytest.approx(down, rel=0.2)
+    assert quarter[:, 0] == pytest.approx(out, rel=0.12)
+
+
+def test_the_elements_themselves_on_a_coarse_mesh():
+    pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+    from train.physics.whole_pad import WholePad
+
+    for poisson in (0.45, 0.495):
+        stiffness, shape, _, out = ELEMENTS[poisson]
+        whole = WholePad(Layer(poisson=poisson), cells_high=3, every=5)
+        press = whole.flat()
+        assert press.stiffness_n_per_mm == pytest.approx(stiffness, rel=0.03)
+        assert press.pressure[0, 0] == pytest.approx(shape[0], rel=0.03)
+        assert press.movement[[0, 1, 3], 0] == pytest.approx(out, rel=0.05)
+        assert whole.flat(bonded=True).stiffness_n_per_mm > 1.3 * stiffness
+
+
+def test_without_amplitude_nothing_changes():
+    layer, none = Layer(), FreeSides(0.0)
+    depths_mm = discs(5)
+    pressures = [solver(layer, sides).solve(depths_mm).pressure_mpa for sides in (None, none)]
+    assert np.allclose(*pressures, atol=1e-7)
+    skins = [Skin(USPA44, layer, SIZE, CELL_MM, sides=sides) for sides in (None, none)]
+    assert np.array_equal(*(skin.frames(pressures[0][:, None]) for skin in skins))
+
+
+def test_boxes_give_what_the_whole_pad_gives():
+    # The discs take boxes of one shape at places of their own; some of them lie within reach of the sides.
+    depths_mm = discs(6)
+    boxed, whole = (solver(Layer(), FreeSides(), boxed=on).solve(depths_mm, 1.0, 1e-5) for on in (True, False))
+    assert boxed.force_n == pytest.approx(whole.force_n, rel=1e-4)
+    assert np.abs(boxed.pressure_mpa - whole.pressure_mpa).max() < 1e-3 * whole.pressure_mpa.max()
+    assert (boxed.residual < 1e-5).all()
+
+
+def test_sides_are_felt_near_them_alone_and_are_all_alike():
+    def force_n(row, column):
+        depth_mm = np.full((SIZE, SIZE), 1e3, dtype=np.float32)
+        depth_mm[row : row + 6, column : column + 6] = 0
+        return [solver(Layer(), sides).solve(depth_mm[None], 1.0, 1e-5).force_n[0] for sides in (FreeSides(), None)]
+
+    middle, without = force_n(18, 18)
+    assert 0.97 * without < middle < without
+    beside = [force_n(*at)[0] for at in ((18, 0), (18, 36), (0, 18), (36, 18))]
+    assert beside == pytest.approx([beside[0]] * 4, rel=1e-4)
+    assert beside[0] < 0.8 * without
+    assert force_n(0, 36)[0] < beside[0]
+
+
+def test_what_sides_add_is_a_load_at_work_never_against_it():
+    across, along = FreeSides(0.7).profiles(Layer(), CELLS_MM)
+    assert across.min() > 0
+    for bell in along:
+        assert np.allclose(bell, bell.T)
+        assert np.linalg.eigvalsh(bell).min() > -1e-9 * bell.max()
+
+
+def test_magnets_go_outwards_and_mirror_each_other():
+    moved = FreeSides().movement(Layer(), CELLS_MM, USPA44.taxel_centres_mm())
+    even = moved.sum(axis=(2, 3)).reshape(4, 4, 5)
+    right, back, down, lean_x, lean_y = np.moveaxis(even, -1, 0)
+    assert (right[:, 2:] > 0).all()
+    assert np.allclose(right, -right[:, ::-1])
+    assert np.allclose(right, back.T)
+    assert np.allclose(lean_x, lean_y.T)
+    assert (down > 0).all()
+    assert np.allclose(down, down[::-1])
+    turned = moved.reshape(4, 4, 5, SIZE, SIZE).transpose(1, 0, 2, 4, 3).reshape(moved.shape)  # x for y
+    assert np.allclose(moved[:, [0, 2, 3]], turned[:, [1, 2, 4]])
+    one = moved[7, 0, 30, 40]  # the second row's last magnet, a load below it to the right
+    assert one > moved[7, 0, 41, 40] > 0
+
+
+def test_a_negative_amplitude_is_refused():
+    with pytest.raises(ValueError, match=r"amplitude is -0\.1, expected 0 or more"):
+        FreeSides(-0.1)
