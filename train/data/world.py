@@ -19,6 +19,8 @@ from train.surfaces import surface_mesh
 
 INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly; the upper one is what the layer is linear to."""
+LEAST_FORCE_N: Final = 0.1
+"""Presses below are left out: about twice what is told from noise as a contact."""
 _STILL: Final = 0.35
 """Share of presses without any drag; of the others half are twisted as well."""
 _SLIDE_MM: Final = (0.02, 0.6)
@@ -32,7 +34,7 @@ class World:
     """All that decides a set of presses.
 
     Attributes:
-        count: sequences.
+        count: sequences drawn; those of less than LEAST_FORCE_N, and those beside the pattern, are left out.
         taps: presses in each, the pad turned by a step from one to the next.
         per_pad: sequences of one pad.
         families: relative frequency of each family.
@@ -109,7 +111,8 @@ def _pressed(
         [one.cover for one in tapped for _ in range(taps)],
     )
     newest = slice(0, None, taps)
-    return PressSet(
+    felt = (done.force_n[newest, 2] > LEAST_FORCE_N) & done.touching[newest].any(axis=(1, 2))
+    made = PressSet(
         family=family,
         pad=np.full(n, number, dtype=np.int64),
         constants=np.tile(constants(gripped.pad), (n, 1)),
@@ -122,3 +125,4 @@ def _pressed(
         twist_nmm=done.twist_nmm[newest],
         indentation_mm=done.indentation_mm[newest],
     )
+    return made.pick(felt)

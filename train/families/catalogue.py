@@ -31,8 +31,8 @@ SHARES: Final[Mapping[str, float]] = {
 }
 """Relative frequency of each family in training."""
 
-_LEVEL: Final = 0.4
-"""Share of shapes that lie level; the others are tilted by up to three degrees."""
+_LEVEL: Final = 0.3
+"""Share of shapes that lie level; the others are tilted by up to three degrees, most of them by less than one."""
 _REACH_MM: Final = 6.0
 _FIGURE_SLOPE: Final = float(np.tan(np.radians(0.5)))
 _FIGURES_PER_SEED: Final = 1_000_000
@@ -104,7 +104,10 @@ def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
     x_mm, y_mm = rng.uniform(-reach, reach, 2)
     if family == "two":
         x_mm = (4 + rng.uniform(0, 4)) * (1 if index else -1)
-    slope = np.zeros(2) if rng.random() < _LEVEL else rng.uniform(-faces.SLOPE, faces.SLOPE, 2) / np.sqrt(2)
+    slope = np.zeros(2)
+    if rng.random() > _LEVEL:
+        way = rng.uniform(0, 2 * np.pi)
+        slope = faces.SLOPE * rng.random() ** 2 * np.array([np.cos(way), np.sin(way)])
     if family == "two":
         slope = slope / 5
     return Lie(float(x_mm), float(y_mm), float(rng.uniform(0, 360)), float(slope[0]), float(slope[1]))

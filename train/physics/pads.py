@@ -12,7 +12,7 @@ from train.magnets import Magnet
 from train.physics.free_sides import FreeSides
 from train.skin import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
 
-_UNEVEN_MM: Final = 0.03
+_UNEVEN_MM: Final = 0.015
 """Largest RMS of a pad's own unevenness: a moulded silicone face."""
 _UNEVEN_WAVES: Final = 8
 _TILT_RAD: Final = 0.05
@@ -113,7 +113,7 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "magnet_height_mm": (2.2, 2.8),
     "counts_per_newton": (0.75 / NEWTONS_PER_COUNT_Z, 1.25 / NEWTONS_PER_COUNT_Z),
     "pitch_mm": (4.6, 5.0),
-    "free_sides": (0.0, 1.0),
+    "free_sides": (0.0, 0.6),
 }
 """Bounds of what is drawn uniformly; each with its reason in docs/train.md."""
 
