@@ -8,9 +8,11 @@ That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <
 compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
 2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.contact.
 
-What traction does to pressure is left out (Goodman 1962). That is exact in the limit of a thick layer of nu = 0.5; a
-bonded layer's surface rises before a slide and sinks behind it, by a quarter of the slide at most at nu = .45, and the
-pressure under a wide contact would lean by some tens of per cent. Slopes of the surface are taken as small.
+Pressure alone spreads the surface too; on request friction holds that as well, as if every cell had been in contact
+from the start, which is exact for flat surfaces. What traction does to pressure is left out (Goodman 1962). That is
+exact in the limit of a thick layer of nu = .5; a bonded layer's surface rises before a slide and sinks behind it, by a
+quarter of the slide at most at nu = .45, and the pressure under a wide contact would lean by some tens of per cent.
+Slopes of the surface are taken as small.
 """
 
 from dataclasses import dataclass
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 from train.contact import box_sides, boxes, period_cells
 from train.layer import Layer
-from train.physics.tangential_layer import surface_tensor
+from train.physics.tangential_layer import surface_spread, surface_tensor
 
 _MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4
@@ -73,6 +75,19 @@ class FrictionSolver:
         self._sides = [*(box_sides(size) if boxed else ()), size]
         self._kernels = _kernels(layer, period_cells(layer, size, cell_mm), cell_mm)
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
+        self._layer = layer
+
+    def spread_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float64]:
+        """How pressures (n, size, size) alone would move the surface to the right and back, (n, 2, size, size)."""
+        period = period_cells(self._layer, self.size, self.cell_mm)
+        q_x, q_y = _waves(period, self.cell_mm)
+        q = np.hypot(q_x, q_y)
+        along = np.divide(1j * surface_spread(self._layer, q), q, out=np.zeros(q.shape, dtype=complex), where=q > 0)
+        # The highest wave is its own mirror image: an odd transfer has none of it.
+        right, back = along * q_x, along * q_y
+        right[:, -1] = back[period // 2] = 0.0
+        wave = np.fft.rfft2(pressure_mpa, s=(period, period))[:, None] * np.stack([right, back])
+        return np.fft.irfft2(wave, s=(period, period))[..., : self.size, : self.size]
 
     def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Surface displacement to the right and back, (n, 2, size, size) in [mm], under tractions of that shape."""
@@ -85,6 +100,7 @@ class FrictionSolver:
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
         tolerance: float = 1e-3,
+        holds_spread: bool = False,
     ) -> FrictionResult:
         """Slide and turn surfaces that touch with the given pressures.
 
@@ -94,6 +110,8 @@ class FrictionSolver:
             twist_rad: (n,), of the surface about the pad's centre, from right to back.
             friction: (n,), coefficients mu, >= 0.
             tolerance: residual at which a pose is done.
+            holds_spread: friction also holds what the pressure would spread. Then the magnets' in-plane movement
+                under pressure counts in full (train.skin.Skin, in_plane_share 1): these tractions hold it back.
 
         Raises:
             ValueError: shapes or values do not fit.
@@ -104,6 +122,8 @@ class FrictionSolver:
         moved_mm = np.empty((count, 2, self.size, self.size))
         moved_mm[:, 0] = slide_mm[:, 0, None, None] - twist_rad[:, None, None] * along_mm[:, None]
         moved_mm[:, 1] = slide_mm[:, 1, None, None] + twist_rad[:, None, None] * along_mm
+        if holds_spread:
+            moved_mm -= self.spread_mm(pressure_mpa)
         limit_mpa = np.maximum(pressure_mpa, 0) * friction[:, None, None]
         traction_mpa = np.zeros((count, 2, self.size, self.size), dtype=np.float32)
         residual = np.zeros(count, dtype=np.float32)
@@ -213,12 +233,19 @@ class FrictionSolver:
 
 def _kernels(layer: Layer, period: int, cell_mm: float) -> NDArray[np.float64]:
     """Displacement around one cell under its traction, (3, period, period) in [mm/MPa]: xx, yy and xy."""
-    q_x = 2 * np.pi * np.fft.rfftfreq(period, cell_mm)[None, :]
-    q_y = 2 * np.pi * np.fft.fftfreq(period, cell_mm)[:, None]
+    q_x, q_y = _waves(period, cell_mm)
     xx, yy, xy = surface_tensor(layer, q_x, q_y)
     # The highest wave is its own mirror image: an odd transfer has none of it.
     xy[period // 2] = xy[:, -1] = 0.0
     return np.fft.irfft2(np.stack([xx, yy, xy]), s=(period, period))
+
+
+def _waves(period: int, cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Wave numbers to the right (1, m) and back (period, 1), in [1/mm]."""
+    q_x, q_y = np.fft.rfftfreq(period, cell_mm), np.fft.fftfreq(period, cell_mm)
+    return 2 * np.pi * np.asarray(q_x, dtype=np.float64)[None, :], 2 * np.pi * np.asarray(q_y, dtype=np.float64)[
+        :, None
+    ]
 
 
 def _project(traction: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:

@@ -100,7 +100,7 @@ def traction_response(
 
 def _quarter(size: int, cell_mm: float) -> tuple[_Array, _Array, _Array]:
     """Wave numbers 0 to the highest: to the right (1, m), back (m, 1), and their length (m, m), in [1/mm]."""
-    q = 2 * np.pi * np.fft.rfftfreq(_PADS_WIDE * size, cell_mm)
+    q = 2 * np.pi * np.asarray(np.fft.rfftfreq(_PADS_WIDE * size, cell_mm), dtype=np.float64)
     return q[None, :], q[:, None], np.hypot(q[None, :], q[:, None])
 
 

@@ -55,6 +55,25 @@ def surface_tangential_compliance(
     return along, thickness / shear * np.tanh(a) / a
 
 
+def surface_spread(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Surface displacement along the wave per pressure: u = i times this, in closed form, in [mm/MPa].
+
+    U = [(1-2nu)(3-4nu)(cosh 2a - 1) - 2a^2] / (2 G q [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2]), a = qh: the surface
+    value of train.layer.inner_displacement. Below 0 a pressure drives the surface apart.
+
+    Args:
+        layer: the pad.
+        q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
+    """
+    nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
+    a = np.maximum(q_per_mm * thickness, 1e-8)  # goes to 0 as a does
+    decay = np.exp(-2 * a)
+    kappa = 3 - 4 * nu
+    numerator = (1 - 2 * nu) * kappa * np.expm1(-2 * a) ** 2 - 4 * a**2 * decay
+    denominator = kappa * (1 + decay**2) + 2 * decay * (2 * a**2 + 5 - 12 * nu + 8 * nu**2)
+    return thickness / (2 * shear * a) * numerator / denominator
+
+
 def inner_tangential(layer: Layer, q_per_mm: NDArray[np.float64], height_mm: float) -> TangentialResponse:
     """Displacement at a height inside the layer per tangential traction on its surface.
 
@@ -72,7 +91,7 @@ def inner_tangential(layer: Layer, q_per_mm: NDArray[np.float64], height_mm: flo
 
 
 def surface_tensor(
-    layer: Layer, q_x: NDArray[np.float64], q_y: NDArray[np.float64]
+    layer: Layer, q_x: NDArray[np.floating], q_y: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Surface compliance (xx, yy, xy) per wave vector: u_x = xx t_x + xy t_y, u_y = xy t_x + yy t_y, in [mm/MPa].
 
@@ -81,7 +100,7 @@ def surface_tensor(
         q_x: wave numbers to the right; with q_y of shapes that broadcast, in [1/mm].
         q_y: wave numbers back.
     """
-    square = q_x**2 + q_y**2
+    square = np.asarray(q_x**2 + q_y**2, dtype=np.float64)
     along, across = surface_tangential_compliance(layer, np.sqrt(square))
     extra = np.divide(along - across, square, out=np.zeros_like(square), where=square > 0)
     return across + extra * q_x**2, across + extra * q_y**2, extra * q_x * q_y

@@ -1,0 +1,382 @@
+import numpy as np
+import pytest
+import torch
+
+from firmware_bridge.geometry import USPA44
+from train.contact import ContactSolver
+from train.depth import NOTHING_MM
+from train.layer import Layer, inner_displacement, surface_compliance
+from train.magnets import Magnet
+from train.physics.friction import FrictionSolver
+from train.physics.magnet_response import traction_response
+from train.physics.tangential_layer import (
+    inner_tangential,
+    surface_spread,
+    surface_tangential_compliance,
+    surface_tensor,
+)
+from train.skin import Skin
+
+SIZE, CELL_MM = 42, 0.47
+AS = np.concatenate([[0.0], np.logspace(-9, 4, 120), [1e6, 1e12]])
+"""q h, from even loads to overflow."""
+
+
+def cells_mm(size=SIZE, cell_mm=CELL_MM):
+    return (np.arange(size) - (size - 1) / 2) * cell_mm
+
+
+def radius_mm(size=SIZE, cell_mm=CELL_MM, centre_mm=(0.0, 0.0)):
+    along = cells_mm(size, cell_mm)
+    return np.hypot(along[None, :] - centre_mm[0], along[:, None] - centre_mm[1])
+
+
+def push(solver, pressure, slide_mm=(0.0, 0.0), twist_rad=0.0, friction=0.5, tolerance=1e-5):
+    """One pose."""
+    result = solver.solve(
+        pressure[None], np.array([slide_mm]), np.array([twist_rad]), np.array([friction]), tolerance=tolerance
+    )
+    assert result.residual[0] < 1.01 * tolerance
+    return result
+
+
+THICK, FINE_MM = Layer(thickness_mm=60.0, poisson=0.3), 0.2
+
+
+@pytest.fixture(scope="module")
+def thick():
+    return FrictionSolver(THICK, 36, FINE_MM, torch.float64)
+
+
+class TestLayer:
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.49, 0.4999])
+    @pytest.mark.parametrize("thickness_mm", [0.5, 4.5, 50.0])
+    def test_closed_form_and_boundary_conditions_agree_at_every_wave(self, thickness_mm, poisson):
+        layer = Layer(thickness_mm, 0.12, poisson)
+        q = AS / thickness_mm
+        along, across = surface_tangential_compliance(layer, q)
+        top = inner_tangential(layer, q, thickness_mm)
+        assert (np.diff(along[:-1]) < 1e-6 * along[0]).all()
+        assert (along > 0).all()
+        # Measured 7e-11 and 4e-16.
+        assert np.allclose(top.along[:-1], along[:-1], rtol=1e-9)
+        assert np.allclose(top.across, across, rtol=1e-12)
+        for height_mm in (0.0, 0.5 * thickness_mm, 0.99 * thickness_mm):
+            inside = inner_tangential(layer, q, height_mm)
+            for part in (inside.along, inside.across, inside.sunk):
+                assert np.isfinite(part).all()
+                assert np.abs(part).max() <= along[0] * (1 + 1e-9)
+            if height_mm == 0:
+                assert np.allclose([inside.along, inside.across, inside.sunk], 0, atol=1e-9 * along[0])
+
+    @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.4999])
+    def test_down_under_traction_is_along_under_pressure(self, poisson):
+        layer = Layer(poisson=poisson)
+        q = np.linspace(0.01, 20, 300)
+        _, spread = inner_displacement(layer, q, layer.thickness_mm)
+        assert np.allclose(
+            inner_tangential(layer, q, layer.thickness_mm).sunk, -spread, atol=1e-9 * np.abs(spread).max()
+        )
+
+        assert np.allclose(surface_spread(layer, q), spread, atol=1e-9 * np.abs(spread).max())
+
+    def test_limits_of_thin_and_thick(self):
+        layer = Layer(poisson=0.3)
+        along, across = surface_tangential_compliance(layer, np.array([0.0, 1e-9, 100.0]))
+        shear = layer.thickness_mm / layer.shear_modulus_mpa
+        assert np.allclose([along[:2], across[:2]], shear)
+        assert along[2] == pytest.approx(0.7 / (layer.shear_modulus_mpa * 100.0))
+        assert across[2] == pytest.approx(1 / (layer.shear_modulus_mpa * 100.0))
+        assert along[2] == pytest.approx(surface_compliance(layer, np.array([100.0]))[0])
+        # Even traction shears the layer evenly.
+        inside = inner_tangential(layer, np.array([0.0]), 1.5)
+        assert np.allclose([inside.along, inside.across], 1.5 / layer.shear_modulus_mpa)
+        assert abs(inside.sunk[0]) < 1e-5
+
+    def test_inside_obeys_equilibrium(self):
+        layer, q, step = Layer(poisson=0.45), np.array([0.5]), 1e-3
+        u, across, down = np.array(
+            [
+                [part[0] for part in (field.along, field.across, field.sunk)]
+                for field in (inner_tangential(layer, q, 2.0 + shift) for shift in (-step, 0.0, step))
+            ]
+        ).T
+        # u_x = u, u_z = -i down times exp(i q x): Navier's equations along x and z, and across.
+        slope_u, slope_down = (u[2] - u[0]) / (2 * step), (down[2] - down[0]) / (2 * step)
+        bend_u, bend_down, bend_across = ((f[2] - 2 * f[1] + f[0]) / step**2 for f in (u, down, across))
+        stiff = 1 / (1 - 2 * layer.poisson)
+        along_x = bend_u - q[0] ** 2 * u[1] + stiff * q[0] * (slope_down - q[0] * u[1])
+        along_z = -bend_down + q[0] ** 2 * down[1] + stiff * (q[0] * slope_u - bend_down)
+        assert abs(along_x) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
+        assert abs(along_z) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
+        assert bend_across == pytest.approx(q[0] ** 2 * across[1], rel=1e-4)
+
+    def test_a_turned_wave_is_the_wave_turned(self):
+        layer, angle = Layer(), 0.7
+        q_x, q_y = np.array([0.3, 1.0, 4.0]), np.array([0.5, -0.2, 3.0])
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        turned_x, turned_y = turn @ np.stack([q_x, q_y])
+
+        def tensor(right, back):
+            xx, yy, xy = surface_tensor(layer, right, back)
+            return np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0)
+
+        assert np.allclose(tensor(turned_x, turned_y), turn @ tensor(q_x, q_y) @ turn.T)
+
+    def test_far_from_a_load_on_a_thick_layer_it_is_cerrutis(self):
+        layer = Layer(thickness_mm=100.0, poisson=0.3)
+        solver = FrictionSolver(layer, 64, 0.5, torch.float64, boxed=False)
+        load = np.zeros((1, 2, 64, 64))
+        load[0, 0, 10, 10] = 1.0
+        moved = solver.displacement_mm(load)[0]
+        for right, back in ((6, 0), (0, 6), (4, 4), (3, 5)):
+            x_mm, y_mm = 0.5 * right, 0.5 * back
+            r_mm = np.hypot(x_mm, y_mm)
+            unit = 0.25 / (2 * np.pi * layer.shear_modulus_mpa * r_mm)
+            expected = unit * np.array([1 - 0.3 + 0.3 * (x_mm / r_mm) ** 2, 0.3 * x_mm * y_mm / r_mm**2])
+            found = moved[:, 10 + back, 10 + right]
+            # Measured 3.8 %: a layer 30 distances thick is stiffer than a half-space, by about r / h.
+            assert np.abs(found - expected).max() < 0.05 * unit
+
+
+class TestFriction:
+    def test_a_stuck_disc_on_a_thick_layer_is_as_stiff_as_mindlins(self, thick):
+        disc = (radius_mm(36, FINE_MM) <= 3.0).astype(float)
+        result = push(thick, disc, (0.1, 0.0), friction=1e6, tolerance=1e-4)
+        a_mm = np.sqrt(disc.sum() * FINE_MM**2 / np.pi)
+        expected_n = 8 * a_mm * THICK.shear_modulus_mpa / (2 - THICK.poisson) * 0.1
+        # Measured 1.4 % above: cells, and a layer 20 radii thick.
+        assert result.force_n[0, 0] == pytest.approx(expected_n, rel=0.03)
+        assert abs(result.force_n[0, 1]) < 1e-4 * expected_n
+        assert result.stick[0].sum() == disc.sum()
+
+    def test_a_stuck_disc_turns_as_hard_as_reissners(self, thick):
+        disc = (radius_mm(36, FINE_MM) <= 3.0).astype(float)
+        result = push(thick, disc, twist_rad=0.05, friction=1e6, tolerance=1e-4)
+        a_mm = np.sqrt(disc.sum() * FINE_MM**2 / np.pi)
+        expected_nmm = 16 / 3 * THICK.shear_modulus_mpa * a_mm**3 * 0.05
+        # Measured 2.3 % below: a disc of square cells.
+        assert result.moment_nmm[0] == pytest.approx(expected_nmm, rel=0.03)
+        assert np.abs(result.force_n).max() < 1e-4 * expected_nmm
+
+    @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+    def test_a_sphere_slips_around_a_circle_as_cattaneo_and_mindlin_have_it(self, thick, share):
+        size, cell_mm, a_mm, friction = 36, FINE_MM, 3.0, 0.4
+        pressure = 0.05 * np.sqrt(np.maximum(1 - (radius_mm(size, cell_mm) / a_mm) ** 2, 0))
+        load_n = pressure.sum() * cell_mm**2
+        shear, nu = THICK.shear_modulus_mpa, THICK.poisson
+        slide_mm = 3 * friction * load_n * (2 - nu) / (16 * shear * a_mm) * (1 - (1 - share) ** (2 / 3))
+        result = push(thick, pressure, (slide_mm, 0.0), friction=friction, tolerance=1e-4)
+        c_mm = np.sqrt(result.stick[0].sum() * cell_mm**2 / np.pi)
+        # Measured 1.1 to 2.2 % and .001 to .014.
+        assert result.force_n[0, 0] == pytest.approx(share * friction * load_n, rel=0.03)
+        assert c_mm / a_mm == pytest.approx((1 - share) ** (1 / 3), abs=0.03)
+
+    def test_thin_pads_shear_cell_by_cell(self):
+        layer = Layer(thickness_mm=0.05, poisson=0.3)
+        pressure = np.full((SIZE, SIZE), 0.5)
+        result = push(FrictionSolver(layer, SIZE, CELL_MM, torch.float64), pressure, (0.003, -0.004), friction=1e3)
+        inner = result.traction_mpa[0, :, 2:-2, 2:-2]
+        expected = np.array([0.003, -0.004]) * layer.shear_modulus_mpa / layer.thickness_mm
+        assert np.allclose(inner, expected[:, None, None], rtol=0.01)
+
+    def test_sliding_bears_mu_p_everywhere_against_the_slip(self):
+        pressure = 0.1 * (radius_mm(centre_mm=(2.0, 1.0)) < 5.0)
+        result = push(FrictionSolver(Layer(), SIZE, CELL_MM), pressure, (30.0, 40.0), friction=0.7, tolerance=1e-3)
+        assert not result.stick.any()
+        size = np.hypot(*result.traction_mpa[0])
+        assert np.allclose(size, 0.7 * pressure, rtol=1e-4)
+        direction = result.traction_mpa[0, :, pressure > 0] / size[pressure > 0][:, None]
+        assert np.abs(direction - [0.6, 0.8]).max() < 0.05
+
+    def test_forces_and_moments_are_those_of_the_tractions_and_the_law_holds(self):
+        rng = np.random.default_rng(2)
+        depth = np.where(radius_mm(centre_mm=(-1.0, 3.0)) < 6, 0.0, NOTHING_MM).astype(np.float32)
+        pressure = ContactSolver(Layer(), SIZE, CELL_MM).solve(depth[None], 0.2).pressure_mpa[0]
+        solver = FrictionSolver(Layer(), SIZE, CELL_MM, torch.float64)
+        sticking = 0
+        for _ in range(5):
+            slide, twist, friction = rng.normal(0, 0.1, 2), rng.normal(0, 0.02), rng.uniform(0.3, 0.8)
+            result = push(solver, pressure, slide, twist, friction)
+            traction = result.traction_mpa[0].astype(float)
+            along = cells_mm()
+            assert np.allclose(result.force_n[0], traction.sum(axis=(1, 2)) * CELL_MM**2, rtol=1e-5)
+            moment = ((along * traction[1]) - along[:, None] * traction[0]).sum() * CELL_MM**2
+            assert result.moment_nmm[0] == pytest.approx(moment, rel=1e-5)
+            size, limit = np.hypot(*traction), friction * pressure
+            assert (size <= limit * (1 + 1e-5)).all()
+            # What a cell slips, the surface less the pad: none where it sticks, along its traction where it slips.
+            moved = np.stack(np.broadcast_arrays(slide[0] - twist * along[:, None], slide[1] + twist * along))
+            slip = moved - solver.displacement_mm(result.traction_mpa)[0]
+            scale = np.sqrt((moved**2).mean())
+            assert np.abs(slip[:, result.stick[0]]).max(initial=0.0) < 2e-3 * scale
+            slipping = (pressure > 0) & ~result.stick[0]
+            across = slip[0] * traction[1] - slip[1] * traction[0]
+            assert np.abs(across[slipping] / size[slipping]).max(initial=0.0) < 2e-3 * scale
+            assert ((slip * traction).sum(axis=0)[slipping] / size[slipping]).min(initial=0.0) > -2e-3 * scale
+            sticking += result.stick[0].sum()
+            # The pad's work is symmetric: C is.
+            other = rng.normal(size=(1, 2, SIZE, SIZE))
+            there = (solver.displacement_mm(other)[0] * traction).sum()
+            assert there == pytest.approx((solver.displacement_mm(result.traction_mpa)[0] * other[0]).sum(), rel=1e-3)
+        assert 0 < sticking < 5 * (pressure > 0).sum()
+
+    def test_a_press_that_friction_holds_spreads_nothing_and_pushes_nowhere(self):
+        layer = Layer()
+        pressure = 0.1 * np.exp(-((radius_mm(centre_mm=(1.0, -2.0)) / 3.0) ** 2)) + 1e-4
+        solver = FrictionSolver(layer, SIZE, CELL_MM, torch.float64)
+        still = np.zeros((1, 2)), np.zeros(1), np.full(1, 1e6)
+        free = solver.spread_mm(pressure[None])[0]
+        # Outwards at nu = .45: the pad is squeezed out from under a wide load.
+        outwards = (free[0] * (cells_mm()[None, :] - 1.0) + free[1] * (cells_mm()[:, None] + 2.0))[radius_mm() < 5]
+        assert outwards.mean() > 0
+        held = solver.solve(pressure[None], *still, tolerance=1e-4, holds_spread=True)
+        assert held.stick.all()
+        left = solver.displacement_mm(held.traction_mpa)[0] + free
+        assert np.sqrt((left**2).mean()) < 2e-4 * np.sqrt((free**2).mean())
+        assert not solver.solve(pressure[None], *still).traction_mpa.any()
+        # By reciprocity the work of any traction on the spread is the pressure's on what the traction sinks.
+        q_x = 2 * np.pi * np.fft.fftfreq(4 * SIZE, CELL_MM)[None, :]
+        q = np.hypot(q_x, q_x.T)
+        sunk = inner_tangential(layer, q, layer.thickness_mm).sunk / np.where(q > 0, q, 1)
+        right = np.zeros((SIZE, SIZE))
+        right[5:20, 8:30] = 0.02
+        down = np.fft.ifft2(1j * q_x * sunk * np.fft.fft2(right, s=q.shape)).real[:SIZE, :SIZE]
+        # Measured .4 %: the grids repeat themselves after different distances.
+        assert (down * pressure).sum() == pytest.approx((free[0] * right).sum(), rel=0.01)
+
+    def test_a_turned_push_is_the_push_turned(self):
+        pressure = 0.1 * (radius_mm(centre_mm=(3.0, -2.0)) < 4.0)
+        solver = FrictionSolver(Layer(), SIZE, CELL_MM, torch.float64)
+        first = push(solver, pressure, (0.1, 0.04), 0.01, 0.5).traction_mpa[0]
+        # np.rot90 turns from back to right: (x, y) to (y, -x).
+        turned = push(solver, np.rot90(pressure).copy(), (0.04, -0.1), 0.01, 0.5).traction_mpa[0]
+        assert np.allclose(turned[0], np.rot90(first[1]), atol=1e-4)
+        assert np.allclose(turned[1], -np.rot90(first[0]), atol=1e-4)
+
+    def test_a_batch_in_boxes_is_each_pose_on_the_whole_pad_and_the_residual_tells_the_error(self):
+        rng = np.random.default_rng(0)
+        pressure = np.stack(
+            [0.1 * (radius_mm(centre_mm=rng.uniform(-7, 7, 2)) < rng.uniform(0.4, 8)) for _ in range(12)]
+        )
+        pressure[3] = 0.0
+        slide, twist, friction = rng.normal(0, 0.2, (12, 2)), rng.normal(0, 0.02, 12), rng.uniform(0.2, 1, 12)
+        friction[4] = 0.0
+        fast = FrictionSolver(Layer(), SIZE, CELL_MM).solve(pressure, slide, twist, friction)
+        exact = FrictionSolver(Layer(), SIZE, CELL_MM, torch.float64, boxed=False)
+        assert fast.residual.max() < 1e-3
+        assert not fast.traction_mpa[3:5].any()
+        assert not fast.stick[3:5].any()
+        for pose in set(range(12)) - {3, 4}:
+            one = push(exact, pressure[pose], slide[pose], twist[pose], friction[pose])
+            # Measured 0.2 % at most.
+            assert np.linalg.norm(one.force_n[0] - fast.force_n[pose]) < 0.01 * np.linalg.norm(one.force_n[0])
+
+    def test_what_does_not_fit_is_refused(self):
+        solver = FrictionSolver(Layer(), SIZE, CELL_MM)
+        pressure = np.ones((2, SIZE, SIZE))
+        with pytest.raises(ValueError, match=r"slide, twist and friction of shapes .* expected .*\(2, 2\)"):
+            solver.solve(pressure, np.zeros(2), np.zeros(2), np.ones(2))
+        with pytest.raises(ValueError, match=r"friction is -1\.0, expected 0 or more"):
+            solver.solve(pressure, np.zeros((2, 2)), np.zeros(2), np.array([1.0, -1.0]))
+        with pytest.raises(ValueError, match="a slide is not finite"):
+            solver.solve(pressure, np.full((2, 2), np.nan), np.zeros(2), np.ones(2))
+
+
+class TestMagnets:
+    RIGHT, BACK, DOWN, LEAN_X, LEAN_Y = range(5)
+
+    def test_an_even_traction_shears_the_layer_evenly(self):
+        layer = Layer(thickness_mm=3.0)
+        magnet = Magnet(diameter_mm=1e-6)  # a needle leans with the material along it
+        response = traction_response(USPA44, layer, 61, 0.47, magnet).reshape(16, 5, 2, -1).sum(axis=-1)
+        middle = response[[5, 6, 9, 10]]
+        # Measured 2 %: the pad of 29 mm ends.
+        assert np.allclose(middle[:, self.RIGHT, 0], magnet.height_mm / layer.shear_modulus_mpa, rtol=0.03)
+        assert np.allclose(middle[:, self.LEAN_X, 0], 1 / layer.shear_modulus_mpa, rtol=0.03)
+        assert np.allclose(response[:, self.RIGHT, 0].reshape(4, 4), response[:, self.BACK, 1].reshape(4, 4).T)
+
+    def test_the_sums_are_those_of_whole_complex_waves(self):
+        layer, magnet, size, cell_mm = Layer(), Magnet(), 20, 1.0
+        response = traction_response(USPA44, layer, size, cell_mm, magnet).reshape(16, 5, 2, size, size)
+        q_x = 2 * np.pi * np.fft.fftfreq(4 * size, cell_mm)[None, :]
+        q_y = 2 * np.pi * np.fft.fftfreq(4 * size, cell_mm)[:, None]
+        q = np.hypot(q_x, q_y)
+        fields = [inner_tangential(layer, q, magnet.height_mm + shift) for shift in (-1e-3, 0.0, 1e-3)]
+        waves = np.stack([q_x + 0 * q, q_y + 0 * q]) / np.where(q > 0, q, 1)
+        inside = [
+            field.across * np.eye(2)[:, :, None, None] + (field.along - field.across) * waves[:, None] * waves
+            for field in fields
+        ]
+        down = 1j * fields[1].sunk * waves
+        slope_down = 1j * np.stack([q_x + 0 * q, q_y + 0 * q])[:, None] * down
+        shape = (0.25 - 1) / (0.25 + 1)
+        lean = (1 + shape) / 2 * (inside[2] - inside[0]) / 2e-3 + (1 - shape) / 2 * slope_down
+        transfers = np.concatenate([inside[1], down[None], lean])
+        for taxel in (0, 6):
+            x_mm, y_mm = USPA44.taxel_centres_mm()[taxel]
+            wave_x = np.exp(1j * q_x.T * (x_mm - cells_mm(size, cell_mm)))
+            wave_y = np.exp(1j * q_y * (y_mm - cells_mm(size, cell_mm)))
+            expected = (wave_y.T @ transfers @ wave_x).real / (4 * size) ** 2
+            # They differ in the one highest wave of both axes, whose phase no grid tells.
+            assert np.allclose(response[taxel], expected, atol=1e-5 * np.abs(expected).max())
+
+    def test_readings_follow_the_traction_and_are_as_before_without(self):
+        skin = Skin(USPA44, Layer(), SIZE, CELL_MM)
+        pressure = np.full((1, 1, SIZE, SIZE), 0.01, dtype=np.float32)
+        alone = skin.frames(pressure)
+        right = np.zeros((1, 1, 2, SIZE, SIZE), dtype=np.float32)
+        assert np.array_equal(skin.frames(pressure, right), alone)
+        right[:, :, 0] = 0.005
+        changed = (skin.frames(pressure, right) - alone)[0, 0]
+        assert (changed[0] > 50).all()
+        assert np.abs(changed[1]).max() < 0.2 * changed[0].min()
+        back = right[:, :, ::-1].copy()
+        turned = (skin.frames(pressure, back) - alone)[0, 0]
+        assert np.allclose(turned[1], changed[0].T, atol=0.05)
+
+    def test_tractions_that_do_not_fit_are_refused(self):
+        skin = Skin(USPA44, Layer(), SIZE, CELL_MM)
+        with pytest.raises(ValueError, match=r"expected \(3, 2, 42, 42\): two for every pressure"):
+            skin.movement(np.zeros((3, SIZE, SIZE)), np.zeros((3, SIZE, SIZE)))
+
+
+@pytest.mark.parametrize(("thickness_mm", "poisson"), [(2.0, 0.3), (3.0, 0.4)])
+def test_a_patch_pushed_along_moves_a_block_of_finite_elements_as_the_layer(thickness_mm, poisson):
+    felupe = pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+    from scipy.sparse.linalg import cg
+
+    # Free sides give way: a block of eight thicknesses does not feel them, one of five did by 8 % in its middle plane.
+    layer, step_mm, across, high = Layer(thickness_mm, poisson=poisson), thickness_mm / 6, 49, 9
+    nodes_mm = (np.arange(across) - (across - 1) / 2) * step_mm
+    mesh = felupe.Grid(nodes_mm, nodes_mm, np.linspace(0, thickness_mm, high))
+    field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(mesh), dim=3)])
+    elastic = felupe.LinearElastic(E=2 * layer.shear_modulus_mpa * (1 + poisson), nu=poisson)
+    stiffness = felupe.SolidBody(elastic, field).assemble.matrix().tocsr()
+    patch = np.exp(-(((nodes_mm[None, :] - 0.4) ** 2 + nodes_mm[:, None] ** 2) / 1.6**2)) * 1e-3  # [MPa]
+    push_n = np.zeros((high, across, across, 3))
+    push_n[-1, :, :, 0] = patch * step_mm**2
+    free = np.arange(across**2 * 3, stiffness.shape[0])
+    moved_mm = np.zeros(push_n.size)
+    solution, unfinished = cg(stiffness[free][:, free], push_n.ravel()[free], rtol=1e-7, maxiter=3000)
+    assert not unfinished
+    moved_mm[free] = solution
+    moved_mm = moved_mm.reshape(high, across, across, 3)
+
+    wide = 4 * across
+    wave = np.fft.fft2(patch, s=(wide, wide))
+    q_x, q_y = 2 * np.pi * np.fft.fftfreq(wide, step_mm)[None, :], 2 * np.pi * np.fft.fftfreq(wide, step_mm)[:, None]
+    q = np.hypot(q_x, q_y)
+    inside = (np.abs(nodes_mm) < 5)[:, None] & (np.abs(nodes_mm) < 5)
+    for layer_of_nodes in (high - 1, high // 2):
+        response = inner_tangential(layer, q, thickness_mm * layer_of_nodes / (high - 1))
+        extra = np.divide(response.along - response.across, q**2, out=np.zeros_like(q), where=q > 0)
+        sunk = np.divide(response.sunk, q, out=np.zeros_like(q), where=q > 0)
+        transfers = (response.across + extra * q_x**2, extra * q_x * q_y, -1j * sunk * q_x)
+        expected = [np.fft.ifft2(transfer * wave).real[:across, :across] for transfer in transfers]
+        found = np.moveaxis(moved_mm[layer_of_nodes], -1, 0)
+        errors = [np.abs(f - e)[inside].max() / np.abs(expected[0]).max() for f, e in zip(found, expected, strict=True)]
+        # Measured .9 to 1.2 % of the greatest displacement along, .1 to .6 % across and down.
+        assert errors[0] < 0.02
+        assert max(errors[1:]) < 0.01
