@@ -20,6 +20,7 @@ from edge.contract import (
     TRACTION_NAME,
     Contract,
 )
+from edge.runtime import Runtime
 from edge.sinks.base import Sink
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import Link
@@ -61,6 +62,19 @@ def make_contract(**changes) -> Contract:
         "traction_scale": None,
     }
     return Contract(**(values | changes))
+
+
+def make_pad_contract(**changes) -> Contract:
+    """Of a model that takes a pad and gives traction."""
+    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
+    return make_contract(**({"pad_inputs": pad_inputs, "takes_gains": True, "traction_scale": 2} | changes))
+
+
+def make_wrench_result(number: int = 0, press_counts: float = 20_000, **settings):
+    """What a model with traction makes of a press on taxel 5: .44 N there, where nothing is known of the pad."""
+    contract = make_pad_contract(interval_factor=1.6)
+    runtime = Runtime(FakeModel(contract), **{"source": "device", "baselines": {"4": BASELINE}} | settings)
+    return runtime.push(make_scan(number, press_counts=press_counts, time_ns=time.monotonic_ns()))
 
 
 def write_model(
