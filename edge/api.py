@@ -44,6 +44,7 @@ from edge.source import Source
 from edge.statistics import Statistics
 from edge.stream import Stream
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
+from edge.wrench import Wrench
 from edge.zeroing import take_baselines
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import (
@@ -59,6 +60,7 @@ from firmware_bridge.errors import (
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.source import DEMO_LOOP
+from firmware_bridge.pad import Pad
 from firmware_bridge.scan import Scan
 from firmware_bridge.sensor_file import SensorFile, load_sensor_file
 from firmware_bridge.xela import ID_MAPS
@@ -91,6 +93,7 @@ __all__ = [
     "Model",
     "ModelError",
     "NoDeviceError",
+    "Pad",
     "RecordingError",
     "Result",
     "Runtime",
@@ -107,6 +110,7 @@ __all__ = [
     "Stream",
     "UsageError",
     "WindowError",
+    "Wrench",
     "bundled_models",
     "demo_recording",
     "devices",
@@ -137,8 +141,8 @@ def open_source(
     Args:
         texts: what `edge-sr --source` takes: "slcan:serial=D30BL366", "replay:FILE", "demo", ...; several with names,
             "left=slcan:...". Without any, the adapter of the sensor file, or the one that is plugged in.
-        sensor: file that `edge-sr doctor` wrote. How its sensors sit, their baselines and their counts per newton hold
-            for every runtime of this source; it goes before what a recording tells.
+        sensor: file that `edge-sr doctor` wrote. How its sensors sit, their baselines, their counts per newton and
+            their pads hold for every runtime of this source; it goes before what a recording tells.
         id_map: which CAN id is which taxel, one of ID_MAPS.
         rate_hz: plays a recording at this rate; of a device, what its patterns' deadlines are by, in [Hz].
         give_up_s: how long a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
@@ -183,6 +187,7 @@ def open_runtime(
     *,
     baselines: Mapping[str, Baseline] | str | Path | None = None,
     counts_per_newton: float | Mapping[str, float] | None = None,
+    pad: Pad | Mapping[str, Pad] | None = None,
     contact_on_counts: float = ON_COUNTS,
     contact_off_counts: float = OFF_COUNTS,
     idle_reset_s: float = IDLE_TIMEOUT_S,
@@ -200,6 +205,8 @@ def open_runtime(
             zeroed from its first 100 scans, its pad still and free meanwhile.
         counts_per_newton: summed z per [N], of all sensors or by name; by default as the sensor file says. A name that
             is never heard is told as an event.
+        pad: what is known of the pad of all sensors, or of each by name, for models that take any of it; by default as
+            the sensor file says.
         contact_on_counts: summed z at which a tap begins.
         contact_off_counts: summed z at which it ends.
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
@@ -221,6 +228,7 @@ def open_runtime(
         baselines=references(baselines, known),
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
+        pad=known.pads if pad is None else pad,
         on_counts=contact_on_counts,
         off_counts=contact_off_counts,
         idle_timeout_s=idle_reset_s,

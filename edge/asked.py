@@ -8,6 +8,7 @@ from typing import Any
 from edge.errors import UsageError
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.pad import Pad
 
 
 def check_positive(name: str, number: Any) -> None:
@@ -47,3 +48,17 @@ def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
         if baseline.counts.shape != geometry.scan_shape:
             got = f"baseline of sensor {name} has shape {baseline.counts.shape}"
             raise UsageError(f"{got}, expected {geometry.scan_shape}: zero again")
+
+
+def check_pads(pads: Any) -> None:
+    """A pad of all sensors, or pads by the names of theirs, or None.
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    if isinstance(pads, Mapping):
+        for name, pad in pads.items():
+            if not isinstance(pad, Pad):
+                raise UsageError(f"pad of sensor {name} is a {type(pad).__name__}, expected a Pad")
+    elif pads is not None and not isinstance(pads, Pad):
+        raise UsageError(f"pad is a {type(pads).__name__}, expected a Pad, or each by its sensor's name")

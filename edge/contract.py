@@ -1,7 +1,7 @@
 """The one agreement between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from types import MappingProxyType
 from typing import Any, Final
@@ -11,13 +11,20 @@ from numpy.typing import NDArray
 
 from edge.confidence import is_confidence, is_number
 from edge.errors import ModelError
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.geometry import AXES, SensorGeometry
+from firmware_bridge.pad import PAD_RANGES, Pad
 
-CONTRACT_VERSION: Final = 4
+CONTRACT_VERSION: Final = 5
+EARLIER_VERSION: Final = 4
+"""Still loaded; its files lack the keys of ADDED."""
+ADDED: Final = ("pad_inputs", "takes_gains", "traction_scale")
+"""Keys that version 5 brought; without them a model takes no pad and gives no traction."""
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
+PAD_NAME: Final = "pad"
 OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
+TRACTION_NAME: Final = "traction"
 ANY_BATCH: Final = "any"
 """Of a graph that takes as many windows in one run as it is given; its first dimension bears this name."""
 ARITHMETICS: Final = ("float32", "int8")
@@ -32,8 +39,12 @@ LEAST_UNIT: Final = 1e-6
 """Of counts, newtons or millimetres that something is divided by, so that float32 holds what comes out."""
 STAND_IN_KEYS: Final = (
     *("scale", "angle_step_deg", "output_unit", "output_full_scale", "sensor", "rows", "cols", "pitch_mm"),
+    "traction_scale",
 )
 """What two models must share for one to take over from the other: the same taps, and patterns of one meaning."""
+
+Shape = tuple[int | str, *tuple[int, ...]]
+"""Of an input or output: the batch first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +74,9 @@ class Contract:
         training_sha256: of the training configuration.
         test_set_sha256: of the frozen test set that `test_error` was measured on.
         test_error: number of taps given -> metric name -> value; empty where the test set has another scale.
+        pad_inputs: what the model takes of the pad, see `pad_row`: name in PAD_RANGES, centre and spread of each.
+        takes_gains: it takes windows of taxels whose gains are evened out, and wants to know where they are.
+        traction_scale: traction pixels per taxel pitch; None where the model gives no traction.
     """
 
     version: int
@@ -85,6 +99,9 @@ class Contract:
     training_sha256: str
     test_set_sha256: str
     test_error: dict[str, dict[str, float]]
+    pad_inputs: tuple[tuple[str, float, float], ...] = ()
+    takes_gains: bool = False
+    traction_scale: int | None = None
 
     @property
     def window_shape(self) -> tuple[int | str, int, int, int]:
@@ -97,29 +114,53 @@ class Contract:
         return (self.rows * self.scale, self.cols * self.scale)
 
     @property
-    def output_shapes(self) -> dict[str, tuple[int | str, int, int]]:
-        """Shapes (batch, H, W) of the graph's outputs by name: the pattern, and its deviation if there is one."""
-        names = (OUTPUT_NAME,) if self.interval_factor is None else (OUTPUT_NAME, DEVIATION_NAME)
-        return dict.fromkeys(names, (self.batch, *self.pattern_shape))
+    def pad_width(self) -> int:
+        """Numbers that the model takes of each pad; 0 where it takes none."""
+        return 2 * len(self.pad_inputs) + self.takes_gains
+
+    @property
+    def traction_shape(self) -> tuple[int, int, int] | None:
+        """Shape (3, h, w) of the traction x, y, z; None where the model gives none."""
+        scale = self.traction_scale
+        return None if scale is None else (len(AXES), self.rows * scale, self.cols * scale)
+
+    @property
+    def input_shapes(self) -> dict[str, Shape]:
+        """Shapes of the graph's inputs by name: the window, and the pad if it takes any of it."""
+        shapes: dict[str, Shape] = {INPUT_NAME: self.window_shape}
+        return shapes | ({PAD_NAME: (self.batch, self.pad_width)} if self.pad_width else {})
+
+    @property
+    def output_shapes(self) -> dict[str, Shape]:
+        """Shapes of the graph's outputs by name: the pattern, and its deviation and the traction if there are any."""
+        shapes: dict[str, Shape] = {OUTPUT_NAME: (self.batch, *self.pattern_shape)}
+        if self.interval_factor is not None:
+            shapes[DEVIATION_NAME] = (self.batch, *self.pattern_shape)
+        if self.traction_shape is not None:
+            shapes[TRACTION_NAME] = (self.batch, *self.traction_shape)
+        return shapes
 
     def to_metadata(self) -> dict[str, str]:
         """The contract as the string map that ONNX metadata holds."""
-        return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items()}
+        keys = _keys(self.version)
+        return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items() if key in keys}
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "Contract":
-        """Read and check a contract.
+        """Read and check a contract, of this version or the one before.
 
         Raises:
             ModelError: a key is missing, unreadable or out of range; the key is named.
         """
         version = _value(metadata, "version")
-        if version != CONTRACT_VERSION:  # before the other keys, which another version may not have
-            expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
+        # Before the other keys, which another version may not have.
+        if version not in (CONTRACT_VERSION, EARLIER_VERSION):
+            expected = f"expected {CONTRACT_VERSION} or {EARLIER_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {field.name: _value(metadata, field.name) for field in fields(cls)}
+        values = {key: _value(metadata, key) for key in _keys(version)}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
+        values["pad_inputs"] = tuple(map(tuple, values.get("pad_inputs", ())))
         return cls(**values)
 
     def check_sensor(self, geometry: SensorGeometry) -> None:
@@ -150,10 +191,43 @@ class Contract:
             if got != expected:
                 raise ModelError(f"contract key '{key}' is {got!r}, that of the model before {expected!r}")
 
-    def scale_window(self, deformation_counts: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Zeroed counts (taps, 3, rows, cols) to network input units, same shape."""
+    def scale_window(
+        self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float32]:
+        """Zeroed counts (taps, 3, rows, cols) to network input units, same shape.
+
+        Args:
+            deformation_counts: as they were read.
+            gains: (3, rows, cols) that they are divided by, where they are known and the model takes them.
+        """
         divisor = np.asarray(self.counts_per_unit, dtype=np.float32)[None, :, None, None]
-        return deformation_counts / divisor
+        return deformation_counts / (divisor if gains is None else divisor * gains)
+
+    def pad_row(self, pad: Pad | None) -> NDArray[np.float32]:
+        """A pad as the model takes it.
+
+        Args:
+            pad: what is known of it, if anything.
+
+        Returns:
+            (pad_width,) float32: of each of `pad_inputs` (value - centre) / spread, 0 where it is not known; then 1
+            for each that is and 0 for each that is not; at last, where the model takes gains, the same of these.
+        """
+        row = np.zeros(self.pad_width, dtype=np.float32)
+        known = {} if pad is None else pad.constants
+        for index, (name, centre, spread) in enumerate(self.pad_inputs):
+            if name in known:
+                row[index] = (known[name] - centre) / spread
+                row[len(self.pad_inputs) + index] = 1
+        if self.takes_gains and pad is not None and pad.gains is not None:
+            row[-1] = 1
+        return row
+
+
+def _keys(version: int) -> list[str]:
+    """Keys of a contract of this version."""
+    names = [field.name for field in fields(Contract)]
+    return [name for name in names if name not in ADDED] if version == EARLIER_VERSION else names
 
 
 def _value(metadata: Mapping[str, str], key: str) -> Any:
@@ -210,3 +284,29 @@ def _check(values: Mapping[str, Any]) -> None:
     error = values["test_error"]
     if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
         refuse("test_error", "a map from taps to metrics")
+    _check_pad_and_traction(values, refuse)
+
+
+def _check_pad_and_traction(values: Mapping[str, Any], refuse: Callable[[str, str], None]) -> None:
+    """Check the keys of ADDED, where they are there."""
+    inputs = values.get("pad_inputs", [])
+    if not isinstance(inputs, list) or not all(map(_is_pad_input, inputs)):
+        expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"
+        refuse("pad_inputs", f"a list of [name, centre, spread], {expected}")
+    if len({name for name, _, _ in inputs}) < len(inputs):
+        refuse("pad_inputs", "no name twice")
+    if not isinstance(values.get("takes_gains", False), bool):
+        refuse("takes_gains", "true or false")
+    scale = values.get("traction_scale")
+    if scale is not None and (type(scale) is not int or not 1 <= scale <= MOST["scale"]):
+        refuse("traction_scale", f"a whole number from 1 to {MOST['scale']}, or null for a model without traction")
+    if scale is not None and len(AXES) * values["rows"] * values["cols"] * scale**2 > MOST_PIXELS:
+        refuse("traction_scale", f"tractions of at most {MOST_PIXELS} numbers")
+
+
+def _is_pad_input(value: Any) -> bool:
+    if not isinstance(value, list) or len(value) != 3 or not all(map(is_number, value[1:])):
+        return False
+    name, centre, spread = value
+    low, high = PAD_RANGES.get(name, (1.0, 0.0)) if isinstance(name, str) else (1.0, 0.0)
+    return low <= centre <= high and spread >= LEAST_UNIT

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from edge.event import Event
 from edge.result import Result, mask_bits
+from edge.wrench import Wrench
 from firmware_bridge.drift import Drift
 from firmware_bridge.scan import Scan
 
@@ -33,6 +34,8 @@ def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
         "interval_mm": _rounded(result.interval_mm, 5),
         "expected_rmse_mm": _rounded(result.expected_rmse_mm, 5),
         "another_tap": result.another_tap,
+        "wrench": None if result.wrench is None else _wrench(result.wrench),
+        "wrench_origin": result.wrench_origin,
         "reused_from": result.reused_from,
         "run_time_us": _rounded(result.run_time_us, 1),
         "latency_us": _rounded(result.latency_us, 1),
@@ -88,6 +91,15 @@ def _vendor(scan: Scan) -> dict[str, list[float] | float]:
     if scan.vendor is not None and scan.vendor.temperature_k is not None:
         said["temperature_k"] = round(float(np.nanmean(scan.vendor.temperature_k)), 2)
     return said
+
+
+def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
+    centre = wrench.centre_of_pressure_mm
+    return {
+        "force_n": [round(value, 4) for value in wrench.force_n],
+        "torque_n_mm": [round(value, 3) for value in wrench.torque_n_mm],
+        "centre_of_pressure_mm": None if centre is None else [round(value, 3) for value in centre],
+    }
 
 
 def _drift(drift: Drift | None) -> dict[str, Any] | None:

@@ -83,7 +83,12 @@ def open_recording(
     if sensor is None:  # else it is told which ones the file does not know
         sensors |= {track.sensor for track in recording.tracks}
     entries = {
-        name: SensorEntry(mountings.get(name, Mounting()), known.counts_per_newton.get(name), baselines.get(name))
+        name: SensorEntry(
+            mountings.get(name, Mounting()),
+            known.counts_per_newton.get(name),
+            baselines.get(name),
+            known.pads.get(name),
+        )
         for name in sorted(sensors)
     }
     known = replace(known, sensors=entries)

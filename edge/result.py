@@ -7,6 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.wrench import Wrench
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.drift import Drift
 from firmware_bridge.links.base import SourceKind
@@ -14,12 +15,13 @@ from firmware_bridge.scan import Scan
 
 MADE: Final = (
     *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),
-    *("expected_rmse_mm", "another_tap"),
+    *("expected_rmse_mm", "another_tap", "traction", "wrench", "wrench_origin"),
 )
 """Of a result, what is made of a pattern."""
 
 State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
 Filled = Literal["rest", "neighbours"]
+WrenchOrigin = Literal["calibrated", "nominal"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,11 @@ class Result:
             and y down, in [mm].
         interval_mm: how far a touched pixel may be off: half of the interval that holds 90 % of pixels, mean over the
             touched ones, in [mm]; None without a deviation.
+        traction: (3, h, w) float32, force on the pad per area along x, y and z, z into the pad, over the same face as
+            the pattern, in [kPa]; None without a pattern, or where the model gives none.
+        wrench: the traction summed up, see edge.wrench; None without.
+        wrench_origin: "calibrated" where the model was told the sensor's counts per newton, else "nominal": in the
+            sensitivity that it was trained for, which is not this sensor's own; None without a wrench.
         reused_from: number of the scan whose pattern this is, where nothing had changed beyond noise since; else None.
         expected_rmse_mm: RMS error that patterns so doubtful had on taps not trained on, in [mm]; None where not known.
         another_tap: whether another tap is expected to lower that error enough to be worth it; None where the model
@@ -88,6 +95,9 @@ class Result:
     area_mm2: float | None = None
     centroid_mm: tuple[float, float] | None = None
     interval_mm: float | None = None
+    traction: NDArray[np.float32] | None = None
+    wrench: Wrench | None = None
+    wrench_origin: WrenchOrigin | None = None
     reused_from: int | None = None
     expected_rmse_mm: float | None = None
     another_tap: bool | None = None

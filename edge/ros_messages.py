@@ -66,6 +66,7 @@ string record              # all of it as JSON, as in a line of jsonl:
 """,
     STD_HEADER,
 )
+Vector = tuple[float, float, float]
 _WARN, _ERROR, _INFO = 30, 40, 20
 _LEVELS: Final = {"lost": _ERROR, "silent": _WARN, "trouble": _WARN, "sink": _ERROR}
 
@@ -75,54 +76,66 @@ def frame_of(result: Result) -> str:
     return result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
 
 
-def force_xyz_n(result: Result) -> tuple[float, float, float] | None:
-    """Force on the pad in [N], x to the right, y down, z into the pad; None where it is known in counts alone.
+def force_and_torque(result: Result) -> tuple[Vector, Vector] | None:
+    """Force on the pad in [N] and torque about its middle in [N m]; x to the right, y down, z into the pad.
 
-    Our own calibration is of z alone: x and y are NaN, and known only where all of it is the vendor's.
+    All of it where the model gives traction. Else torques are NaN, and force is that which is known: our own
+    calibration is of z alone, so x and y are NaN, unless all of it is the vendor's; None where counts alone are known.
     """
+    if result.wrench is not None:
+        x, y, z = result.wrench.torque_n_mm
+        return result.wrench.force_n, (x / 1e3, y / 1e3, z / 1e3)
     if result.force_n is None:
         return None
     vendor = result.scan.vendor_force_n
-    return vendor if vendor is not None and vendor[2] == result.force_n else (math.nan, math.nan, result.force_n)
+    known = vendor is not None and vendor[2] == result.force_n
+    return (vendor if known else (math.nan, math.nan, result.force_n)), (math.nan,) * 3
 
 
 def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
-    """A map (H, W) as an Image of encoding 32FC1, in the map's unit, x to the right and y down."""
-    height, width = values.shape
+    """A map (H, W) as an Image of encoding 32FC1, in the map's unit, x to the right and y down.
+
+    A map (3, H, W) of vectors becomes one of 32FC3, with x, y, z of a pixel side by side.
+    """
+    pixels = np.ascontiguousarray(values if values.ndim == 2 else values.transpose(1, 2, 0), dtype="<f4")
+    height, width = pixels.shape[:2]
     return IMAGE.encode(
         {
             "header": {"stamp": stamp(unix_ns), "frame_id": frame},
             "height": height,
             "width": width,
-            "encoding": "32FC1",
+            "encoding": "32FC1" if values.ndim == 2 else "32FC3",
             "is_bigendian": 0,
-            "step": 4 * width,
-            "data": np.ascontiguousarray(values, dtype="<f4").view(np.uint8),
+            "step": pixels[0].nbytes,
+            "data": pixels.view(np.uint8),
         }
     )
 
 
 def image_map(data: bytes) -> NDArray[np.float32]:
-    """The map (H, W) in an Image that `image` made.
+    """The map (H, W), or (3, H, W), in an Image that `image` made.
 
     Raises:
         CdrError: it is no Image.
         ValueError: it is one of another kind.
     """
     said = IMAGE.decode(data)
-    if said["encoding"] != "32FC1" or said["is_bigendian"]:
-        raise ValueError(f"an image of encoding {said['encoding'][:20]!r}, expected 32FC1, little-endian")
-    return said["data"].view("<f4").reshape(said["height"], said["width"])
+    if said["encoding"] not in ("32FC1", "32FC3") or said["is_bigendian"]:
+        raise ValueError(f"an image of encoding {said['encoding'][:20]!r}, expected 32FC1 or 32FC3, little-endian")
+    pixels = said["data"].view("<f4")
+    if said["encoding"] == "32FC1":
+        return pixels.reshape(said["height"], said["width"])
+    return pixels.reshape(said["height"], said["width"], 3).transpose(2, 0, 1)
 
 
 def wrench(result: Result, unix_ns: int) -> bytes | None:
-    """Force on the pad; None where it is not known in [N]."""
-    force_n = force_xyz_n(result)
-    if force_n is None:
+    """Force on the pad and torque; None where force is not known in [N]."""
+    known = force_and_torque(result)
+    if known is None:
         return None
     header = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
-    force, unknown = dict(zip("xyz", force_n, strict=True)), dict.fromkeys("xyz", math.nan)
-    return WRENCH_STAMPED.encode({"header": header, "wrench": {"force": force, "torque": unknown}})
+    force, torque = (dict(zip("xyz", vector, strict=True)) for vector in known)
+    return WRENCH_STAMPED.encode({"header": header, "wrench": {"force": force, "torque": torque}})
 
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:

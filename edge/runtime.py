@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.asked import check_baselines, check_positive, check_whole
+from edge.asked import check_baselines, check_pads, check_positive, check_whole
 from edge.confidence import expect
 from edge.contract import MOST, Contract
 from edge.errors import ModelError, WindowError
@@ -18,10 +18,12 @@ from edge.result import MADE, Result
 from edge.rezero import REFUSED
 from edge.sensor import Sensor
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
+from edge.wrench import wrench_of
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import Pad
 from firmware_bridge.scan import Scan
 
 OLD_NS: Final = 50_000_000
@@ -36,17 +38,24 @@ class Model(Protocol):
     name: str
     contract: Contract
 
-    def run(self, window: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Pattern (H, W) of a window (taps, 3, rows, cols) in network input units."""
+    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Pattern (H, W) of a window (taps, 3, rows, cols) in network input units, and of a `Contract.pad_row`."""
         ...
 
-    def run_together(self, windows: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run_together(
+        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
+    ) -> NDArray[np.float32]:
         """Patterns (n, H, W) of several windows in one call."""
         ...
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
         """Standard deviation of each pixel of the last run's patterns, of their shape; None where there is none."""
+        ...
+
+    @property
+    def traction(self) -> NDArray[np.float32] | None:
+        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]; None where there is none."""
         ...
 
 
@@ -63,6 +72,8 @@ class Runtime:
         counts_per_newton: summed z per [N], of all sensors or by name; without it a force in newtons is the vendor's,
             where the scan has one.
         mountings: which way a sensor's axes point, and its gains, by name; as wired without.
+        pad: what is known of the pad of all sensors, or of each by name, for models that take any of it. Counts per
+            newton that it lacks are those above.
         on_counts: summed z at which a tap begins.
         off_counts: summed z at which it ends.
         idle_timeout_s: time without contact after which earlier taps are forgotten.
@@ -76,8 +87,8 @@ class Runtime:
 
     Raises:
         ModelError: the model is for another sensor.
-        UsageError: contact thresholds, an idle time-out, counts per newton or a number of taps that cannot be, or a
-            baseline of another grid.
+        UsageError: contact thresholds, an idle time-out, counts per newton, a pad or a number of taps that cannot be,
+            or a baseline of another grid.
     """
 
     def __init__(
@@ -90,6 +101,7 @@ class Runtime:
         baselines: Mapping[str, Baseline] | None = None,
         counts_per_newton: float | Mapping[str, float] | None = None,
         mountings: Mapping[str, Mounting] | None = None,
+        pad: Pad | Mapping[str, Pad] | None = None,
         on_counts: float = ON_COUNTS,
         off_counts: float = OFF_COUNTS,
         idle_timeout_s: float = IDLE_TIMEOUT_S,
@@ -107,6 +119,7 @@ class Runtime:
                 check_positive(f"counts_per_newton of sensor {name}", counts)
         elif counts_per_newton is not None:
             check_positive("counts_per_newton", counts_per_newton)
+        check_pads(pad)
         check_whole("most_taps", most_taps, 1, MOST["taps"])
         self._model = model
         self._most_taps = max(most_taps, model.contract.taps)
@@ -116,6 +129,7 @@ class Runtime:
         self._geometry = geometry
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
+        self._pad = pad
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._thresholds = (on_counts, off_counts, idle_timeout_s)
@@ -177,6 +191,8 @@ class Runtime:
         if model.contract.taps > self._most_taps:
             raise ModelError(f"contract key 'taps' is {model.contract.taps}, but {self._most_taps} are remembered")
         self._model = model
+        for sensor in self._sensors.values():
+            sensor.take_pad(model.contract)
         self._tell(why)
 
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
@@ -192,7 +208,8 @@ class Runtime:
 
         Raises:
             WindowError: a scan is not of this sensor geometry.
-            ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
+            ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
+                above zero.
         """
         results: list[Result] = []
         due: dict[int, _Due] = {}
@@ -278,15 +295,17 @@ class Runtime:
         start_ns = self._clock_ns()
         windows = []
         for index, touch in due.items():
-            window = contract.scale_window(touch.window[: contract.taps])
+            window = contract.scale_window(touch.window[: contract.taps], touch.sensor.gains)
             window[results[index].taps_used :] = 0
             windows.append(window)
-        patterns = self._model.run_together(windows)
+        patterns = self._model.run_together(windows, [touch.sensor.pad_row for touch in due.values()])
         run_time_us = (self._clock_ns() - start_ns) / 1e3
-        deviations = self._model.deviation
+        deviations, tractions = self._model.deviation, self._model.traction
         for row, (index, touch) in enumerate(due.items()):
             deviation = None if deviations is None else deviations[row].copy()
             made = self._made(results[index], patterns[row].copy(), deviation, run_time_us)
+            if tractions is not None:
+                made = self._with_traction(made, tractions[row].copy(), touch.sensor)
             touch.sensor.keep(made, touch.window[0], touch.made_by)
             yield index, made
 
@@ -320,6 +339,15 @@ class Runtime:
             run_time_us=run_time_us,
         )
 
+    def _with_traction(self, result: Result, traction: NDArray[np.float32], sensor: Sensor) -> Result:
+        pixel_mm = self._geometry.rows * self._geometry.pitch_mm / traction.shape[1]
+        return replace(
+            result,
+            traction=traction,
+            wrench=wrench_of(traction, pixel_mm),
+            wrench_origin=sensor.wrench_origin,
+        )
+
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor
         baseline = self._baselines.get(name)
@@ -337,6 +365,8 @@ class Runtime:
         )
         per_newton = self._counts_per_newton
         sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton
+        sensor.pad = self._pad.get(name) if isinstance(self._pad, Mapping) else self._pad
+        sensor.take_pad(self._model.contract)
         if baseline is not None:
             age_s = baseline.age_s(self._unix_time_s())
             # Taken in the future it cannot have been: one of the two clocks was wrong.

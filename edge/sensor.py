@@ -2,13 +2,15 @@
 
 import time
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.contract import Contract
 from edge.estimate import Filler, Readings, TaxelEstimator
-from edge.result import Result
+from edge.result import Result, WrenchOrigin
 from edge.rezero import GIVEN_UP, Rezeroing, in_contact
 from edge.scene import LastReading, TapsThatMatter
 from edge.taps import TapTracker
@@ -16,8 +18,9 @@ from edge.taxels import TaxelWatch
 from firmware_bridge.baseline import Baseline, BaselineEstimator, deformation
 from firmware_bridge.drift import Drift, DriftTracker
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.geometry import AXES, SensorGeometry
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import Pad
 from firmware_bridge.scan import Scan
 
 LONGEST_GAP_NS: Final = 1_000_000_000
@@ -33,6 +36,11 @@ class Sensor:
         drift: what has become of the rest level since it was zeroed; None without a baseline.
         note: why there is no baseline yet, or how a zeroing on demand stands.
         drift_note: what the user should know of the rest level.
+        counts_per_newton: summed z per [N], if that is known.
+        pad: what is known of it.
+        pad_row: the same as the model takes it.
+        gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
+        wrench_origin: whether the model is told the counts per newton.
         events: what has happened to the zeroing since the last scan; whoever tells them clears them.
     """
 
@@ -57,6 +65,10 @@ class Sensor:
         self.drift_note: str | None = None
         self.events: list[str] = []
         self.counts_per_newton: float | None = None
+        self.pad: Pad | None = None
+        self.pad_row: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
+        self.gains: NDArray[np.float32] | None = None
+        self.wrench_origin: WrenchOrigin = "nominal"
         self.watch = TaxelWatch((geometry.rows, geometry.cols), mounting)
         self._mounting = mounting
         self._name = name
@@ -69,6 +81,19 @@ class Sensor:
         self._taken: Baseline | None = None
         self._taken_ns: int | None = None
         self._tracker: DriftTracker | None = None
+
+    def take_pad(self, contract: Contract) -> None:
+        """Make what is known of the pad ready for a model, once for all its runs."""
+        pad = self.pad
+        if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
+            pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
+        self.pad_row = contract.pad_row(pad)
+        self.gains = None
+        if contract.takes_gains and pad is not None and pad.gains is not None:
+            self.gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+        told = pad is not None and pad.counts_per_newton is not None
+        takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
+        self.wrench_origin = "calibrated" if told and takes else "nominal"
 
     def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
         """Subtract this from now on.

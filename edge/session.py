@@ -10,7 +10,7 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright: ignore[reportAttributeAccessIssue]
 
-from edge.contract import ANY_BATCH, DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
+from edge.contract import ANY_BATCH, DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.errors import ModelError, WindowError
 from edge.onnx_file import read_model
 
@@ -60,7 +60,7 @@ class ModelSession:
                     f"contract key 'batch' is {self.contract.batch}, but here the number of windows changes from run "
                     "to run: export it with --batch any"
                 )
-            _check_tensors("input", self._session.get_inputs(), {INPUT_NAME: self.contract.window_shape})
+            _check_tensors("input", self._session.get_inputs(), self.contract.input_shapes)
             _check_tensors("output", self._session.get_outputs(), self.contract.output_shapes)
         except ModelError as error:
             raise ModelError(f"{path}: {error}") from error
@@ -68,6 +68,8 @@ class ModelSession:
             raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
         self._runs: dict[int, _Run] = {}
         self._deviation: NDArray[np.float32] | None = None
+        self._traction: NDArray[np.float32] | None = None
+        self._unknown_pad = self.contract.pad_row(None)
         try:
             for _ in range(WARM_UP_RUNS):
                 self.run(np.zeros(self._shape, dtype=np.float32))
@@ -83,11 +85,20 @@ class ModelSession:
         """
         return self._deviation
 
-    def run(self, window: NDArray[np.float32]) -> NDArray[np.float32]:
+    @property
+    def traction(self) -> NDArray[np.float32] | None:
+        """Traction on the pad in the last run, in [kPa], or None where the model gives none.
+
+        (3, h, w) float32, or (n, 3, h, w) after n windows were run together: as `deviation`, the session's own array.
+        """
+        return self._traction
+
+    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """Infer the pattern of one window.
 
         Args:
             window: (taps, 3, rows, cols) float32, newest first, in network input units.
+            pad: what the contract's `pad_row` makes of the sensor's pad; without, nothing is known of it.
 
         Returns:
             (H, W) float32 in the contract's output unit: the session's own array, read-only, and
@@ -95,20 +106,26 @@ class ModelSession:
 
         Raises:
             WindowError: wrong shape or type, or not finite.
-            ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
+            ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
+                above zero.
         """
-        pattern = self.run_together([window])[0]
+        pattern = self.run_together([window], None if pad is None else [pad])[0]
         if self._deviation is not None:
             self._deviation = self._deviation[0]
+        if self._traction is not None:
+            self._traction = self._traction[0]
         return pattern
 
-    def run_together(self, windows: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run_together(
+        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
+    ) -> NDArray[np.float32]:
         """Infer the patterns of several windows in one call, as `run` does of one.
 
         A graph of one window a run is called once for each.
 
         Args:
             windows: one or more, of different sensors.
+            pads: of the same sensors; without, nothing is known of any.
 
         Returns:
             (n, H, W).
@@ -119,13 +136,22 @@ class ModelSession:
             if not np.isfinite(window).all():
                 raise WindowError("window has values that are not finite")
         count = len(windows)
+        pads = [self._unknown_pad] * count if pads is None else pads
+        for pad in pads:
+            if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
+                expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
+                raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
         run = self._runs.get(count) or self._runs.setdefault(count, _Run(self._session, self.contract, count))
-        for index, window in enumerate(windows):
-            run.input[index] = window.reshape(run.input.shape[1:])
+        for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
+            run.window[index] = window.reshape(run.window.shape[1:])
+            if run.pad is not None:
+                run.pad[index] = pad
         run()
-        pattern, self._deviation = run.pattern, run.deviation
+        pattern, self._deviation, self._traction = run.pattern, run.deviation, run.traction
         if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
+        if self._traction is not None and not np.isfinite(self._traction).all():
+            raise ModelError(f"model '{self.name}' gave a traction that is not finite: export it again")
         deviation = self._deviation
         # Not a number is neither above nor below anything, so it fails here too.
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
@@ -141,22 +167,26 @@ class _Run:
     """Arrays for so many windows, and what fills them."""
 
     def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int) -> None:
-        self.input = np.zeros((count, *contract.window_shape[1:]), dtype=np.float32)
-        outputs = {
-            name: np.zeros((count, *shape[1:]), dtype=np.float32) for name, shape in contract.output_shapes.items()
-        }
+        inputs, outputs = (
+            {name: np.zeros((count, *shape[1:]), dtype=np.float32) for name, shape in shapes.items()}
+            for shapes in (contract.input_shapes, contract.output_shapes)
+        )
         at_once = count if contract.batch == ANY_BATCH else 1
         self._session = session
         self._bindings = [session.io_binding() for _ in range(0, count, at_once)]
         for index, binding in enumerate(self._bindings):
             part = slice(index * at_once, (index + 1) * at_once)
-            _bind(binding.bind_input, INPUT_NAME, self.input[part])
+            for name, given in inputs.items():
+                _bind(binding.bind_input, name, given[part])
             for name, output in outputs.items():
                 _bind(binding.bind_output, name, output[part])
         for output in outputs.values():
             output.setflags(write=False)
+        self.window = inputs[INPUT_NAME]
+        self.pad = inputs.get(PAD_NAME)
         self.pattern = outputs[OUTPUT_NAME]
         self.deviation = outputs.get(DEVIATION_NAME)
+        self.traction = outputs.get(TRACTION_NAME)
 
     def __call__(self) -> None:
         for binding in self._bindings:

@@ -43,8 +43,15 @@ HEADER: Final = (
     ("deviation_at", "I"),
     ("writer_pid", "Q"),
     ("pattern_unit", "16s"),
+    ("traction_at", "I"),
+    ("traction_height", "I"),
+    ("traction_width", "I"),
 )
-"""Name and struct's character of each field from byte 0 on; behind them, at HEARTBEAT_AT, `heartbeat_ns`, a q."""
+"""Name and struct's character of each field from byte 0 on; behind them, at HEARTBEAT_AT, `heartbeat_ns`, a q.
+
+`traction_at` is 0 where the model gives no traction, and with writers that know of none, whose halves lack the fields
+from `wrench_origin` on.
+"""
 
 FIELDS: Final = (
     ("checksum", "I"),
@@ -77,12 +84,23 @@ FIELDS: Final = (
     ("latency_us", "d"),
     ("sensor", f"{SENSOR_BYTES}s"),
     ("model", f"{MODEL_BYTES}s"),
+    ("wrench_origin", "i"),
+    ("has_traction", "i"),
+    ("force_x_n", "d"),
+    ("force_y_n", "d"),
+    ("force_z_n", "d"),
+    ("torque_x_n_mm", "d"),
+    ("torque_y_n_mm", "d"),
+    ("torque_z_n_mm", "d"),
+    ("centre_of_pressure_x_mm", "d"),
+    ("centre_of_pressure_y_mm", "d"),
 )
 """Name and struct's character of each field of a half; its maps follow."""
 
 SOURCES: Final = ("device", "replay", "emulated")
 STATES: Final = ("zeroing", "incomplete", "idle", "contact", "dropped")
 FILLED: Final = ("rest", "neighbours")
+WRENCH_ORIGINS: Final = ("nominal", "calibrated")
 # Told by their place, from 1: memory that nobody wrote must not pass for a sensor's.
 
 
@@ -98,12 +116,17 @@ def offsets_of(fields: tuple[tuple[str, str], ...]) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where everything lies for a sensor of rows x cols taxels and patterns of height x width pixels."""
+    """Where everything lies for a sensor of rows x cols taxels and patterns of height x width pixels.
+
+    Attributes:
+        traction_shape: (3, h, w), where there is a traction.
+    """
 
     rows: int
     cols: int
     height: int
     width: int
+    traction_shape: tuple[int, int, int] | None = None
 
     @property
     def maps(self) -> dict[str, tuple[np.dtype, tuple[int, ...], int]]:
@@ -115,6 +138,7 @@ class Layout:
             ("counts", "<i4", scan),
             ("pattern", "<f4", pattern),
             ("deviation", "<f4", pattern),
+            *([] if self.traction_shape is None else [("traction", "<f4", self.traction_shape)]),
         ):
             maps[name] = (np.dtype(kind), shape, at)
             at = _aligned(at + int(np.prod(shape)) * 4, 8)
@@ -123,7 +147,7 @@ class Layout:
     @property
     def half_bytes(self) -> int:
         """Size of one half of a slot."""
-        kind, shape, at = self.maps["deviation"]
+        kind, shape, at = list(self.maps.values())[-1]
         return _aligned(at + int(np.prod(shape)) * kind.itemsize, LINE_BYTES)
 
     @property
@@ -141,9 +165,10 @@ class Layout:
         return struct_of(HEADER).pack(
             *(MAGIC, VERSION, HEADER_BYTES, SLOTS, self.slot_bytes, self.half_bytes, LINE_BYTES),
             *(self.rows, self.cols, self.height, self.width),
-            *(at for _, _, at in self.maps.values()),
+            *(self.maps[name][2] for name in ("zeroed", "counts", "pattern", "deviation")),
             writer_pid,
             pattern_unit.encode()[:16],
+            *((0, 0, 0) if self.traction_shape is None else (self.maps["traction"][2], *self.traction_shape[1:])),
         )
 
 

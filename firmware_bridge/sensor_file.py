@@ -6,6 +6,7 @@ Here is what it tells, and the reading of it; `sensor_file_text` writes it.
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,11 +18,13 @@ from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import GAIN_RANGE, GAINS, PAD_RANGES, Pad
 from firmware_bridge.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.sensor_file_table import (
     REMEDY,
     Table,
     a_table,
+    between,
     flat_cells,
     is_number,
     one_of,
@@ -44,11 +47,12 @@ _GRID: Final = (USPA44.rows, USPA44.cols)
 
 @dataclass(frozen=True)
 class SensorEntry:
-    """What is known of one sensor: how it sits, its summed z per [N], and what its free pad reads."""
+    """What is known of one sensor: how it sits, its summed z per [N], what its free pad reads, and the pad itself."""
 
     mounting: Mounting = field(default_factory=Mounting)
     counts_per_newton: float | None = None
     baseline: Baseline | None = None
+    pad: Pad | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,11 @@ class SensorFile:
         known = {name: entry.counts_per_newton for name, entry in self.sensors.items()}
         return {name: counts for name, counts in known.items() if counts is not None}
 
+    @property
+    def pads(self) -> dict[str, Pad]:
+        """The pads that are known, by sensor name."""
+        return {name: entry.pad for name, entry in self.sensors.items() if entry.pad is not None}
+
 
 def load_sensor_file(path: str | Path) -> SensorFile:
     """Read a sensor file.
@@ -128,11 +137,33 @@ def _entry(path: Path, name: str, values: Mapping[str, Any]) -> SensorEntry:
     signs = table.take("signs", _signs, required=False)
     gains = table.take("gains", _gains, required=False)
     counts_per_newton = table.take("counts_per_newton", positive, required=False)
+    pad = table.take("pad", a_table, required=False)
     baseline = table.take("baseline", a_table, required=False)
     table.end()
     known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
     mounting = Mounting(**{key: value for key, value in known.items() if value is not None})
-    return SensorEntry(mounting, counts_per_newton, None if baseline is None else _baseline(path, name, baseline))
+    return SensorEntry(
+        mounting,
+        counts_per_newton,
+        None if baseline is None else _baseline(path, name, baseline),
+        None if pad is None else _pad(path, name, pad),
+    )
+
+
+def _pad(path: Path, name: str, values: Mapping[str, Any]) -> Pad:
+    table = Table(path, f"sensors.{name}.pad.", values)
+    constants: dict[str, float] = {}
+    intervals: dict[str, tuple[float, float]] = {}
+    for constant, (low, high) in PAD_RANGES.items():
+        value = table.take(constant, between(low, high), required=False)
+        interval = table.take(f"{constant}_interval", partial(_interval, low, high), required=False)
+        if value is not None:
+            constants[constant] = value
+        if interval is not None:
+            intervals[constant] = interval
+    gains = table.take("gains", _pad_gains, required=False)
+    table.end()
+    return Pad(**constants, intervals=intervals, gains=gains)
 
 
 def _baseline(path: Path, name: str, values: Mapping[str, Any]) -> Baseline:
@@ -172,6 +203,23 @@ def _gains(value: Any) -> tuple[float, ...]:
         raise ValueError(expected)
     gains = [float(cell) for cell in cells]
     return tuple(gains if per_taxel else [gain for gain in gains for _ in range(USPA44.taxel_count)])
+
+
+def _interval(low: float, high: float, value: Any) -> tuple[float, float]:
+    expected = f"two numbers from {low:g} to {high:g}, the lower first"
+    ends = flat_cells(value, (2,), expected)
+    if not (all(map(is_number, ends)) and low <= ends[0] <= ends[1] <= high):
+        raise ValueError(expected)
+    return ends[0], ends[1]
+
+
+def _pad_gains(value: Any) -> tuple[float, ...]:
+    low, high = GAIN_RANGE
+    expected = f"{GAINS} numbers from {low:g} to {high:g}: x of all places, then y, then z"
+    gains = flat_cells(value, (GAINS,), expected)
+    if not all(is_number(gain) and low <= gain <= high for gain in gains):
+        raise ValueError(expected)
+    return tuple(map(float, gains))
 
 
 def _rest_counts(value: Any) -> NDArray[np.float64]:

@@ -104,6 +104,17 @@ def positive(value: Any) -> float:
     return value  # not as a float: a baseline's id tells 1000 from 1000.0
 
 
+def between(low: float, high: float) -> Callable[[Any], float]:
+    """A number of this range, both ends included, as it is written."""
+
+    def read(value: Any) -> float:
+        if not is_number(value) or not low <= value <= high:
+            raise ValueError(f"a number from {low:g} to {high:g}")
+        return value
+
+    return read
+
+
 def flat_cells(value: Any, shape: tuple[int, ...], expected: str) -> list[Any]:
     """Lists in lists of this shape, flat."""
     if not isinstance(value, list) or len(value) != shape[0]:

@@ -14,6 +14,7 @@ from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import PAD_RANGES, Pad
 from firmware_bridge.sensor_file import FILE_FORMAT, FILE_VERSION, SensorFile
 
 
@@ -51,6 +52,8 @@ def _text(sensor_file: SensorFile) -> str:
         lines += ["", f"[sensors.{_quoted(name)}]", *_mounting_lines(entry.mounting)]
         if entry.counts_per_newton is not None:
             lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
+        if entry.pad is not None:
+            lines += ["", f"[sensors.{_quoted(name)}.pad]", *_pad_lines(entry.pad)]
         if entry.baseline is not None:
             lines += ["", f"[sensors.{_quoted(name)}.baseline]", *_baseline_lines(entry.baseline)]
     return "\n".join([*lines, ""])
@@ -72,6 +75,25 @@ def _mounting_lines(mounting: Mounting) -> list[str]:
         f"signs = {list(mounting.signs)}  # of x (to the right), y (down) and z (into the pad), after the swap",
         *gain_lines,
     ]
+
+
+def _pad_lines(pad: Pad) -> list[str]:
+    lines = ["# The pad itself, for networks that ask for it."]
+    known = pad.constants
+    for name in PAD_RANGES:
+        if name in known:
+            lines.append(f"{name} = {float(known[name])!r}")
+        if name in pad.intervals:
+            lines.append(f"{name}_interval = {list(map(float, pad.intervals[name]))}")
+    if pad.gains is not None:
+        rows = (pad.gains[at : at + USPA44.cols] for at in range(0, len(pad.gains), USPA44.cols))
+        lines += [
+            "# How strongly each place reads: x row by row, then y, then z.",
+            "gains = [",
+            *(f"    {', '.join(repr(float(gain)) for gain in row)}," for row in rows),
+            "]",
+        ]
+    return lines
 
 
 def _baseline_lines(baseline: Baseline) -> list[str]:

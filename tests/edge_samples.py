@@ -11,7 +11,16 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, Contract
+from edge.contract import (
+    CONTRACT_VERSION,
+    DEVIATION_NAME,
+    INPUT_NAME,
+    OUTPUT_NAME,
+    PAD_NAME,
+    TRACTION_NAME,
+    Contract,
+)
+from edge.runtime import Runtime
 from edge.sinks.base import Sink
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import Link
@@ -28,7 +37,7 @@ BASELINE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file
 
 def make_contract(**changes) -> Contract:
     values = {
-        "version": 4,
+        "version": CONTRACT_VERSION,
         "batch": 1,
         "taps": 4,
         "scale": 10,
@@ -48,8 +57,24 @@ def make_contract(**changes) -> Contract:
         "training_sha256": "ab" * 32,
         "test_set_sha256": "cd" * 32,
         "test_error": {"1": {"psnr_db": 30.1}, "4": {"psnr_db": 33.2, "rmse_percent": 2.1}},
+        "pad_inputs": (),
+        "takes_gains": False,
+        "traction_scale": None,
     }
     return Contract(**(values | changes))
+
+
+def make_pad_contract(**changes) -> Contract:
+    """Of a model that takes a pad and gives traction."""
+    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
+    return make_contract(**({"pad_inputs": pad_inputs, "takes_gains": True, "traction_scale": 2} | changes))
+
+
+def make_wrench_result(number: int = 0, press_counts: float = 20_000, **settings):
+    """What a model with traction makes of a press on taxel 5: .44 N there, where nothing is known of the pad."""
+    contract = make_pad_contract(interval_factor=1.6)
+    runtime = Runtime(FakeModel(contract), **{"source": "device", "baselines": {"4": BASELINE}} | settings)
+    return runtime.push(make_scan(number, press_counts=press_counts, time_ns=time.monotonic_ns()))
 
 
 def write_model(
@@ -64,44 +89,91 @@ def write_model(
     input_shape: list | None = None,
     element_type: int = TensorProto.FLOAT,
     gain: float = 1.0,
+    pad_name: str | None = None,
+    pad_width: int | None = None,
+    with_traction: bool | None = None,
+    traction_shape: tuple[int, ...] | None = None,
 ) -> Path:
     """A real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
-    The deviation, there if the contract has a factor for it unless asked otherwise, is `tiny_deviation`.
+    The deviation, there if the contract has a factor for it unless asked otherwise, is `tiny_deviation`. A pad,
+    likewise, makes all stronger by `tiny_stiffness`; a traction, likewise, is the newest tap's x, y, z in squares.
     """
     contract = contract or make_contract()
     with_deviation = contract.interval_factor is not None if with_deviation is None else with_deviation
-    taps, scale = contract.taps, contract.scale
+    with_traction = contract.traction_scale is not None if with_traction is None else with_traction
+    pad_width = contract.pad_width if pad_width is None else pad_width
+    pad_name = pad_name or PAD_NAME
+    taps, scale, traction_scale = contract.taps, contract.scale, contract.traction_scale or 1
     weights = np.zeros((3 * taps, 1, scale, scale), dtype=np.float32)
     for tap in range(taps):
         weights[3 * tap + 2] = gain * 10.0**-tap
-    shape = [(input_shape or [contract.batch])[0], *contract.pattern_shape]
-    doubts = [
-        helper.make_node("Abs", [output_name], ["size"]),
-        helper.make_node("Mul", ["size", "doubt"], ["doubted"]),
-        helper.make_node("Add", ["doubted", "doubt"], [DEVIATION_NAME]),
+    newest = np.zeros((3 * taps, 3, traction_scale, traction_scale), dtype=np.float32)
+    newest[[0, 1, 2], [0, 1, 2]] = gain
+    batch = (input_shape or [contract.batch])[0]
+    shape = [batch, *contract.pattern_shape]
+    traction_shape = traction_shape or contract.traction_shape or (3, contract.rows, contract.cols)
+    nodes = [
+        helper.make_node("Cast", [input_name], ["floats"], to=TensorProto.FLOAT),
+        helper.make_node("ConvTranspose", ["floats", "weights"], ["soft"], strides=[scale, scale]),
+        helper.make_node("Mul", ["soft", "stiffness"], ["squares"]),
+        helper.make_node("Squeeze", ["squares", "axis"], [output_name]),
     ]
-    output_names = [output_name, DEVIATION_NAME] if with_deviation else [output_name]
+    inputs = {input_name: (element_type, input_shape or list(contract.window_shape))}
+    outputs = {output_name: shape}
+    if pad_width:
+        inputs[pad_name] = (TensorProto.FLOAT, [batch, pad_width])
+        nodes[:0] = [
+            helper.make_node("Mul", [pad_name, "pad_weights"], ["weighed"]),
+            helper.make_node("ReduceSum", ["weighed", "axis"], ["stiffer"], keepdims=1),
+            helper.make_node("Add", ["stiffer", "one"], ["stiff"]),
+            helper.make_node("Unsqueeze", ["stiff", "last"], ["stiffness"]),
+        ]
+    if with_deviation:
+        outputs[DEVIATION_NAME] = shape
+        nodes += [
+            helper.make_node("Abs", [output_name], ["size"]),
+            helper.make_node("Mul", ["size", "doubt"], ["doubted"]),
+            helper.make_node("Add", ["doubted", "doubt"], [DEVIATION_NAME]),
+        ]
+    if with_traction:
+        outputs[TRACTION_NAME] = [batch, *traction_shape]
+        strides = [traction_scale, traction_scale]
+        nodes += [
+            helper.make_node("ConvTranspose", ["floats", "newest"], ["forces"], strides=strides),
+            helper.make_node("Mul", ["forces", "stiffness"], [TRACTION_NAME]),
+        ]
+    constants = {
+        "weights": weights,
+        "newest": newest,
+        "axis": np.array([1]),
+        "last": np.array([2, 3]),
+        "one": np.array([[1]], dtype=np.float32),
+        "pad_weights": np.arange(1, (pad_width or 1) + 1, dtype=np.float32)[None],
+        "doubt": np.array(doubt, dtype=np.float32),
+        **({} if pad_width else {"stiffness": np.ones((1, 1, 1, 1), dtype=np.float32)}),
+    }
     graph = helper.make_graph(
-        [
-            helper.make_node("Cast", [input_name], ["floats"], to=TensorProto.FLOAT),
-            helper.make_node("ConvTranspose", ["floats", "weights"], ["squares"], strides=[scale, scale]),
-            helper.make_node("Squeeze", ["squares", "axis"], [output_name]),
-            *(doubts if with_deviation else []),
-        ],
+        nodes,
         "tiny",
-        [helper.make_tensor_value_info(input_name, element_type, input_shape or list(contract.window_shape))],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in output_names],
-        [
-            numpy_helper.from_array(weights, "weights"),
-            numpy_helper.from_array(np.array([1]), "axis"),
-            numpy_helper.from_array(np.array(doubt, dtype=np.float32), "doubt"),
-        ],
+        [helper.make_tensor_value_info(name, kind, of) for name, (kind, of) in inputs.items()],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, of) for name, of in outputs.items()],
+        [numpy_helper.from_array(values, name) for name, values in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
     helper.set_model_props(model, contract.to_metadata() if metadata is None else metadata)
     onnx.save(model, path)
     return path
+
+
+def tiny_stiffness(pad_row: np.ndarray) -> float:
+    """How much stronger the tiny model's outputs are for a pad."""
+    return 1 + float(pad_row @ np.arange(1, len(pad_row) + 1))
+
+
+def tiny_traction(window_units: np.ndarray, scale: int) -> np.ndarray:
+    """What the tiny model makes of a window (taps, 3, rows, cols), as traction (3, h, w)."""
+    return np.kron(window_units[0], np.ones((1, scale, scale)))
 
 
 def tiny_pattern(window_units: np.ndarray, scale: int = 10) -> np.ndarray:
@@ -160,23 +232,31 @@ class FakeModel:
         self.name = "fake"
         self.contract = contract or make_contract()
         self.windows: list[np.ndarray] = []
+        self.pads: list[np.ndarray | None] = []
         self.deviation: np.ndarray | None = None
+        self.traction: np.ndarray | None = None
         self._on_run = on_run
 
-    def run(self, window: np.ndarray) -> np.ndarray:
+    def run(self, window: np.ndarray, pad: np.ndarray | None = None) -> np.ndarray:
         self._on_run()
         self.windows.append(window.copy())
-        pattern = tiny_pattern(window).astype(np.float32)
+        self.pads.append(pad)
+        stiffness = np.float32(1 if pad is None else tiny_stiffness(pad))
+        pattern = tiny_pattern(window).astype(np.float32) * stiffness
         if self.contract.interval_factor is not None:
             self.deviation = tiny_deviation(pattern)
+        if self.contract.traction_scale is not None:
+            self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32) * stiffness
         return pattern
 
-    def run_together(self, windows: list[np.ndarray]) -> np.ndarray:
-        patterns, deviations = [], []
-        for window in windows:
-            patterns.append(self.run(window))
+    def run_together(self, windows: list[np.ndarray], pads: list[np.ndarray] | None = None) -> np.ndarray:
+        patterns, deviations, tractions = [], [], []
+        for index, window in enumerate(windows):
+            patterns.append(self.run(window, None if pads is None else pads[index]))
             deviations.append(self.deviation)
+            tractions.append(self.traction)
         self.deviation = None if deviations[0] is None else np.stack(deviations)
+        self.traction = None if tractions[0] is None else np.stack(tractions)
         return np.stack(patterns)
 
 

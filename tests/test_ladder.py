@@ -165,13 +165,17 @@ class Slow:
     def deviation(self):
         return self._session.deviation
 
-    def run(self, window):
-        self._clock.now_ns += round(self._run_time_us * self._clock.load * 1000)
-        return self._session.run(window)
+    @property
+    def traction(self):
+        return self._session.traction
 
-    def run_together(self, windows):
+    def run(self, window, pad=None):
         self._clock.now_ns += round(self._run_time_us * self._clock.load * 1000)
-        return self._session.run_together(windows)
+        return self._session.run(window, pad)
+
+    def run_together(self, windows, pads=None):
+        self._clock.now_ns += round(self._run_time_us * self._clock.load * 1000)
+        return self._session.run_together(windows, pads)
 
 
 class Clock:

@@ -18,7 +18,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 import ros2_messages
-from edge_samples import BASELINE, ROOT, make_contract, make_scan
+from edge_samples import BASELINE, ROOT, make_contract, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -243,6 +243,20 @@ def test_forces_of_the_vendor_have_three_axes_and_counts_are_no_newtons(sink):
     assert math.isnan(forces[1].x) and forces[1].z == 1.9, "z of one calibration beside x and y of another"
     assert len(forces) == 3 and math.isnan(forces[2].z), "counts in place of newtons"
     assert diagnose(result, {}, {}, 0.0, None).values["force"].startswith("counts only")
+
+
+def test_subscribers_get_force_and_torque_of_a_model_with_traction_until_they_hold_no_more(sink):
+    result, free = make_wrench_result(), make_wrench_result(press_counts=0)
+    assert result.wrench is not None
+    torque_n_m = [torque / 1000 for torque in result.wrench.torque_n_mm]
+    with Listener({"skin/s4/wrench": WRENCH}) as listener:
+        listener.until(lambda: listener.of("skin/s4/wrench"), lambda: sink.write(result, {}))
+        for message in listener.of("skin/s4/wrench"):
+            assert list(message["wrench"]["force"].values()) == list(result.wrench.force_n)
+            assert list(message["wrench"]["torque"].values()) == torque_n_m
+        sink.write(free, {})
+        listener.until(lambda: math.isnan(listener.of("skin/s4/wrench")[-1]["wrench"]["force"]["z"]))
+        assert all(map(math.isnan, listener.of("skin/s4/wrench")[-1]["wrench"]["torque"].values()))
 
 
 def test_two_sinks_share_the_domain_and_one_outlives_the_other(sink):

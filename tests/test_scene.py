@@ -165,9 +165,9 @@ def test_two_sensors_are_inferred_in_one_call_in_the_order_they_came():
     calls = []
 
     class Together(FakeModel):
-        def run_together(self, windows):
+        def run_together(self, windows, pads=None):
             calls.append(len(windows))
-            return super().run_together(windows)
+            return super().run_together(windows, pads)
 
     model = Together(make_contract(interval_factor=1.6))
     baselines = dict.fromkeys(("4", "6"), BASELINE)

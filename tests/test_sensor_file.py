@@ -9,6 +9,7 @@ from test_mounting import mountings
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import PAD_RANGES, Pad
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.xela import ID_MAPS
@@ -22,6 +23,20 @@ def baseline(sensor, seed, created_unix_s=1.7e9):
 
 
 @st.composite
+def pads(draw):
+    constants, intervals = {}, {}
+    for name, (low, high) in PAD_RANGES.items():
+        if draw(st.booleans()):
+            constants[name] = draw(st.floats(low, high, allow_subnormal=False))
+        if draw(st.booleans()):
+            intervals[name] = tuple(sorted(draw(st.tuples(*[st.floats(low, high, allow_subnormal=False)] * 2))))
+    gains = draw(st.none() | st.integers(0, 9))
+    if gains is not None:
+        gains = tuple(np.random.default_rng(gains).uniform(0.01, 100, 48).tolist())
+    return Pad(**constants, intervals=intervals, gains=gains)
+
+
+@st.composite
 def sensor_files(draw):
     entries = {}
     for name in draw(st.sets(names, min_size=1, max_size=3)):
@@ -30,6 +45,7 @@ def sensor_files(draw):
             draw(mountings),
             draw(st.none() | st.floats(1e-3, 1e6)),
             draw(st.none() | st.integers(0, 9).map(lambda seed, n=name, at=created: baseline(n, seed, at))),
+            draw(st.none() | pads()),
         )
     return SensorFile(draw(st.sampled_from(sorted(ID_MAPS))), draw(st.none() | names), entries)
 
@@ -41,6 +57,7 @@ def test_what_is_written_is_read(tmp_path, written):
     read = load_sensor_file(tmp_path / "s.toml")
     assert (read.model, read.adapter, read.mountings) == (written.model, written.adapter, written.mountings)
     assert read.counts_per_newton == written.counts_per_newton
+    assert read.pads == written.pads
     assert {name: one.id for name, one in read.baselines.items()} == {
         name: one.id for name, one in written.baselines.items()
     }
@@ -116,6 +133,48 @@ def test_what_cannot_be_is_refused_in_one_line_that_names_the_key(tmp_path, key,
         load_sensor_file(tmp_path / "s.toml")
     assert f"{key}'" in str(refused.value) and "\n" not in str(refused.value)
     assert str(refused.value).startswith(f"{tmp_path}/s.toml, '")
+
+
+def pad_text(*lines):
+    head = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n[sensors.4.pad]\n'
+    return head + "".join(f"{line}\n" for line in lines)
+
+
+def test_a_pad_by_hand_is_read(tmp_path):
+    gains = [1.0, 0.5, *[1.0] * 46]
+    lines = ("thickness_mm = 4", "poisson = 0", "poisson_interval = [0, 0.49]", f"gains = {gains}")
+    (tmp_path / "s.toml").write_text(pad_text(*lines))
+    entry = load_sensor_file(tmp_path / "s.toml").sensors["4"]
+    assert entry.pad == Pad(thickness_mm=4, poisson=0, intervals={"poisson": (0, 0.49)}, gains=tuple(gains))
+    assert entry.counts_per_newton is None and entry.mounting == Mounting()
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (
+            "thickness = 4.5",
+            "'sensors.4.pad.thickness': not known, expected one of thickness_mm, thickness_mm_interval",
+        ),
+        ("thickness_mm = 0", "'sensors.4.pad.thickness_mm': 0, expected a number from 0.1 to 100"),
+        ("thickness_mm = true", "a number from 0.1 to 100"),
+        ("poisson = 0.5", "a number from 0 to 0.4999"),
+        ("poisson = nan", "a number from 0 to 0.4999"),
+        ("counts_per_newton = 1e9", "a number from 0.001 to 1e+06"),
+        ("in_plane_share_interval = 1", "two numbers from 0 to 10, the lower first"),
+        ("in_plane_share_interval = [2, 1]", "the lower first"),
+        ("in_plane_share_interval = [1, 2, 3]", "two numbers"),
+        ("in_plane_share_interval = [1, inf]", "two numbers"),
+        ("gains_interval = [1, 2]", "'sensors.4.pad.gains_interval': not known"),
+        ("gains = [1, 1, 1]", "48 numbers from 0.01 to 100: x of all places, then y, then z"),
+        (f"gains = {[0.0] * 48}", "48 numbers from 0.01 to 100"),
+        (f"gains = {[[1.0] * 48]}", "48 numbers"),
+    ],
+)
+def test_a_pad_that_cannot_be_is_refused_by_its_key(tmp_path, line, words):
+    (tmp_path / "s.toml").write_text(pad_text(line))
+    with pytest.raises(SensorFileError, match=re.escape(words)):
+        load_sensor_file(tmp_path / "s.toml")
 
 
 def test_that_text_is_refused_for_its_id_alone(tmp_path):

@@ -16,7 +16,16 @@ from struct import unpack_from
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, FakeModel, ended, make_contract, make_scan
+from edge_samples import (
+    BASELINE,
+    ROOT,
+    FakeModel,
+    ended,
+    make_contract,
+    make_pad_contract,
+    make_scan,
+    make_wrench_result,
+)
 
 from edge.errors import SinkError
 from edge.event import Event
@@ -218,6 +227,34 @@ class TestLayout:
         ]
         heartbeat = (str(HEARTBEAT_AT), "heartbeat_ns", "i64")
         assert documented == [*tables[: len(HEADER)], heartbeat, *tables[len(HEADER) :]]
+
+    def test_a_wrench_and_its_traction_are_there_while_they_hold(self, name):
+        sink = SharedMemorySink(name, make_pad_contract(interval_factor=1.6))
+        memory, layout = attach(name), Layout(4, 4, 40, 40, (3, 8, 8))
+        at, height, width = unpack_from("<3I", memory, offsets_of(HEADER)["traction_at"])
+        kind, shape, place = layout.maps["traction"]
+        assert (at, height, width) == (place, 8, 8)
+        told = {}
+        for number, press in enumerate((20_000, 0)):
+            result = make_wrench_result(number, press)
+            sink.write(result, {})
+            half = latest(memory, "4")
+            assert half is not None
+            told[press] = fields(half), np.frombuffer(half, kind, math.prod(shape), at).reshape(shape), result
+        sink.close()
+        said, traction, result = told[20_000]
+        names = [f"{what}_{axis}_{unit}" for what, unit in (("force", "n"), ("torque", "n_mm")) for axis in "xyz"]
+        assert [said[one] for one in names] == [*result.wrench.force_n, *result.wrench.torque_n_mm]
+        centre = (said["centre_of_pressure_x_mm"], said["centre_of_pressure_y_mm"])
+        assert centre == result.wrench.centre_of_pressure_mm
+        assert (said["wrench_origin"], said["has_traction"]) == (1, 1)
+        np.testing.assert_array_equal(traction, result.traction)
+        said, traction, _ = told[0]
+        assert np.isnan(traction).all() and all(math.isnan(said[one]) for one in names)
+        assert (said["wrench_origin"], said["has_traction"]) == (0, 0) and math.isnan(said["centre_of_pressure_x_mm"])
+
+    def test_without_traction_the_header_says_so(self, sink, name):
+        assert unpack_from("<3I", attach(name), offsets_of(HEADER)["traction_at"]) == (0, 0, 0)
 
     @pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc")
     def test_the_documented_reader_in_c_reads(self, sink, name, tmp_path):

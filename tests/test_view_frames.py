@@ -97,6 +97,7 @@ def test_hello_says_what_does_not_change():
         "cols": 4,
         "height": 40,
         "width": 40,
+        "wrench": False,
         "recording": None,
         "max_fps": MAX_FPS,
         "maps": [],

@@ -20,7 +20,7 @@ import numpy as np
 import orjson
 import pytest
 from bridge_samples import write_recording
-from edge_samples import BASELINE, ROOT, FakeModel, ended, make_contract, make_scan, write_model
+from edge_samples import BASELINE, ROOT, FakeModel, ended, make_pad_contract, make_scan, write_model
 from test_listening import reachable
 
 from edge import api
@@ -36,7 +36,7 @@ from edge.sinks.zenoh import ZenohSink, chunks
 
 zenoh = pytest.importorskip("zenoh")
 
-CONTRACT = make_contract(interval_factor=1.6)
+CONTRACT = make_pad_contract(interval_factor=1.6)
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "PYTHONUNBUFFERED": ""}
 # Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
 CONSUME = """
@@ -160,7 +160,8 @@ class TestMessages:
             said = plain(record(result, counters))
             expected.append(("grip/4/scan", "application/json", said, {}))
             if result.pattern is not None and result.reused_from is None:
-                maps = {"pattern": result.pattern, "deviation": result.deviation}
+                maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
+                assert said["wrench"]["force_n"][2] > 0 and said["wrench_origin"] == "nominal"
                 expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
             if number == 20:
                 sink.tell(event, counters)

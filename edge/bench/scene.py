@@ -101,13 +101,19 @@ class _Counted:
     def deviation(self) -> NDArray[np.float32] | None:
         return self._model.deviation
 
-    def run(self, window: NDArray[np.float32]) -> NDArray[np.float32]:
-        self.windows += 1
-        return self._model.run(window)
+    @property
+    def traction(self) -> NDArray[np.float32] | None:
+        return self._model.traction
 
-    def run_together(self, windows: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        self.windows += 1
+        return self._model.run(window, pad)
+
+    def run_together(
+        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
+    ) -> NDArray[np.float32]:
         self.windows += len(windows)
-        return self._model.run_together(windows)
+        return self._model.run_together(windows, pads)
 
 
 def _measured(

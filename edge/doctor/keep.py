@@ -60,7 +60,8 @@ def keep(
             counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
             baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
         per_newton = counts_per_newton.get(name, entry.counts_per_newton)
-        entries[name] = SensorEntry(entry.mounting.then(turned), per_newton, baseline)
+        pad = None if entry.pad is None else entry.pad.turned(turned)
+        entries[name] = SensorEntry(entry.mounting.then(turned), per_newton, baseline, pad)
     # A sensor of a named source is one of several, each with an adapter of its own.
     serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
     written = replace(known, adapter=serial_number or known.adapter, sensors=entries)

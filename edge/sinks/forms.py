@@ -76,8 +76,14 @@ def open_sink(
     if form == "npz":
         from edge.sinks.npz import NpzSink
 
-        scan_shape, deviations = (3, contract.rows, contract.cols), contract.interval_factor is not None
-        return NpzSink(Path(target), scan_shape, contract.pattern_shape, deviations=deviations, origin=origin)
+        return NpzSink(
+            Path(target),
+            (3, contract.rows, contract.cols),
+            contract.pattern_shape,
+            deviations=contract.interval_factor is not None,
+            traction_shape=contract.traction_shape,
+            origin=origin,
+        )
     if form == "mcap":
         from edge.sinks.mcap import McapSink
 

@@ -22,6 +22,8 @@ from edge.sinks.room import has_room, widen
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _DECIMALS: Final = 7
 """Of maps in [mm]: what is less than a nanometre apart is noise of the arithmetic."""
+_TRACTION_DECIMALS: Final = 4
+"""Of [kPa], a tenth of a pascal."""
 
 
 class JsonLinesSink(Sink):
@@ -93,6 +95,7 @@ def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
     """A result as one line of JSON, its maps last."""
     line = record(result, counters)
     line["pattern"], line["deviation"] = _map(result.pattern), _map(result.deviation)
+    line["traction"] = _map(result.traction, _TRACTION_DECIMALS)
     return orjson.dumps(line, option=_OPTIONS)
 
 
@@ -101,8 +104,8 @@ def event_line(event: Event, counters: Mapping[str, int], source: str | None) ->
     return orjson.dumps(event_record(event, counters, source), option=orjson.OPT_APPEND_NEWLINE)
 
 
-def _map(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-    return None if values is None else np.round(values, _DECIMALS)
+def _map(values: NDArray[np.float32] | None, decimals: int = _DECIMALS) -> NDArray[np.float32] | None:
+    return None if values is None else np.round(values, decimals)
 
 
 def _open(target: str) -> BufferedWriter:

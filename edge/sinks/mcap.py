@@ -130,10 +130,9 @@ class McapSink(Sink):
                 self._baselines[sensor] = result.baseline
             self._add(sensor, "scan", SCAN, unix_ns, encode_scan(scan, unix_ns, said["fresh"], said["renewed"]))
             self._add(sensor, "result", RESULT, unix_ns, result_message(result, said, unix_ns))
-            if result.pattern is not None:
-                self._add(sensor, "pattern", IMAGE, unix_ns, image(result.pattern, frame_of(result), unix_ns))
-            if result.deviation is not None:
-                self._add(sensor, "deviation", IMAGE, unix_ns, image(result.deviation, frame_of(result), unix_ns))
+            for name in ("pattern", "deviation", "traction"):
+                if (values := getattr(result, name)) is not None:
+                    self._add(sensor, name, IMAGE, unix_ns, image(values, frame_of(result), unix_ns))
             force = wrench(result, unix_ns)
             if force is not None:
                 self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)

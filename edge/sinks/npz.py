@@ -30,6 +30,8 @@ ROWS: Final = "rows"
 CHUNK_SCANS: Final = 256
 MODEL_CHARACTERS: Final = 32
 """Of a model's name: files may have longer ones, and a record must not fail for that."""
+_NO_WRENCH: Final = (np.nan,) * 6
+_NO_CENTRE: Final = (np.nan,) * 2
 
 
 class NpzSink(Sink):
@@ -38,10 +40,11 @@ class NpzSink(Sink):
     Arrays, one row a scan: sensor, scan, time_ns, device_time_ns (-1 unknown), counts (3, rows, cols; -1
     absent), source, origin (the same, but of a replay that of what is played), state, model, contact (-1 unknown),
     taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros where there is none), deviation (the same,
-    only if the model gives it), interval_mm, expected_rmse_mm and run_time_us (NaN where there is none), another_tap
-    and reused_from (-1 where there is none), dead (bit i: taxel i is not believed), filled (what stood for them, or
-    empty), baseline (its id, or empty), baseline_age_s (NaN without) and baseline_counts (3, rows, cols, what was
-    subtracted, drift and all; NaN without, and where a taxel was not zeroed).
+    only if the model gives it), traction (3, h, w; likewise), wrench (force x, y, z in [N], torque x, y, z in [N mm]),
+    centre_of_pressure_mm (x, y), interval_mm, expected_rmse_mm and run_time_us (NaN where there is none), wrench_origin
+    (or empty), another_tap and reused_from (-1 where there is none), dead (bit i: taxel i is not believed), filled
+    (what stood for them, or empty), baseline (its id, or empty), baseline_age_s (NaN without) and baseline_counts
+    (3, rows, cols, what was subtracted, drift and all; NaN without, and where a taxel was not zeroed).
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class NpzSink(Sink):
         pattern_shape: tuple[int, ...],
         *,
         deviations: bool = False,
+        traction_shape: tuple[int, ...] | None = None,
         origin: SourceKind | None = None,
     ) -> None:
         """Start the parts.
@@ -60,6 +64,7 @@ class NpzSink(Sink):
             scan_shape: (3, rows, cols).
             pattern_shape: (H, W).
             deviations: patterns come with deviations.
+            traction_shape: (3, h, w), where patterns come with tractions.
             origin: what kind of source the scans come from, where results are of a recording; else as they say.
 
         Raises:
@@ -70,6 +75,7 @@ class NpzSink(Sink):
         self._failed = False
         self._origin = origin
         self._no_pattern = np.zeros(pattern_shape, dtype=np.float32)
+        self._no_traction = np.zeros(traction_shape or 0, dtype=np.float32)
         self._no_baseline = np.full(scan_shape, np.nan, dtype=np.float32)
         self._layout: dict[str, tuple[str, tuple[int, ...]]] = {
             "sensor": ("<U64", ()),
@@ -87,6 +93,10 @@ class NpzSink(Sink):
             "has_pattern": ("|b1", ()),
             "pattern": ("<f4", pattern_shape),
             **({"deviation": ("<f4", pattern_shape)} if deviations else {}),
+            **({"traction": ("<f4", traction_shape)} if traction_shape else {}),
+            "wrench": ("<f4", (6,)),
+            "centre_of_pressure_mm": ("<f4", (2,)),
+            "wrench_origin": ("<U10", ()),
             "interval_mm": ("<f4", ()),
             "expected_rmse_mm": ("<f4", ()),
             "another_tap": ("|i1", ()),
@@ -116,7 +126,7 @@ class NpzSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Add one row to every array."""
-        scan, pattern, baseline = result.scan, result.pattern, result.baseline
+        scan, pattern, baseline, wrench = result.scan, result.pattern, result.baseline, result.wrench
         row: dict[str, ArrayLike] = {
             "sensor": scan.sensor,
             "scan": scan.number,
@@ -133,6 +143,10 @@ class NpzSink(Sink):
             "has_pattern": pattern is not None,
             "pattern": self._no_pattern if pattern is None else pattern,
             "deviation": self._no_pattern if result.deviation is None else result.deviation,
+            "traction": self._no_traction if result.traction is None else result.traction,
+            "wrench": _NO_WRENCH if wrench is None else (*wrench.force_n, *wrench.torque_n_mm),
+            "centre_of_pressure_mm": _NO_CENTRE if wrench is None else wrench.centre_of_pressure_mm or _NO_CENTRE,
+            "wrench_origin": result.wrench_origin or "",
             "interval_mm": np.nan if result.interval_mm is None else result.interval_mm,
             "expected_rmse_mm": np.nan if result.expected_rmse_mm is None else result.expected_rmse_mm,
             "another_tap": -1 if result.another_tap is None else result.another_tap,

@@ -20,7 +20,7 @@ from edge.errors import SinkError
 from edge.event import Event
 from edge.record import event_record
 from edge.result import Result
-from edge.ros_messages import force_xyz_n, frame_of
+from edge.ros_messages import Vector, force_and_torque, frame_of
 from edge.ros_names import base_topic, sensor_topic
 from edge.sinks.base import Sink
 from edge.sinks.ros2_diagnostics import Diagnosis, Level, diagnose
@@ -44,7 +44,7 @@ _DIAGNOSTICS_TOPIC: Final = "diagnostics"
 """ROS's tools listen there, whatever a robot is called."""
 _EVENTS_KEPT: Final = 100
 _UNKNOWN: Final = math.nan
-_FORCE_UNKNOWN: Final = (_UNKNOWN, _UNKNOWN, _UNKNOWN)
+_VECTOR_UNKNOWN: Final = (_UNKNOWN, _UNKNOWN, _UNKNOWN)
 _OUTAGES: Final = ("lost", "silent")
 _Message = TypeVar("_Message", bound=IdlStruct)
 
@@ -138,9 +138,9 @@ class Ros2Sink(Sink):
                 self._show(sensor, sensor.deviation, time_ns, result.deviation)
         elif result.state != "dropped":  # a newer scan, which has one, is already there
             self._withdraw(sensor, time_ns, 0.0 if result.contact is False else _UNKNOWN)
-        force_n = force_xyz_n(result)
-        if force_n is not None:
-            self._publish_wrench(sensor, time_ns, force_n)
+        force = force_and_torque(result)
+        if force is not None:
+            self._publish_wrench(sensor, time_ns, *force)
         elif result.state != "dropped":
             self._withdraw_force(sensor, time_ns)
         if result.event is not None:
@@ -230,18 +230,18 @@ class Ros2Sink(Sink):
     def _withdraw_force(self, sensor: _Sensor, time_ns: int) -> None:
         """Say once, where there was a force, that it holds no more."""
         if sensor.force_shown:
-            self._publish_wrench(sensor, time_ns, _FORCE_UNKNOWN)
+            self._publish_wrench(sensor, time_ns, _VECTOR_UNKNOWN, _VECTOR_UNKNOWN)
             sensor.force_shown = False
 
     def _withdraw_all(self, sensor: _Sensor, time_ns: int) -> None:
         self._withdraw(sensor, time_ns, _UNKNOWN)
         self._withdraw_force(sensor, time_ns)
 
-    def _publish_wrench(self, sensor: _Sensor, time_ns: int, force_n: tuple[float, float, float]) -> None:
+    def _publish_wrench(self, sensor: _Sensor, time_ns: int, force_n: Vector, torque_n_m: Vector) -> None:
         if sensor.wrench is None:
             topic = sensor_topic(self._base, sensor.last.scan.sensor, "wrench")
             sensor.wrench = self._writer(topic, WrenchStamped)
-        wrench = Wrench(Vector3(*force_n), Vector3(*_FORCE_UNKNOWN))
+        wrench = Wrench(Vector3(*force_n), Vector3(*torque_n_m))
         self._publish(sensor.wrench, WrenchStamped(self._header(time_ns, sensor.frame), wrench))
         sensor.force_shown = True
 

@@ -10,7 +10,7 @@ SILENCE_S: Final = 1.0
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
 _TOLD: Final = (
     *("state", "source", "model", "contact", "force_counts", "force_n", "expected_rmse_mm", "interval_mm"),
-    *("latency_us", "pattern_unit", "filled", "baseline_age_s", "note"),
+    *("wrench_origin", "latency_us", "pattern_unit", "filled", "baseline_age_s", "note"),
 )
 
 
@@ -86,7 +86,7 @@ def _values(result: Result, counters: Mapping[str, int], silence_s: float | None
     if result.baseline is not None:
         values["baseline"] = result.baseline.id
         values["baseline_origin"] = result.baseline.origin
-    if result.force_n is None:
+    if result.force_n is None and result.wrench is None:
         values["force"] = "counts only, so there is no wrench: --counts-per-newton gives newtons"
     return values | {name: str(count) for name, count in counters.items() if count}
 

@@ -31,6 +31,7 @@ from edge.shm_layout import (
     SLOTS,
     SOURCES,
     STATES,
+    WRENCH_ORIGINS,
     Layout,
     offsets_of,
     struct_of,
@@ -71,7 +72,7 @@ class SharedMemorySink(Sink):
         self._path = folder / name
         self._clock_ns = clock_ns
         height, width = contract.pattern_shape
-        self._layout = Layout(contract.rows, contract.cols, height, width)
+        self._layout = Layout(contract.rows, contract.cols, height, width, contract.traction_shape)
         try:
             self._file, self._memory = self._create(contract.output_unit)
         except OSError as error:
@@ -132,7 +133,7 @@ class SharedMemorySink(Sink):
         return slot_at
 
     def _fill(self, result: Result, sequence: int) -> None:
-        scan = result.scan
+        scan, wrench = result.scan, result.wrench
         x_mm, y_mm = (None, None) if result.centroid_mm is None else result.centroid_mm
         _HEAD.pack_into(
             self._draft,
@@ -147,10 +148,15 @@ class SharedMemorySink(Sink):
             *map(_or_nan, (result.expected_rmse_mm, result.baseline_age_s, result.run_time_us, result.latency_us)),
             scan.sensor.encode(),
             _cut(result.model, MODEL_BYTES),
+            0 if result.wrench_origin is None else WRENCH_ORIGINS.index(result.wrench_origin) + 1,
+            result.traction is not None,
+            *((math.nan,) * 6 if wrench is None else (*wrench.force_n, *wrench.torque_n_mm)),
+            *((None if wrench is None else wrench.centre_of_pressure_mm) or (math.nan, math.nan)),
         )
         self._maps["counts"][:] = scan.counts
         # Where there is none, none must be left standing from before.
-        for name, values in (("zeroed", result.zeroed), ("pattern", result.pattern), ("deviation", result.deviation)):
+        for name in self._maps.keys() - {"counts"}:
+            values = getattr(result, name)
             self._maps[name][:] = np.nan if values is None else values
         checksum = zlib.crc32(memoryview(self._draft)[_CHECKED_FROM:])
         self._draft[:4] = checksum.to_bytes(4, "little")

@@ -89,10 +89,8 @@ class ZenohSink(Sink):
         said = record(result, counters)
         self._put(publishers[0], orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
         if result.pattern is not None and result.reused_from is None:
-            maps = {"pattern": result.pattern}
-            if result.deviation is not None:
-                maps["deviation"] = result.deviation
-            self._put(publishers[1], pack(said, maps))
+            maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
+            self._put(publishers[1], pack(said, {name: one for name, one in maps.items() if one is not None}))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Put an event.

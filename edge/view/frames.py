@@ -116,6 +116,7 @@ def hello(run: Run, recording: Path | None) -> bytes:
         "cols": contract.cols,
         "height": height,
         "width": width,
+        "wrench": contract.traction_scale is not None,
         "recording": _path(recording),
         "max_fps": MAX_FPS,
     }

@@ -1,0 +1,86 @@
+"""What is known of the pad on a sensor: what it is made of, how thick it lies, how strongly its taxels read.
+
+Networks may ask for it, since one reading stands for another press on a thicker or harder pad. It turns no axis and
+corrects no record: that is the mounting's part.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.mounting import Mounting
+
+PAD_RANGES: Final = MappingProxyType(
+    {
+        "thickness_mm": (0.1, 100.0),
+        "shear_modulus_mpa": (1e-4, 1e3),
+        "poisson": (0.0, 0.4999),
+        "in_plane_share": (0.0, 10.0),
+        "magnet_height_mm": (0.01, 100.0),
+        "counts_per_newton": (1e-3, 1e6),
+    }
+)
+"""The constants of a pad, in this order, and what each may be: wider than any pad, so that only slips are refused."""
+GAIN_RANGE: Final = (0.01, 100.0)
+GAINS: Final = len(AXES) * USPA44.taxel_count
+
+
+@dataclass(frozen=True)
+class Pad:
+    """The constants of one sensor's pad, each None where it is not known.
+
+    Attributes:
+        thickness_mm: of the soft layer, in [mm].
+        shear_modulus_mpa: of its material, in [MPa].
+        poisson: Poisson's ratio.
+        in_plane_share: factor on the in-plane movement of the magnets.
+        magnet_height_mm: of the magnets' centres over the chips, in [mm].
+        counts_per_newton: summed z per [N].
+        intervals: lowest and highest of a constant, as whoever found it gives them; nothing is computed from them.
+        gains: how strongly each place reads on each axis, 1 where it reads as the others: x of all places row by row,
+            then y, then z, along the pad's axes. Networks that know gains get readings divided by them.
+
+    Raises:
+        ValueError: one of these cannot be.
+    """
+
+    thickness_mm: float | None = None
+    shear_modulus_mpa: float | None = None
+    poisson: float | None = None
+    in_plane_share: float | None = None
+    magnet_height_mm: float | None = None
+    counts_per_newton: float | None = None
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    gains: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.constants.items():
+            low, high = PAD_RANGES[name]
+            if not low <= value <= high:
+                raise ValueError(f"{name} is {value!r}, expected {low:g} to {high:g}")
+        for name, ends in self.intervals.items():
+            if name not in PAD_RANGES:
+                raise ValueError(f"interval of {name!r}, expected one of {', '.join(PAD_RANGES)}")
+            low, high = PAD_RANGES[name]
+            if not low <= ends[0] <= ends[1] <= high:
+                raise ValueError(f"{name} lies in {list(ends)}, expected two of {low:g} to {high:g}, the lower first")
+        low, high = GAIN_RANGE
+        if self.gains is not None and (len(self.gains) != GAINS or not all(low <= gain <= high for gain in self.gains)):
+            raise ValueError(f"gains are {list(self.gains)}, expected {GAINS} numbers from {low:g} to {high:g}")
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Those that are known, by name."""
+        values = {name: getattr(self, name) for name in PAD_RANGES}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def turned(self, found: Mounting) -> "Pad":
+        """The same pad under a mounting that was corrected by `found`: its gains go with the places and axes."""
+        if self.gains is None:
+            return self
+        gains = np.asarray(self.gains).reshape(len(AXES), -1)[[1, 0, 2] if found.swap_xy else [0, 1, 2]]
+        return replace(self, gains=tuple(gains[:, list(found.order)].ravel().tolist()))

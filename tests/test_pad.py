@@ -1,0 +1,310 @@
+"""Models of contract version 5: what they take of the pad, and what of it reaches them."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import (
+    BASELINE,
+    FakeModel,
+    make_contract,
+    make_pad_contract,
+    make_scan,
+    tiny_pattern,
+    tiny_stiffness,
+    tiny_traction,
+    write_model,
+)
+
+from edge.contract import ANY_BATCH, Contract
+from edge.errors import ModelError, UsageError, WindowError
+from edge.runtime import Runtime
+from edge.session import ModelSession
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import GAINS, PAD_RANGES, Pad
+
+GAINED = tuple(np.linspace(0.5, 2, GAINS).tolist())
+PAD = Pad(thickness_mm=5.0, gains=GAINED)
+OTHER = Pad(thickness_mm=4.0, counts_per_newton=2000.0)
+
+
+def random_window(seed=0):
+    return np.random.default_rng(seed).normal(size=(4, 3, 4, 4)).astype(np.float32)
+
+
+def row(*numbers):
+    return np.array(numbers, dtype=np.float32)
+
+
+class TestContract:
+    @pytest.mark.parametrize(
+        ("pad", "expected"),
+        [
+            (None, row(0, 0, 0, 0, 0)),
+            (Pad(), row(0, 0, 0, 0, 0)),
+            (Pad(poisson=0.4), row(0, 0, 0, 0, 0)),
+            (PAD, row(1, 0, 1, 0, 1)),
+            (OTHER, row(-1, 2, 1, 1, 0)),
+            (Pad(counts_per_newton=1000.0), row(0, 0, 0, 1, 0)),
+        ],
+    )
+    def test_a_pad_is_values_then_flags_then_gains(self, pad, expected):
+        got = make_pad_contract().pad_row(pad)
+        assert got.dtype == np.float32
+        np.testing.assert_array_equal(got, expected)
+
+    @pytest.mark.parametrize("takes_gains", [False, True])
+    def test_without_inputs_there_is_no_more_than_the_flag_of_gains(self, takes_gains):
+        contract = make_contract(takes_gains=takes_gains)
+        assert contract.pad_row(PAD).tolist() == [1] * takes_gains
+        assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
+
+    def test_what_is_written_is_read(self):
+        for contract in (make_pad_contract(), make_contract(), make_contract(version=4)):
+            assert Contract.from_metadata(contract.to_metadata()) == contract
+        assert len(make_contract().to_metadata()) == len(make_contract(version=4).to_metadata()) + 3
+
+    def test_of_version_4_later_keys_are_not_looked_at(self):
+        metadata = make_contract(version=4).to_metadata() | {"tactile.traction_scale": "2", "tactile.pad_inputs": "{"}
+        contract = Contract.from_metadata(metadata)
+        assert contract.traction_scale is None and contract.pad_width == 0
+
+    @pytest.mark.parametrize(
+        ("key", "value", "expected"),
+        [
+            ("pad_inputs", "[4]", "a list of [name, centre, spread]"),
+            ("pad_inputs", "{}", "a list of"),
+            (
+                "pad_inputs",
+                '[["thickness", 4, 1]]',
+                "names of: thickness_mm, shear_modulus_mpa, poisson, in_plane_share",
+            ),
+            ("pad_inputs", '[[["thickness_mm"], 4, 1]]', "a list of"),
+            ("pad_inputs", '[["thickness_mm", 4]]', "a list of"),
+            ("pad_inputs", '[["thickness_mm", -4, 1]]', "centre as a pad may have it"),
+            ("pad_inputs", '[["thickness_mm", 4, 0]]', "spread from 1e-06"),
+            ("pad_inputs", '[["thickness_mm", 4, true]]', "a list of"),
+            ("pad_inputs", '[["poisson", 0.4, 0.1], ["poisson", 0.4, 0.1]]', "no name twice"),
+            ("takes_gains", "null", "true or false"),
+            ("traction_scale", "0", "a whole number from 1 to 256, or null"),
+            ("traction_scale", "true", "a whole number"),
+            ("traction_scale", "256", "at most 1048576 numbers"),
+        ],
+    )
+    def test_what_cannot_be_is_refused_by_name(self, key, value, expected):
+        with pytest.raises(ModelError, match=re.escape(f"'{key}' is ") + ".*" + re.escape(expected)):
+            Contract.from_metadata(make_pad_contract().to_metadata() | {f"tactile.{key}": value})
+
+    def test_one_that_gives_other_traction_does_not_stand_in_but_one_that_takes_another_pad_does(self):
+        make_pad_contract(pad_inputs=(), takes_gains=False).check_stands_in(make_pad_contract())
+        make_contract(version=4).check_stands_in(make_contract())
+        with pytest.raises(ModelError, match="'traction_scale' is None, that of the model before 2"):
+            make_contract().check_stands_in(make_pad_contract())
+
+
+class TestSession:
+    @pytest.mark.parametrize("version", [4, 5])
+    def test_a_model_without_pad_and_traction_runs_as_ever(self, tmp_path, version):
+        session = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(version=version)))
+        window = random_window()
+        np.testing.assert_allclose(session.run(window), tiny_pattern(window), atol=1e-6)
+        assert session.traction is None and session.contract.version == version
+
+    @pytest.mark.parametrize("factor", [None, 1.6])
+    def test_pad_and_traction_are_bound_beside_window_and_pattern(self, tmp_path, factor):
+        contract = make_pad_contract(interval_factor=factor)
+        session = ModelSession(write_model(tmp_path / "pad.onnx", contract))
+        window = random_window()
+        for pad in (None, contract.pad_row(PAD), contract.pad_row(OTHER), None):
+            stiffness = 1 if pad is None else tiny_stiffness(pad)
+            np.testing.assert_allclose(session.run(window, pad), stiffness * tiny_pattern(window), atol=1e-5)
+            assert session.traction is not None and session.traction.shape == (3, 8, 8)
+            np.testing.assert_allclose(session.traction, stiffness * tiny_traction(window, 2), atol=1e-5)
+            assert (session.deviation is None) == (factor is None)
+
+    def test_traction_is_one_read_only_array_bound_once(self, tmp_path):
+        session = ModelSession(write_model(tmp_path / "pad.onnx", make_pad_contract()))
+        session.run(random_window(1))
+        first = session.traction
+        session.run(random_window(2))
+        assert first is not None and session.traction is not None and np.shares_memory(first, session.traction)
+        with pytest.raises(ValueError, match="read-only"):
+            first[0] = 1
+
+    @pytest.mark.parametrize("batch", [1, ANY_BATCH])
+    def test_pads_of_several_sensors_in_one_call_give_what_each_gives_alone(self, tmp_path, batch):
+        contract = make_pad_contract(batch=batch, interval_factor=1.6)
+        session = ModelSession(write_model(tmp_path / "several.onnx", contract))
+        windows = [random_window(seed) for seed in range(3)]
+        pads = [contract.pad_row(pad) for pad in (PAD, None, OTHER)]
+        alone = [
+            (session.run(window, pad).copy(), np.copy(session.traction))
+            for window, pad in zip(windows, pads, strict=True)
+        ]
+        for order in ((0, 1, 2), (2, 0), (1,), (1, 2, 0)):
+            together = session.run_together([windows[one] for one in order], [pads[one] for one in order]).copy()
+            assert session.traction is not None and session.traction.shape == (len(order), 3, 8, 8)
+            for index, one in enumerate(order):
+                assert together[index].tobytes() == alone[one][0].tobytes()
+                assert session.traction[index].tobytes() == alone[one][1].tobytes()
+        session.run_together(windows)
+        assert session.traction[1].tobytes() == alone[1][1].tobytes(), "without pads nothing is known of any"
+
+    @pytest.mark.parametrize(
+        ("graph", "message"),
+        [
+            (
+                {"pad_name": "gel"},
+                r"input is window .*, gel tensor\(float\) \[1, 5\], but .* pad tensor\(float\) \[1, 5\]",
+            ),
+            ({"pad_width": 4}, r"pad tensor\(float\) \[1, 4\], but .* pad tensor\(float\) \[1, 5\]"),
+            ({"pad_width": 0}, r"input is window tensor\(float\) \[1, 12, 4, 4\], but .* pad tensor"),
+            (
+                {"with_traction": False},
+                r"output is pattern [^,]*, 40, 40\], but .* traction tensor\(float\) \[1, 3, 8, 8\]",
+            ),
+            ({"contract": make_contract(), "pad_width": 5}, r"pad tensor\(float\) \[1, 5\], but .* says window [^p]*$"),
+            ({"contract": make_contract(), "with_traction": True}, r"traction tensor\(float\) \[1, 3, 4, 4\], but"),
+            (
+                {"metadata": make_pad_contract(traction_scale=3).to_metadata()},
+                r"\[1, 3, 8, 8\], but .*\[1, 3, 12, 12\]",
+            ),
+            (
+                {"metadata": make_contract(version=4).to_metadata()},
+                r"pad tensor\(float\) \[1, 5\], but its contract says window tensor\(float\) \[1, 12, 4, 4\]$",
+            ),
+        ],
+    )
+    def test_a_graph_that_breaks_its_contract_is_refused_naming_the_tensor(self, tmp_path, graph, message):
+        with pytest.raises(ModelError, match=message):
+            ModelSession(write_model(tmp_path / "graph.onnx", **({"contract": make_pad_contract()} | graph)))
+
+    @pytest.mark.parametrize(
+        "pad", [row(0, 0, 0, 0), np.zeros(5), np.full(5, np.nan, np.float32), np.zeros((1, 5), np.float32)]
+    )
+    def test_a_pad_that_no_contract_gave_is_refused(self, tmp_path, pad):
+        session = ModelSession(write_model(tmp_path / "pad.onnx", make_pad_contract()))
+        with pytest.raises(WindowError, match=r"pad is .*, expected \(5,\) float32, finite"):
+            session.run(random_window(), pad)
+
+    def test_a_traction_that_is_not_finite_is_never_given_out(self, tmp_path):
+        contract = make_pad_contract(counts_per_unit=(1.0, 1.0, 1.0))
+        session = ModelSession(write_model(tmp_path / "loud.onnx", contract, gain=3e38))
+        window = np.zeros((4, 3, 4, 4), dtype=np.float32)
+        window[0, 0] = 1e3  # x, which the tiny pattern does not see
+        with pytest.raises(ModelError, match="'loud' gave a traction that is not finite"):
+            session.run(window)
+
+
+class TestRuntime:
+    def runtime(self, model, **settings):
+        baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "6")}
+        return Runtime(model, **({"source": "device", "baselines": baselines, "reuse": False} | settings))
+
+    def pads_of(self, settings, contract=None):
+        model = FakeModel(contract or make_pad_contract())
+        result = self.runtime(model, **settings).push(make_scan(0, press_counts=3000))
+        return model.pads[0].tolist(), result.wrench_origin
+
+    @pytest.mark.parametrize(
+        ("settings", "expected", "origin"),
+        [
+            ({}, [0, 0, 0, 0, 0], "nominal"),
+            ({"pad": PAD}, [1, 0, 1, 0, 1], "nominal"),
+            ({"pad": {"4": OTHER}}, [-1, 2, 1, 1, 0], "calibrated"),
+            ({"pad": {"6": OTHER}}, [0, 0, 0, 0, 0], "nominal"),
+            ({"counts_per_newton": 1500.0}, [0, 1, 0, 1, 0], "calibrated"),
+            ({"pad": PAD, "counts_per_newton": {"4": 1500.0}}, [1, 1, 1, 1, 1], "calibrated"),
+            ({"pad": OTHER, "counts_per_newton": 1500.0}, [-1, 2, 1, 1, 0], "calibrated"),
+        ],
+    )
+    def test_the_model_is_given_the_pad_of_the_sensor(self, settings, expected, origin):
+        assert self.pads_of(settings) == (expected, origin)
+
+    def test_a_model_that_does_not_take_the_sensitivity_gives_nominal_newtons(self):
+        contract = make_pad_contract(pad_inputs=(("thickness_mm", 4.5, 0.5),))
+        assert self.pads_of({"counts_per_newton": 1500.0}, contract) == ([0, 0, 0], "nominal")
+
+    @pytest.mark.parametrize("takes_gains", [True, False])
+    def test_gains_divide_what_the_network_sees_and_nothing_else(self, takes_gains):
+        model = FakeModel(make_pad_contract(takes_gains=takes_gains))
+        bare = self.runtime(FakeModel(make_contract())).push(make_scan(0, press_counts=3000, taxel=9))
+        result = self.runtime(model, pad=PAD).push(make_scan(0, press_counts=3000, taxel=9))
+        assert result.zeroed is not None and bare.zeroed is not None and result.window is not None
+        np.testing.assert_array_equal(result.zeroed, bare.zeroed)
+        np.testing.assert_array_equal(result.window[0], bare.zeroed)
+        assert result.force_counts == bare.force_counts == 3000
+        gain = GAINED[2 * 16 + 9] if takes_gains else 1
+        assert model.windows[0][0, 2].flat[9] == pytest.approx(3 / gain)
+        assert np.count_nonzero(model.windows[0]) == 1
+
+    def test_two_sensors_in_one_call_get_what_each_gets_alone_bit_for_bit(self, tmp_path):
+        contract = make_pad_contract(batch=ANY_BATCH, interval_factor=1.6)
+        path = write_model(tmp_path / "pad.onnx", contract)
+        pads = {"4": PAD, "6": OTHER}
+        scans = [make_scan(0, sensor=name, press_counts=press, noise=9) for name, press in (("4", 20_000), ("6", 9000))]
+        together = self.runtime(ModelSession(path), pad=pads).push_together([(scan, True) for scan in scans])
+        for scan, result in zip(scans, together, strict=True):
+            alone = self.runtime(ModelSession(path), pad=pads).push(scan)
+            for name in ("pattern", "deviation", "traction"):
+                assert getattr(result, name).tobytes() == getattr(alone, name).tobytes()
+            assert result.wrench == alone.wrench is not None
+            assert result.wrench_origin == alone.wrench_origin
+        assert [one.wrench_origin for one in together] == ["nominal", "calibrated"]
+        assert together[0].traction is not None and not np.shares_memory(together[0].traction, together[1].traction)
+
+    def test_another_model_is_given_what_it_takes(self):
+        runtime = self.runtime(FakeModel(make_pad_contract()), pad=PAD)
+        runtime.push(make_scan(0, press_counts=3000))
+        other = FakeModel(make_pad_contract(pad_inputs=(), takes_gains=False))
+        runtime.change_model(other, "for a reason")
+        runtime.push(make_scan(1, press_counts=3000))
+        assert other.pads[0].shape == (0,) and other.windows[0].max() == 3
+
+    def test_a_pattern_that_is_given_again_keeps_its_wrench_and_a_dropped_scan_has_none(self):
+        runtime = self.runtime(FakeModel(make_pad_contract()), reuse=True)
+        first, again = (runtime.push(make_scan(number, press_counts=20_000)) for number in (0, 1))
+        assert again.reused_from == 0 and again.wrench == first.wrench is not None
+        assert again.traction is first.traction and again.wrench_origin == "nominal"
+        dropped = runtime.push(make_scan(2, press_counts=9000), infer=False)
+        assert dropped.state == "dropped" and dropped.traction is dropped.wrench is dropped.wrench_origin is None
+
+    @pytest.mark.parametrize("pad", [4.5, {"4": 4.5}, "pad"])
+    def test_what_is_no_pad_is_refused(self, pad):
+        with pytest.raises(UsageError, match="expected a Pad"):
+            self.runtime(FakeModel(), pad=pad)
+
+
+class TestPad:
+    def test_names_are_those_that_models_and_files_know(self):
+        assert list(PAD_RANGES) == [
+            *("thickness_mm", "shear_modulus_mpa", "poisson", "in_plane_share", "magnet_height_mm"),
+            "counts_per_newton",
+        ]
+
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"thickness_mm": 0.0},
+            {"poisson": 0.5},
+            {"counts_per_newton": float("nan")},
+            {"intervals": {"thickness": (1, 2)}},
+            {"intervals": {"thickness_mm": (5, 4)}},
+            {"intervals": {"thickness_mm": (0, 4)}},
+            {"gains": (1.0,) * 16},
+            {"gains": (0.0,) * 48},
+            {"gains": (float("nan"),) * 48},
+        ],
+    )
+    def test_what_no_pad_has_is_refused(self, wrong):
+        with pytest.raises(ValueError, match="expected"):
+            Pad(**wrong)
+
+    def test_gains_go_with_their_places_and_axes_when_the_mounting_is_corrected(self):
+        order = tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist())
+        turned = PAD.turned(Mounting(order=order, swap_xy=True, signs=(-1, 1, 1)))
+        assert turned.gains is not None and turned.thickness_mm == 5.0
+        before, after = (np.asarray(gains).reshape(3, 16) for gains in (GAINED, turned.gains))
+        np.testing.assert_array_equal(after, before[[1, 0, 2]][:, list(order)])
+        assert Pad().turned(Mounting(order=order)) == Pad()
