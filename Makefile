@@ -32,17 +32,22 @@ lint: $(VENV)/.dev  ## format, lint, types, import rules
 docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-models: $(VENV)/.dev data/seen.npz data/figures.npz  ## retrain and re-export the bundled models: about an hour on two cores
-	$(BIN)/python -m train.freeze edge/models --data data/seen.npz data/figures.npz
-	$(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/seen.npz data/figures.npz
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --int8 data/seen.npz data/figures.npz --fine-tune-steps 3000
+TAPS := data/gripped.npz data/gripped4.npz
+
+models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: under two hours on two cores
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --int8 $(TAPS) --validation data/validation.npz --fine-tune-steps 800
+	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 
-data/seen.npz: $(VENV)/.dev  ## taps on the 18 surfaces
-	$(BIN)/python -m train.generate $@ --taps 7 --seed 1
+data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
+	$(BIN)/python -m train.data.make_presses $@ --count 34000 --seed 1
 
-data/figures.npz: $(VENV)/.dev  ## taps on random figures
-	$(BIN)/python -m train.generate $@ --surfaces none --glyphs 4500 --polygons 4500 --taps 7 --seed 2
+data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each
+	$(BIN)/python -m train.data.make_presses $@ --count 5000 --taps 4 --seed 2
+
+data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
+	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --seed 1000001
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -19,16 +19,17 @@ from export.int8 import quantised
 from export.parity import GraphRun
 from export.rounding import integer_convolutions, rounded
 from firmware_bridge.geometry import SensorGeometry
-from train.batches import Draw, WindowBatches, network_input
+from train.batches import network_input
 from train.calibration import calibrate
+from train.data.batch import Batch
+from train.data.presses import PressSet
 from train.dataset import Sequences
 from train.fit import given_taps
-from train.freeze import SEED, freeze
 from train.loop import Recipe, train
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
-from train.nuisances import Nuisances
 from train.objectives import RelativeError
+from train.training import batches_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class FineTuning:
 
     Attributes:
         steps: optimizer steps.
-        validation: flat sequences, of no test and no training, by which it is decided and deviations are calibrated.
+        validation: of no test and no training, by which it is decided and deviations are calibrated.
         always: whether integers cost much or not: it goes on learning, too.
         learning_rate: highest of the one cycle. In 3000 steps the bundled four-tap network gains .2 dB in integers and
             .14 in float, so that nothing is lost to integers any more (docs/log.md).
@@ -46,7 +47,7 @@ class FineTuning:
     """
 
     steps: int
-    validation: Sequences
+    validation: FrozenSet
     always: bool = False
     learning_rate: float = 2e-4
     batch: int = 64
@@ -55,10 +56,6 @@ class FineTuning:
     def recipe(self, taps: int) -> Recipe:
         """How a network of so many taps is trained on."""
         return Recipe(self.steps, self.batch, self.learning_rate, given=given_taps(taps))
-
-    def frozen(self, scale: int) -> FrozenSet:
-        """The validation set of training, at a scale."""
-        return freeze(self.validation, Nuisances(), SEED, scale=scale)
 
     def sha256(self, training_sha256: str, data_sha256: str, *, every: bool) -> str:
         """Hash of all that decides the weights of a network that was trained and then trained on."""
@@ -70,7 +67,7 @@ def fine_tuned(
     net: PatternNet,
     model: onnx.ModelProto,
     quantised_model: onnx.ModelProto,
-    sequences: Sequences,
+    sequences: Sequences | PressSet,
     recipe: Recipe,
     seed: int = 1,
 ) -> PatternNet:
@@ -94,7 +91,7 @@ def fine_tuned(
     """
     trained = copy.deepcopy(net)
     objective = HeteroscedasticError() if isinstance(trained, CompactNet) else RelativeError()
-    batches = WindowBatches(sequences.at_scale(net.scale), Draw(), recipe.given, recipe.batch, seed)
+    batches = batches_of(sequences, net.scale, recipe, seed)
     with contextlib.ExitStack() as done:
         done.enter_context(rounded(trained, integer_convolutions(model, quantised_model)))
         folder = done.enter_context(tempfile.TemporaryDirectory())
@@ -117,7 +114,7 @@ def recalibrated(net: PatternNet, integers: onnx.ModelProto, validation: FrozenS
     """
     other = copy.deepcopy(net)
     if isinstance(other, CompactNet):
-        patterns, deviations = GraphRun(integers)(network_input(validation.windows(net.taps)).numpy())
+        patterns, deviations = GraphRun(integers)(network_input(validation.windows(net.taps)).numpy())[:2]
         other.deviation_scale *= calibrate(validation.patterns(), patterns, deviations)
     return other
 
@@ -144,8 +141,8 @@ class Quantised:
 def quantised_well(
     net: PatternNet,
     geometry: SensorGeometry,
-    windows: NDArray[np.float32],
-    sequences: Sequences,
+    seen: Batch,
+    sequences: Sequences | PressSet,
     tuning: FineTuning | None,
     most_loss_db: float,
     *,
@@ -158,7 +155,7 @@ def quantised_well(
     Args:
         net: without batch normalisation, see `export.rounding.folded`.
         geometry: of the sensor.
-        windows: of which ranges are taken, see `export.int8.quantised`.
+        seen: of which ranges are taken, see `export.int8.quantised`.
         sequences: training taps.
         tuning: how it is trained on, or None for never.
         most_loss_db: what integers may cost.
@@ -169,24 +166,24 @@ def quantised_well(
         DivergedError: the learning rate is too high.
     """
     model = to_model(net, geometry)
-    plain = Quantised(net, model, quantised(model, windows, every=every))
+    plain = Quantised(net, model, quantised(model, seen, every=every))
     if tuning is None:
         return plain
-    validation = tuning.frozen(net.scale)
+    validation = tuning.validation
     in_float_db = graph_psnr_db(model, net.taps, validation)
     before_db = in_float_db - graph_psnr_db(plain.integers, net.taps, validation)
     if before_db <= most_loss_db and not tuning.always:
         return plain
     recipe = tuning.recipe(net.taps)
     other = fine_tuned(net, model, plain.integers, sequences, recipe, tuning.seed)
-    integers = quantised(to_model(other, geometry), windows, every=every)
+    integers = quantised(to_model(other, geometry), seen, every=every)
     now_db = in_float_db - graph_psnr_db(integers, net.taps, validation)
     said = f"fine-tuned {tuning.steps} steps: before {before_db:.3f} dB lost in validation, now {now_db:.3f}"
     if now_db >= before_db:
         return replace(plain, said=f"{said}, so not taken")
     other = recalibrated(other, integers, validation)
     model = to_model(other, geometry)
-    return Quantised(other, model, quantised(model, windows, every=every), trained_on=True, said=said)
+    return Quantised(other, model, quantised(model, seen, every=every), trained_on=True, said=said)
 
 
 def graph_psnr_db(model: onnx.ModelProto, taps: int, validation: FrozenSet) -> float:

@@ -8,7 +8,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME
+from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME
 from export.errors import ExportError
 from firmware_bridge.geometry import SensorGeometry
 from train.networks.blocks import PatternNet
@@ -35,17 +35,19 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
         raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
     traced = _TRACED if isinstance(batch, str) else batch
     example = torch.zeros(traced, 3 * net.taps, geometry.rows, geometry.cols)
+    width = known_width(net)
+    inputs = {INPUT_NAME: example} | ({PAD_NAME: torch.zeros(traced, width)} if width else {})
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not there
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch's own, about torch's own
         program = torch.onnx.export(
             net,
-            (example,),
+            tuple(inputs.values()),
             dynamo=True,
             opset_version=OPSET,
-            input_names=[INPUT_NAME],
-            output_names=[OUTPUT_NAME, DEVIATION_NAME][: len(outputs(net, example))],
-            dynamic_shapes=({0: torch.export.Dim(batch)},) if isinstance(batch, str) else None,
+            input_names=list(inputs),
+            output_names=[OUTPUT_NAME, DEVIATION_NAME, TRACTION_NAME][: len(outputs(net, example))],
+            dynamic_shapes=tuple({0: torch.export.Dim(batch)} for _ in inputs) if isinstance(batch, str) else None,
             verbose=False,
         )
     if program is None:
@@ -63,8 +65,13 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
     return model
 
 
-def outputs(net: nn.Module, windows: Tensor) -> tuple[Tensor, ...]:
-    """The patterns, and their deviations where the network gives any."""
+def known_width(net: nn.Module) -> int:
+    """Numbers that a network takes of what is known of a pad."""
+    return getattr(net, "known", 0)
+
+
+def outputs(net: nn.Module, windows: Tensor, pads: Tensor | None = None) -> tuple[Tensor, ...]:
+    """The patterns, and their deviations and the tractions where the network gives any; without pads none is known."""
     with torch.inference_mode():
-        given = net(windows)
+        given = net(windows) if pads is None else net(windows, pads)
     return given if isinstance(given, tuple) else (given,)

@@ -20,11 +20,15 @@ from numpy.typing import NDArray
 from onnx import NodeProto
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-from edge.contract import INPUT_NAME, Contract
+from edge.contract import INPUT_NAME, PAD_NAME, Contract
 from edge.session import LOG_FATAL_ONLY
 from export.errors import ExportError
-from train.batches import Draw, WindowBatches, network_input
+from train.batches import Draw
+from train.data.batch import Batch
+from train.data.presses import PressSet
 from train.dataset import Sequences
+from train.loop import Recipe
+from train.training import batches_of
 
 _PERCENTILE: Final = 99.999
 """Of a layer's values lie within its range; what lies beyond is cut. With the whole range the bundled models lose .03
@@ -39,8 +43,8 @@ _SET_FORCE_N: Final = (0.3, 8.0)
 """Of the taps that ranges are taken of: light ones count as much."""
 
 
-def calibration_windows(taps: Sequences, contract: Contract) -> NDArray[np.float32]:
-    """Windows (n, 3K, rows, cols) in network units, drawn from training taps as training does, light contacts too.
+def calibration_batch(taps: Sequences | PressSet, contract: Contract) -> Batch:
+    """Windows, and what is known of their pads, drawn from training taps as training does, light contacts too.
 
     Raises:
         DatasetError: the sequences have fewer taps than the network takes.
@@ -48,28 +52,32 @@ def calibration_windows(taps: Sequences, contract: Contract) -> NDArray[np.float
     """
     if len(taps) < _FEWEST:
         raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
-    few = taps.pick(np.unique(np.linspace(0, len(taps) - 1, min(len(taps), _CALIBRATED_ON)).round().astype(int)))
     given = (1 / contract.taps,) * contract.taps
-    batches = WindowBatches(few.at_scale(contract.scale), Draw(set_force_n=_SET_FORCE_N), given, len(few), seed=0)
-    return network_input(batches.draw(0)[0]).numpy()
+    recipe = Recipe(1, batch=min(len(taps), _CALIBRATED_ON), given=given)
+    return batches_of(taps, contract.scale, recipe, 0, Draw(set_force_n=_SET_FORCE_N))(0)
 
 
-class _Windows(CalibrationDataReader):
-    def __init__(self, windows: NDArray[np.float32], batch: int) -> None:
-        filled = np.concatenate([windows, np.resize(windows, (-len(windows) % batch, *windows.shape[1:]))])
-        self._left: Iterator[NDArray[np.float32]] = iter(filled.reshape(-1, batch, *windows.shape[1:]))
+class _Inputs(CalibrationDataReader):
+    def __init__(self, inputs: dict[str, NDArray[np.float32]], batch: int) -> None:
+        filled = {
+            name: np.concatenate([given, np.resize(given, (-len(given) % batch, *given.shape[1:]))])
+            for name, given in inputs.items()
+        }
+        count = len(filled[INPUT_NAME])
+        self._left = iter(
+            {name: given[first : first + batch] for name, given in filled.items()} for first in range(0, count, batch)
+        )
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        window = next(self._left, None)
-        return None if window is None else {INPUT_NAME: window}
+        return next(self._left, None)
 
 
-def quantised(model: onnx.ModelProto, windows: NDArray[np.float32], *, every: bool = False) -> onnx.ModelProto:
+def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> onnx.ModelProto:
     """The same graph with quantise and dequantise nodes around what may be done in integers.
 
     Args:
         model: in float.
-        windows: (n, 3K, rows, cols) in network units, of which the ranges are taken: light contacts among them.
+        seen: of which the ranges are taken: light contacts among them.
         every: all convolutions, not only those that are worth it.
 
     Raises:
@@ -78,12 +86,15 @@ def quantised(model: onnx.ModelProto, windows: NDArray[np.float32], *, every: bo
     nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
     if not nodes:
         raise ExportError("no convolution of the graph may be done in integers: export it without --int8")
+    inputs = {INPUT_NAME: seen.window.numpy()}
+    if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
+        inputs[PAD_NAME] = seen.pad.numpy()
     with tempfile.TemporaryDirectory() as drafts, _quiet():
         path = Path(drafts) / "int8.onnx"
         quantize_static(
             onnx.ModelProto.FromString(model.SerializeToString()),
             path,
-            _Windows(windows, batch),
+            _Inputs(inputs, batch),
             quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,

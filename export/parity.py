@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edge.contract import INPUT_NAME, Contract
+from edge.contract import INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.frozen import FrozenSet
 from edge.session import LOG_FATAL_ONLY
 from export.errors import ParityError
-from export.graph import outputs
+from export.graph import known_width, outputs
 
 LEVELS: Final = {
     "none": onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL,
@@ -31,6 +31,8 @@ TOLERANCE: Final = 1e-5
 
 Both compute in float32 and add in another order. Measured from x4 to x20: compact networks 6e-7, seed-size ones 2e-6.
 """
+FULL_TRACTION_KPA: Final = 100.0
+"""Traction of 40 N evenly on the pad: what differences of tractions are a share of, where none is larger."""
 FULL_RANGE_COUNTS: Final = 32768
 """No zeroed reading is further from rest: `firmware_bridge.baseline.deformation` goes the short way round."""
 _DENORMAL_BITS: Final = 0x000116C2
@@ -73,17 +75,32 @@ class GraphRun:
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
-        batch = self._session.get_inputs()[0].shape[0]
+        inputs = {given.name: given.shape for given in self._session.get_inputs()}
+        batch = inputs[INPUT_NAME][0]
+        self._pad_width = inputs[PAD_NAME][1] if PAD_NAME in inputs else 0
         self._batch = batch if isinstance(batch, int) else 1
         self.outputs: list[str] = [output.name for output in self._session.get_outputs()]
 
-    def __call__(self, windows: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """Each output (n, H, W) of windows (n, 3K, rows, cols); a last batch that is not full is filled with zeros."""
+    def __call__(
+        self, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
+    ) -> list[NDArray[np.float32]]:
+        """Each output (n, ...) of windows (n, 3K, rows, cols); a last batch that is not full is filled with zeros.
+
+        Args:
+            windows: in network units.
+            pads: (n, width), what is known of the pads; without, nothing is.
+        """
         count = len(windows)
-        filled = np.concatenate([windows, np.zeros((-count % self._batch, *windows.shape[1:]), windows.dtype)])
+        inputs = {INPUT_NAME: windows}
+        if self._pad_width:
+            inputs[PAD_NAME] = np.zeros((count, self._pad_width), np.float32) if pads is None else pads
+        filled = {
+            name: np.concatenate([given, np.zeros((-count % self._batch, *given.shape[1:]), given.dtype)])
+            for name, given in inputs.items()
+        }
         runs = [
-            self._session.run(None, {INPUT_NAME: filled[first : first + self._batch]})
-            for first in range(0, len(filled), self._batch)
+            self._session.run(None, {name: given[first : first + self._batch] for name, given in filled.items()})
+            for first in range(0, len(filled[INPUT_NAME]), self._batch)
         ]
         return [np.concatenate(maps)[:count] for maps in zip(*runs, strict=True)]
 
@@ -94,7 +111,7 @@ def differences(
     got: Sequence[NDArray[np.float32]],
     full_scale: float,
 ) -> list[Difference]:
-    """How far outputs lie apart, each (n, H, W); the first is the pattern.
+    """How far outputs lie apart, each (n, ...); what a difference is a share of is of the output's own unit.
 
     Raises:
         ParityError: number or shapes of the outputs differ, or a value is not finite.
@@ -102,17 +119,30 @@ def differences(
     shapes = [[maps.shape for maps in given] for given in (expected, got)]
     if shapes[0] != shapes[1]:
         raise ParityError(f"outputs of shape {shapes[1]}, expected {shapes[0]}")
-    size = np.max([np.abs(maps).max(axis=(1, 2)) for maps in expected], axis=0)
     found = []
-    for name, true in zip(names, expected, strict=False):
+    for name, true in zip(names, expected, strict=True):
         if not np.isfinite(true).all():
             raise ParityError(f"torch gives a {name} that is not finite")
-    for name, true, mine, unit in zip(names, expected, got, (full_scale, 0.0), strict=False):
+    for name, true, mine in zip(names, expected, got, strict=True):
         if not np.isfinite(mine).all():
             raise ParityError(f"the {name} is not finite")
-        apart = np.abs(mine - true).max(axis=(1, 2))
+        same_unit = [maps for other, maps in zip(names, expected, strict=True) if (other == TRACTION_NAME) == (name == TRACTION_NAME)]
+        size = np.max([_largest(maps) for maps in same_unit], axis=0)
+        unit = {OUTPUT_NAME: full_scale, TRACTION_NAME: FULL_TRACTION_KPA}.get(name, 0.0)
+        apart = _largest(mine - true)
         found.append(Difference(name, float(apart.max()), float((apart / np.maximum(unit, size)).max())))
     return found
+
+
+def _largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.abs(maps).reshape(len(maps), -1).max(axis=1)
+
+
+def example_pads(count: int, width: int) -> NDArray[np.float32]:
+    """What may be known of pads, (count, width): of every third nothing."""
+    pads = np.random.default_rng(0).standard_normal((count, width)).astype(np.float32)
+    pads[::3] = 0
+    return pads
 
 
 def check_parity(
@@ -131,9 +161,12 @@ def check_parity(
         ParityError: it is larger than TOLERANCE, or a value is not finite.
     """
     run = GraphRun(model, level)
-    expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows))]
+    width = known_width(net)
+    pads = example_pads(len(windows), width) if width else None
+    known = None if pads is None else torch.from_numpy(pads)
+    expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), known)]
     largest = 0.0
-    for difference in differences(run.outputs, expected, run(windows), full_scale):
+    for difference in differences(run.outputs, expected, run(windows, pads), full_scale):
         if not difference.relative <= TOLERANCE:
             raise ParityError(
                 f"onnxruntime and torch differ by {difference.relative:.2e} in the {difference.output}, expected at "

@@ -19,6 +19,7 @@ from edge.contract import Contract
 from export.errors import ExportError
 from train.networks.blocks import PatternNet
 from train.networks.registry import build
+from train.networks.symmetric import write_out
 
 ORIGIN_KEY: Final = "tactile.origin"
 
@@ -66,6 +67,7 @@ def network_of(model: onnx.ModelProto) -> PatternNet:
     """
     made = origin_of(model)
     net = build(made["network"], made["scale"], **made["options"])
+    write_out(net)
     held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in model.graph.initializer}
     lacking = [name for name in net.state_dict() if name not in held]
     if lacking:

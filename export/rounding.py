@@ -18,6 +18,7 @@ from torch.nn.utils import fuse_conv_bn_eval, parametrize
 
 from export.errors import ExportError
 from train.networks.blocks import MultiScaleResidual, PatternNet, Residual
+from train.networks.symmetric import SymmetricResidual, write_out
 
 _MOST_WEIGHT: Final = 127
 _MOST_VALUE: Final = 255
@@ -53,12 +54,15 @@ class IntegerConvolution:
 
 
 def folded(net: PatternNet) -> PatternNet:
-    """A copy that computes the same in evaluation mode, its batch normalisation part of the convolutions before it.
+    """A copy that computes the same in evaluation mode, of ordinary convolutions alone.
+
+    Symmetric ones are written out, and batch normalisation becomes part of the convolutions before it.
 
     Raises:
         ExportError: a batch normalisation does not follow a convolution.
     """
     fused = copy.deepcopy(net).eval()
+    write_out(fused)
     for sequence in [module for module in fused.modules() if isinstance(module, nn.Sequential)]:
         for place in range(1, len(sequence)):
             before, norm = sequence[place - 1], sequence[place]
@@ -161,7 +165,7 @@ def rounded(net: PatternNet, convolutions: Mapping[str, IntegerConvolution]) -> 
         for name, module in modules.items():
             # What goes straight on beside the convolutions is rounded too, and so is the sum.
             match module:
-                case Residual():
+                case Residual() | SymmetricResidual():
                     first, last = f"{name}.body.0", f"{name}.body.2"
                 case MultiScaleResidual():
                     first, last = f"{name}.fine.0", f"{name}.fuse"

@@ -8,7 +8,7 @@ Where integers cost more than they may on the validation set, the network is tra
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -23,18 +23,23 @@ from edge.frozen import FrozenSet, load_frozen_set
 from edge.progress import tracked
 from export.errors import ExportError
 from export.fine_tune import FineTuning, quantised_well
-from export.graph import outputs, to_model
-from export.int8 import calibration_windows, convolutions, quantised
+from export.graph import known_width, outputs, to_model
+from export.int8 import calibration_batch, convolutions, quantised
 from export.parity import check_parity, extreme_windows, read_windows
 from export.rounding import folded
 from export.writing import Writer
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.batches import COUNTS_PER_UNIT
 from train.calibration import half_width_mm
-from train.dataset import Sequences, join, load_sequences
+from train.confidence import confidence_sets
+from train.data.files import load_taps
+from train.data.frozen_presses import freeze_presses
+from train.data.presses import PressSet, load_presses
+from train.dataset import Sequences
 from train.errors import CheckpointError, TrainError
-from train.freeze import held_out
+from train.freeze import SEED, held_out
 from train.networks.blocks import PatternNet
+from train.physics.pads import input_scale
 from train.poses import ANGLE_STEP_DEG
 from train.training import load_network
 
@@ -57,7 +62,8 @@ def contract_of(
         CheckpointError: the report beside the weights lacks a key; it is named.
     """
     example = torch.zeros(1, 3 * net.taps, geometry.rows, geometry.cols)
-    deviations = len(outputs(net, example)) == 2
+    given = outputs(net, example)
+    known = known_width(net)
     try:
         contact_level, training_sha256 = report["contact_level"], report["training_sha256"]
     except KeyError as error:
@@ -78,11 +84,14 @@ def contract_of(
         cols=geometry.cols,
         pitch_mm=geometry.pitch_mm,
         arithmetic="float32",
-        interval_factor=float(half_width_mm(1.0)) if deviations else None,
+        interval_factor=float(half_width_mm(1.0)) if len(given) > 1 else None,
         confidence={},
         training_sha256=training_sha256,
         test_set_sha256=frozen.sha256(),
         test_error={},
+        pad_inputs=tuple(input_scale()) if known else (),
+        takes_gains=bool(known),
+        traction_scale=given[2].shape[-1] // geometry.cols if len(given) > 2 else None,
     )
 
 
@@ -92,11 +101,11 @@ def export(
     frozen: FrozenSet,
     geometry: SensorGeometry = USPA44,
     batch: int | str = 1,
-    calibration: Sequences | None = None,
+    calibration: Sequences | PressSet | None = None,
     *,
     every: bool = False,
     tuning: FineTuning | None = None,
-    validation: Sequences | None = None,
+    validation: Sequence[FrozenSet] = (),
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and say in a line what it is.
 
@@ -112,8 +121,8 @@ def export(
         calibration: training taps of which integers take their ranges; float32 without.
         every: all convolutions in integers, not only those that are worth it.
         tuning: how a network is trained on for integers, and when; None for never.
-        validation: flat sequences, of no test and no training, on which is found what deviations tell; without, the
-            contract's confidence stays empty.
+        validation: sets of no test and no training, on which is found what deviations tell; without, the contract's
+            confidence stays empty.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
@@ -134,7 +143,7 @@ def export(
 
     single = to_model(net, geometry)
     check_parity(net, single, windows, contract.output_full_scale)
-    seen = calibration_windows(calibration, contract)
+    seen = calibration_batch(calibration, contract)
     well = quantised_well(net, geometry, seen, calibration, tuning, MOST_LOSS_DB, every=every)
     lines: list[str] = []
     if tuning is not None and well.trained_on:
@@ -183,6 +192,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}', as given"
     )
+    parser.add_argument("--validation", type=Path, metavar="FILE", help="presses that nothing is trained on")
     parser.add_argument("--int8", type=Path, nargs="+", metavar="DATA", help="NAME-int8.onnx, ranges of these taps")
     parser.add_argument(
         "--all-integers", action="store_true", help="with --int8: all convolutions, not the large alone"
@@ -206,9 +216,12 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-        taps = None if options.int8 is None else join([load_sequences(path) for path in options.int8])
-        validation = held_out("validation")
-        tuning = FineTuning(FINE_TUNE_STEPS if steps is None else steps, validation, always=steps is not None)
+        taps = None if options.int8 is None else load_taps(options.int8)
+        if options.validation is None:
+            validation = confidence_sets(held_out("validation"), frozen.scale)
+        else:
+            validation = [freeze_presses(load_presses(options.validation), SEED).as_frozen_set()]
+        tuning = FineTuning(FINE_TUNE_STEPS if steps is None else steps, validation[0], always=steps is not None)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(
                 checkpoint,

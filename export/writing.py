@@ -14,8 +14,7 @@ from edge.judge import judge_model, mean_error
 from edge.progress import tracked
 from edge.session import ModelSession
 from export.reference import origin
-from train.confidence import confidence_sets, fit_confidence
-from train.dataset import Sequences
+from train.confidence import fit_confidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +27,13 @@ class Writer:
     Attributes:
         folder: where they go.
         frozen: the test set.
-        validation: flat sequences on which is found what deviations tell; without, the contract's confidence stays
-            empty.
+        validation: sets on which is found what deviations tell; without, the contract's confidence stays empty.
         report: of the checkpoint.
     """
 
     folder: Path
     frozen: FrozenSet
-    validation: Sequences | None
+    validation: Sequence[FrozenSet]
     report: Mapping[str, Any]
 
     def error(self, single: onnx.ModelProto, contract: Contract) -> dict[str, float]:
@@ -68,8 +66,9 @@ class Writer:
                 said.append(f"interval covers {error['coverage_90']:.1%}")
         else:
             said.append(f"not judged, the test set is of x{self.frozen.scale}")
-        if self.validation is not None and session.deviation is not None:
-            contract.confidence.update(fit_confidence(session, confidence_sets(self.validation, contract.scale)))
+        fitting = [one for one in self.validation if one.scale == contract.scale]
+        if fitting and session.deviation is not None:
+            contract.confidence.update(fit_confidence(session, fitting))
         content = self._bytes(model, contract)
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # as the runtime will
         (self.folder / f"{name}.onnx").write_bytes(content)

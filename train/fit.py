@@ -1,12 +1,12 @@
 """Train the bundled networks from nothing to their final error, or one network by name; in one seeded run.
 
-    python -m train.fit checkpoints --data data/seen.npz data/figures.npz
-    torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/seen.npz --network stsr --steps 5000
+    python -m train.fit checkpoints --data data/gripped.npz data/gripped4.npz --validation data/validation.npz
+    torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
     python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start seed-stsr --steps 5000
 
-A base network of seven taps is trained from nothing; each bundled one starts as that network, with its own number of
-taps, and is trained on. The small one is trained from nothing. Older taps drop out at random in training, so a network
-is right with fewer taps than it takes.
+The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older taps
+drop out at random in training, so a network is right with fewer taps than it takes; and what is known of a pad does, so
+it is right without.
 A run that was cut short goes on where it was. `tensorboard --logdir checkpoints/logs` shows how it goes.
 """
 
@@ -17,27 +17,32 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from train.dataset import Sequences, join, load_sequences
+from train.data.files import load_taps
+from train.data.frozen_presses import freeze_presses
+from train.data.presses import PressSet, load_presses
+from train.dataset import Sequences
 from train.errors import TrainError
 from train.freeze import SEED, freeze, held_out
 from train.loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
 from train.nuisances import Nuisances
+from train.physics.pads import KNOWN
 from train.training import Training, fit_network
 
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}
 """Share of windows with 1, 2, ... K taps given."""
 
-BASE: Final = Training(
-    "base", "compact-mtsr7", Recipe(steps=16_000, given=(0.2, 0.1, 0.1, 0.25, 0.05, 0.05, 0.25), bf16=True)
-)
-BUNDLED: Final = tuple(
+_KNOWN: Final = {"known": KNOWN}
+BUNDLED: Final = (
+    Training("stsr", "compact-stsr", Recipe(steps=20_000), options=_KNOWN),
+    Training("stsr-small", "small-stsr", Recipe(steps=12_000, learning_rate=3e-3), options=_KNOWN),
     Training(
-        name, f"compact-{name}", Recipe(steps=steps, learning_rate=5e-4, given=GIVEN[taps]), start="base", seed=1 + taps
-    )
-    for name, taps, steps in (("mtsr4", 4, 2000), ("mtsr2", 2, 1000), ("stsr", 1, 1000))
+        "mtsr4", "compact-mtsr4", Recipe(steps=5000, learning_rate=1e-3, given=GIVEN[4]), start="stsr", options=_KNOWN
+    ),
+    Training(
+        "mtsr2", "compact-mtsr2", Recipe(steps=2000, learning_rate=7e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
+    ),
 )
-SMALL: Final = Training("stsr-small", "small-stsr", Recipe(steps=16_000, bf16=True))
 
 
 def given_taps(taps: int) -> tuple[float, ...]:
@@ -48,11 +53,11 @@ def given_taps(taps: int) -> tuple[float, ...]:
     return tuple(shares)
 
 
-def fit_bundled(data: Sequences, folder: Path, shorten: int = 1) -> None:
-    """Train the base, then the bundled networks from it; `shorten` divides their steps, for tests."""
-    validation = freeze(held_out("validation", taps=data.taps), Nuisances(), SEED)
-    for training in (BASE, *BUNDLED, SMALL):
-        _say(_line(fit_network(_shortened(training, shorten), data, validation, folder)))
+def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
+    """Train the bundled networks, one from another; `shorten` divides their steps, for tests."""
+    frozen = freeze_presses(validation, SEED).as_frozen_set()
+    for training in BUNDLED:
+        _say(_line(fit_network(_shortened(training, shorten), data, frozen, folder)))
 
 
 def _shortened(training: Training, divisor: int) -> Training:
@@ -81,14 +86,19 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     started_s = time.monotonic()
     try:
-        data = join([load_sequences(path) for path in options.data])
+        data = load_taps(options.data)
+        validation = None if options.validation is None else load_presses(options.validation)
         if options.network is None:
-            fit_bundled(data, options.folder, options.shorten)
+            if not isinstance(data, PressSet) or validation is None:
+                raise ValueError("the bundled networks are trained on presses: give --data and --validation such files")
+            fit_bundled(data, validation, options.folder, options.shorten)
         else:
-            training = _training(options)
-            validation = freeze(held_out("validation"), Nuisances(), SEED, scale=training.scale)
-            report = fit_network(training, data, validation, options.folder)
-            _say(_line(report))
+            training = _training(options, data)
+            if validation is None:
+                frozen = freeze(held_out("validation"), Nuisances(), SEED, scale=training.scale)
+            else:
+                frozen = freeze_presses(validation, SEED).as_frozen_set()
+            _say(_line(fit_network(training, data, frozen, options.folder)))
     except (TrainError, ValueError) as error:
         sys.exit(f"fit: {error}")
     except KeyboardInterrupt:
@@ -97,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
     leave_group()
 
 
-def _training(options: argparse.Namespace) -> Training:
+def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Training:
     *_, taps = options.network.rpartition("mtsr")
     recipe = Recipe(
         steps=options.steps,
@@ -107,8 +117,15 @@ def _training(options: argparse.Namespace) -> Training:
         bf16=options.bf16,
         minutes=options.minutes,
     )
+    compact = options.network.startswith(("compact-", "small-"))
     return Training(
-        options.name or _name(options.network), options.network, recipe, options.scale, options.start, seed=options.seed
+        options.name or _name(options.network),
+        options.network,
+        recipe,
+        options.scale,
+        options.start,
+        seed=options.seed,
+        options=_KNOWN if compact and isinstance(data, PressSet) else {},
     )
 
 
@@ -120,7 +137,10 @@ def _name(network: str) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.fit", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="where to write the checkpoints")
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.generate")
+    parser.add_argument(
+        "--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses, or of train.generate"
+    )
+    parser.add_argument("--validation", type=Path, help="presses that nothing is trained on")
     parser.add_argument("--shorten", type=int, default=1, help="divide the bundled networks' steps, to try things out")
     one = parser.add_argument_group("one network instead of the bundled ones")
     one.add_argument("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))

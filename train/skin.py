@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.geometry import SensorGeometry
 from train.layer import Layer
-from train.magnets import MOVEMENT, Magnet, MagnetArray
+from train.magnets import Magnet, MagnetArray
 from train.physics.free_sides import FreeSides
 from train.physics.magnet_response import pressure_response, traction_response
 

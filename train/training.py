@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
@@ -16,14 +16,18 @@ from edge.frozen import FrozenSet
 from edge.metrics import contact_iou, psnr_db, ssim
 from train.batches import Draw, WindowBatches, network_input
 from train.calibration import calibrate, interval_coverage
+from train.data.batch import Batch
+from train.data.press_batches import PressBatches
+from train.data.presses import PressSet
 from train.dataset import Sequences
-from train.errors import CheckpointError
+from train.errors import CheckpointError, DatasetError
 from train.loop import Objective, Recipe, device_name, device_of_rank, rank_and_world, train, wait_for_all
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.registry import build, grown
 from train.networks.srgan import SrganObjective, TactileSRGAN
 from train.objectives import RelativeError
+from train.physics.gripped import SCALE
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
 _INFERRED_AT_ONCE: Final = 128
@@ -61,14 +65,14 @@ class Training:
         return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
 
 
-def fit_network(training: Training, data: Sequences, validation: FrozenSet, folder: Path) -> dict[str, Any]:
+def fit_network(training: Training, data: Sequences | PressSet, validation: FrozenSet, folder: Path) -> dict[str, Any]:
     """Train, calibrate, judge and write one network; returns what its NAME.json holds.
 
     A checkpoint that is there already, trained alike, is left as it is.
 
     Args:
         training: what to train.
-        data: sequences of at least as many taps as it takes.
+        data: sequences, some of them of as many taps as it takes.
         validation: what contact level and deviations are set on.
         folder: of the checkpoints.
 
@@ -90,7 +94,7 @@ def fit_network(training: Training, data: Sequences, validation: FrozenSet, fold
     device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
-    batches = WindowBatches(data.at_scale(training.scale), training.draw, recipe.given, recipe.batch, seed)
+    batches = batches_of(data, training.scale, recipe, seed, training.draw)
     done = train(
         net,
         _objective(net, device, seed),
@@ -131,6 +135,25 @@ def fit_network(training: Training, data: Sequences, validation: FrozenSet, fold
     return report
 
 
+def batches_of(
+    data: Sequences | PressSet, scale: int, recipe: Recipe, seed: int, draw: Draw | None = None
+) -> Callable[[int], Batch]:
+    """Batches of a recipe; of presses those sequences alone that have all taps.
+
+    Raises:
+        DatasetError: there are no sequences of as many taps, or presses are asked for at another scale than theirs.
+    """
+    if isinstance(data, Sequences):
+        return WindowBatches(data.at_scale(scale), draw or Draw(), recipe.given, recipe.batch, seed)
+    if scale != SCALE:
+        raise DatasetError(f"patterns at x{scale} asked for, presses have them at x{SCALE}: take 'train.generate'")
+    taps = len(recipe.given)
+    whole = data.counts[:, taps - 1].any(axis=(1, 2, 3)) if data.taps >= taps else np.zeros(len(data), dtype=bool)
+    if not whole.any():
+        raise DatasetError(f"no sequences of {taps} taps: make some with 'python -m train.data.make_presses --taps'")
+    return PressBatches(data.pick(whole), recipe.given, recipe.batch, seed)
+
+
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
     """The network of NAME.pt in evaluation mode, and NAME.json beside it.
 
@@ -149,16 +172,23 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
 
 def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) in zeroed counts, and deviations where there are."""
+    outputs = infer_all(net, windows)
+    return outputs[0], outputs[1] if len(outputs) > 1 else None
+
+
+def infer_all(
+    net: PatternNet, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
+) -> list[NDArray[np.float32]]:
+    """All that a network gives of windows (n, K, 3, rows, cols) in zeroed counts, and of what is known of the pads."""
     device = next(net.parameters()).device
-    patterns, deviations = [], []
+    parts = torch.split(network_input(windows), _INFERRED_AT_ONCE)
+    known = [()] * len(parts) if pads is None else [(pad,) for pad in torch.from_numpy(pads).split(_INFERRED_AT_ONCE)]
+    rows: list[tuple[torch.Tensor, ...]] = []
     with torch.inference_mode():
-        for part in torch.split(network_input(windows), _INFERRED_AT_ONCE):
-            given = net(part.to(device))
-            pattern, deviation = given if isinstance(given, tuple) else (given, None)
-            patterns.append(pattern.float().cpu().numpy())
-            if deviation is not None:
-                deviations.append(deviation.float().cpu().numpy())
-    return np.concatenate(patterns), np.concatenate(deviations) if deviations else None
+        for part, pad in zip(parts, known, strict=True):
+            given = net(part.to(device), *(one.to(device) for one in pad))
+            rows.append(given if isinstance(given, tuple) else (given,))
+    return [torch.cat(maps).float().cpu().numpy() for maps in zip(*rows, strict=True)]
 
 
 def best_contact_level(patterns: NDArray[np.float32], touching: NDArray[np.bool_]) -> float:

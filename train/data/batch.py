@@ -25,6 +25,4 @@ class Batch:
     def share(self, rank: int, world: int, device: torch.device) -> "Batch":
         """The part of one of several processes, on its device."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Batch(**{
-            name: None if part is None else part[rank::world].to(device) for name, part in parts.items()
-        })
+        return Batch(**{name: None if part is None else part[rank::world].to(device) for name, part in parts.items()})

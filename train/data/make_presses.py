@@ -49,7 +49,9 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
         pool = joblib.Parallel(n_jobs=jobs)
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            for number, part in zip(numbers, pool(joblib.delayed(solve_pad)(world, one) for one in numbers), strict=True):
+            for number, part in zip(
+                numbers, pool(joblib.delayed(solve_pad)(world, one) for one in numbers), strict=True
+            ):
                 replace(part, config=facts).save(_part(folder, number))
                 bar.advance()
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]

@@ -133,9 +133,7 @@ def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
         loaded = PressSet(**arrays, config=facts["config"])
         hashed = str(facts["sha256"])
     except FileNotFoundError:
-        raise DatasetError(
-            f"{path}: no such file; make one with 'python -m train.data.make_presses {path}'"
-        ) from None
+        raise DatasetError(f"{path}: no such file; make one with 'python -m train.data.make_presses {path}'") from None
     except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         if isinstance(error, DatasetError):
             raise

@@ -24,10 +24,27 @@ FIGURES: Final = ("paper", "glyph", "polygon")
 """Families of flat figures on a plate: the paper's 18, and random ones."""
 
 SHARES: Final[Mapping[str, float]] = {
-    **{"paper": 20, "glyph": 14, "polygon": 14},
-    **{"flat": 6, "block": 6, "edge": 4, "corner": 3, "slot": 4, "step": 2},
-    **{"dome": 3, "cylinder": 4, "cone": 2, "ridge": 2, "wire": 3, "saddle": 2, "relief": 4, "grating": 4, "solid": 6},
-    **{"two": 4, "soft": 5, "glove": 5},
+    "paper": 20,
+    "glyph": 14,
+    "polygon": 14,
+    "flat": 6,
+    "block": 6,
+    "edge": 4,
+    "corner": 3,
+    "slot": 4,
+    "step": 2,
+    "dome": 3,
+    "cylinder": 4,
+    "cone": 2,
+    "ridge": 2,
+    "wire": 3,
+    "saddle": 2,
+    "relief": 4,
+    "grating": 4,
+    "solid": 6,
+    "two": 4,
+    "soft": 5,
+    "glove": 5,
 }
 """Relative frequency of each family in training."""
 
@@ -84,7 +101,10 @@ def draw_shape(
     x, y = np.broadcast_arrays(*pad.places_mm)
     maps = []
     for turn, (x_mm, y_mm, more) in zip(angle, off, strict=True):
-        seen = [_turned(lie, turn + more, x_mm, y_mm).seen(height, x, y) for height, lie in zip(heights, places, strict=True)]
+        seen = [
+            _turned(lie, turn + more, x_mm, y_mm).seen(height, x, y)
+            for height, lie in zip(heights, places, strict=True)
+        ]
         maps.append(np.maximum.reduce(seen))
     return Tapped(np.stack(maps), BARE, angle)
 

@@ -154,25 +154,34 @@ class CompactNet(PatternNet):
         deviation = (uncertainty + _LEAST_DEVIATION) * newest * self.deviation_scale
         return (pattern if self.training else torch.relu(pattern)), deviation, traction
 
-    def with_taps(self, taps: int) -> "CompactNet":
-        """The same function of the newest taps, further ones ignored until it is trained; its own weights.
+    def take_over(self, start: "CompactNet") -> None:
+        """Become the same function of the newest taps as another network, further taps ignored until trained.
 
-        A network of several taps has fewer symmetries than one of one tap: it can be made of that one, and one of one
-        tap can be made of it but for its mirrored half.
+        A network of several taps has fewer symmetries than one of one tap, and keeps all that one of one tap computes;
+        the other way round what is not symmetric is lost. At another scale the layers that make pixels start afresh.
 
         Raises:
-            ValueError: no taps asked for.
+            ValueError: another width, or another number of inputs for the pad.
         """
-        channels, blocks = self._width
-        other = CompactNet(taps, self.scale, channels, blocks, self.known, self.group)
-        state = {name: value.clone() for name, value in self.state_dict().items() if not name.startswith("enter.")}
-        other.load_state_dict(state, strict=False)
-        kept, known = 3 * min(taps, self.taps), self.known + 1
-        weight = torch.zeros_like(other.enter.weight)
-        weight[:, :kept] = self.enter.weight[:, :kept]
-        weight[:, -known:] = self.enter.weight[:, -known:]
-        other.enter.assign(weight, self.enter.bias)
-        return other
+        if (start._width, start.known) != (self._width, self.known):
+            raise ValueError(
+                f"its width and inputs of the pad are {start._width} and {start.known}, expected {self._width} and "
+                f"{self.known}"
+            )
+        theirs = dict(start.named_modules())
+        for name, ours in self.named_modules():
+            source = theirs.get(name)
+            if not isinstance(ours, SymmetricConv2d) or not isinstance(source, SymmetricConv2d):
+                continue
+            weight = source.weight.detach()
+            if name == "enter":
+                kept, about = 3 * min(self.taps, start.taps), self.known + 1
+                widened = torch.zeros_like(ours.weight)
+                widened[:, :kept], widened[:, -about:] = weight[:, :kept], weight[:, -about:]
+                weight = widened
+            if weight.shape == ours.weight.shape:
+                ours.assign(weight, source.bias.detach())
+        self.deviation_scale.copy_(start.deviation_scale)
 
 
 class HeteroscedasticError:

@@ -23,9 +23,6 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
 }
 """Name to class and what the name says."""
 
-_PIXELS: Final = ("leave.2.", "doubt.2.")
-"""The layers of a compact network whose size is that of a taxel's pixels."""
-
 
 def build(name: str, scale: int, **options: Any) -> PatternNet:
     """A new network.
@@ -61,17 +58,19 @@ def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNe
     """
     net = build(name, scale, **options)
     if isinstance(net, CompactNet) and isinstance(start, CompactNet):
-        resized = start.with_fewer_taps if net.taps <= start.taps else start.with_more_taps
-        start = resized(net.taps)
-    elif isinstance(net, SeedNet) and isinstance(start, SeedNet) and start.taps == 1:
+        try:
+            net.take_over(start)
+        except ValueError as error:
+            raise ValueError(f"{name} at scale {scale} cannot start from {_kind(start)}: {error}") from error
+        return net
+    if isinstance(net, SeedNet) and isinstance(start, SeedNet) and start.taps == 1:
         start = SeedNet.from_stsr(start, net.taps)
-    learnt = start.state_dict()
-    if isinstance(net, CompactNet) and start.scale != scale:
-        fresh = net.state_dict()
-        learnt |= {key: value for key, value in fresh.items() if key.startswith(_PIXELS)}
     try:
-        net.load_state_dict(learnt)
+        net.load_state_dict(start.state_dict())
     except RuntimeError as error:
-        kind = f"{type(start).__name__} of {start.taps} taps at scale {start.scale}"
-        raise ValueError(f"{name} at scale {scale} cannot start from a {kind}: {error}") from error
+        raise ValueError(f"{name} at scale {scale} cannot start from {_kind(start)}: {error}") from error
     return net
+
+
+def _kind(net: PatternNet) -> str:
+    return f"a {type(net).__name__} of {net.taps} taps at scale {net.scale}"

@@ -12,8 +12,8 @@ from typing import Any, Final
 import torch
 from torch import Tensor, distributed, nn
 
-from train.networks.srcnn import TactileSRCNN
 from train.data.batch import Batch
+from train.networks.srcnn import TactileSRCNN
 from train.objectives import relative_error, truth_size
 
 _CHANNELS: Final = (32, 64, 128)

@@ -208,7 +208,10 @@ def write_out(net: nn.Module) -> nn.Module:
 
 def symmetries(group: Group) -> list[Callable[[NDArray[np.generic]], NDArray[np.generic]]]:
     """Each symmetry as what it does to the last two axes of an array."""
-    return [lambda maps, turns=turns, mirrored=mirrored: _move(maps, turns, mirrored) for turns, mirrored in _ELEMENTS[group]]
+    return [
+        lambda maps, turns=turns, mirrored=mirrored: _move(maps, turns, mirrored)
+        for turns, mirrored in _ELEMENTS[group]
+    ]
 
 
 def _move(maps: NDArray[np.generic], turns: int, mirrored: bool) -> NDArray[np.generic]:

@@ -162,7 +162,9 @@ class GrippedPad:
         pressure = np.zeros(cells_mm.shape, dtype=np.float32)
         for cover in dict.fromkeys(covers):
             which = np.array([i for i, one in enumerate(covers) if one == cover])
-            pressure[which], depth[which] = self._pressed(cover, cells_mm[which], share[which], depth[which], most_force_n)
+            pressure[which], depth[which] = self._pressed(
+                cover, cells_mm[which], share[which], depth[which], most_force_n
+            )
         return self._result(covers, depth_mm, cells_mm, pressure, depth, slide_mm, twist_rad, friction)
 
     def _cells(self, depth_mm: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

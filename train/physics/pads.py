@@ -117,7 +117,14 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 }
 """Bounds of what is drawn uniformly; each with its reason in docs/train.md."""
 
-INPUTS: Final = ("thickness_mm", "shear_modulus_mpa", "poisson", "in_plane_share", "magnet_height_mm", "counts_per_newton")
+INPUTS: Final = (
+    "thickness_mm",
+    "shear_modulus_mpa",
+    "poisson",
+    "in_plane_share",
+    "magnet_height_mm",
+    "counts_per_newton",
+)
 """The constants that a network takes, where they are known."""
 
 KNOWN: Final = 2 * len(INPUTS) + 1

@@ -1,0 +1,102 @@
+"""Presses as sensors with gains of their own have read them: a set to evaluate on, never to learn from."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.frozen import FrozenSet
+from train.data.press_batches import read_presses
+from train.data.presses import PressSet, load_presses
+from train.nuisances import NAMES, Nuisances
+from train.physics.pads import known_numbers
+from train.simulation import MAX_INDENTATION_MM
+
+WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
+"""The frozen set of every family on pads of their own; nothing is chosen by it."""
+_BEFORE_GAIN: Final = ("pose_error_mm", "pose_error_deg", "hysteresis", "cross_talk", "gain_spread")
+
+
+@dataclass(frozen=True, slots=True)
+class FrozenPresses:
+    """n sequences of presses and what was read of them.
+
+    Attributes:
+        presses: their counts are what was read, whole and zeroed.
+        gains: (n, 3, rows, cols) of each sequence's sensor.
+    """
+
+    presses: PressSet
+    gains: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.presses)
+
+    def windows(self, taps: int, *, gains_known: bool = False) -> NDArray[np.float32]:
+        """Windows (n, taps, 3, rows, cols) in zeroed counts, over the sensors' gains where these are known."""
+        windows = self.presses.with_taps(taps).counts
+        return windows / self.gains[:, None] if gains_known else windows
+
+    def pads(self, *, known: bool) -> NDArray[np.float32]:
+        """The pads as a network takes them, (n, train.physics.pads.KNOWN): all of each with its gains, or nothing."""
+        flags = np.full(self.presses.constants.shape, known)
+        return known_numbers(self.presses.constants, flags, flags[:, 0])
+
+    def patterns(self) -> NDArray[np.float32]:
+        """Truth, (n, H, W) in [mm]."""
+        return self.presses.patterns.astype(np.float32)
+
+    def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "FrozenPresses":
+        """The sequences of the given indices."""
+        return FrozenPresses(self.presses.pick(index), self.gains[index])
+
+    def as_frozen_set(self) -> FrozenSet:
+        """The same as the runtime's evaluation takes it: one frame a tap, nothing known of the pads."""
+        one = self.presses
+        depth_mm = one.indentation_mm
+        return FrozenSet(
+            newest=one.counts[:, 0].astype(np.int16),
+            earlier=one.counts[:, 1:].astype(np.int16),
+            tap=np.arange(len(one), dtype=np.int16),
+            indentation_mm=depth_mm,
+            force_n=one.force_n[:, 2],
+            unit_patterns=(self.patterns() / depth_mm[:, None, None]).astype(np.float16),
+            touched=one.touching,
+            surface=one.family,
+            angle_deg=one.angle_deg[:, 0],
+            full_scale_mm=MAX_INDENTATION_MM,
+        )
+
+
+def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances | None = None) -> FrozenPresses:
+    """Read every sequence once, by a sensor of its own.
+
+    Gains act after hysteresis and cross-talk and before drift and noise, as in `train.nuisances`; here they are drawn
+    apart, so that they are known.
+    """
+    nuisances = Nuisances() if nuisances is None else nuisances
+    before = nuisances.without(*(name for name in NAMES if name not in _BEFORE_GAIN), "gain_spread")
+    after = nuisances.without(*_BEFORE_GAIN)
+    gains = _gains(seed, presses, nuisances.gain_spread)
+    felt = replace(presses, counts=read_presses(presses, before, seed))
+    felt = replace(felt, counts=felt.counts * gains[:, None])
+    config = {"presses": dict(presses.config), "read with seed": seed, "gain spread": nuisances.gain_spread}
+    return FrozenPresses(replace(felt, counts=read_presses(felt, after, seed), config=config), gains)
+
+
+def load_frozen_presses(path: Path = WIDE_TEST) -> FrozenPresses:
+    """Read a set that `FrozenPresses.presses.save` has written.
+
+    Raises:
+        DatasetError: absent, not ours, or damaged.
+    """
+    presses = load_presses(path)
+    return FrozenPresses(presses, _gains(presses.config["read with seed"], presses, presses.config["gain spread"]))
+
+
+def _gains(seed: int, presses: PressSet, spread: float) -> NDArray[np.float32]:
+    shape = (len(presses), *presses.counts.shape[2:])
+    draws = np.random.default_rng([seed, 5]).standard_normal(shape, dtype=np.float32)
+    return 1 + np.float32(spread) * draws.clip(-2, 2)
