@@ -10,7 +10,7 @@ from typing import Final
 
 from edge.arguments import Parser, add_source, not_negative, port, positive, whole
 from edge.bundle import DEFAULT_MODEL, DEMO_MODEL
-from edge.sinks.forms import check_sink
+from edge.sinks.forms import check_apart, check_sink
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, check_thresholds
 from firmware_bridge.baseline import FEWEST_SCANS
 
@@ -166,11 +166,12 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
     """Options of a run, and of them all that can be wrong before anything is opened.
 
     Raises:
-        UsageError: no such sink, or thresholds that cannot be.
+        UsageError: no such sink, one twice, or thresholds that cannot be.
     """
     options = parser.parse_args(arguments)
     for text in options.sink:
         check_sink(text)
+    check_apart(options.sink)
     check_thresholds(options.contact_on_counts, options.contact_off_counts)
     return options
 

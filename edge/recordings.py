@@ -12,6 +12,7 @@ from typing import Final
 from edge.commissioned import settled, with_recorded
 from edge.errors import SinkError, UsageError
 from edge.progress import Progress
+from edge.sinks.forms import check_apart
 from edge.source import Source
 from edge.statistics import Statistics
 from firmware_bridge.baseline import Baseline
@@ -36,7 +37,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
         options: of edge.options.record_parser; a sink is added.
 
     Raises:
-        UsageError: a file of another kind is asked for.
+        UsageError: a file of another kind is asked for, or a sink writes into it as well.
         SinkError: the file exists.
     """
     path = Path(options.file)
@@ -49,6 +50,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     if path.exists():  # before anything is begun
         raise SinkError(f"{path} exists: give another name, or delete it first")
     options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
+    check_apart(options.sink)
     statistics = Statistics()
     try:
         yield statistics

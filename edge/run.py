@@ -63,8 +63,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
     with stop_on_signals() as stop, user_commands() as commands:
         loops = options.source == [DEMO_LOOP]
         demo = loops or options.source == ["demo"]
-        default = DEMO_MODEL if demo else DEFAULT_MODEL
-        name = options.model or default
+        name = (DEMO_MODEL if demo else DEFAULT_MODEL) if options.model is None else options.model
         ladder = None
         if options.budget_us is not None:
             ladder = open_ladder(

@@ -160,6 +160,8 @@ class TestRefusals:
         [
             (["--contact-on-counts", "10"], ["on 10", "off 750"]),
             (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "npz:FILE"]),
+            (["--sink", "mcap:/dev/full"], ["'mcap:/dev/full'", "a file whose name ends in .mcap"]),
+            (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["'jsonl:-' is there 2 times", "leave one"]),
             (["--sink", "ros2:4fingers"], ["'4fingers'", "no digit first"]),
             (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
         ],
@@ -194,6 +196,7 @@ class TestRefusals:
     def test_a_model_that_cannot_be_used_is_4(self, files, tmp_path):
         replay = ["--source", f"replay:{files}/rest.npz", "--model"]
         assert_refused(run(*replay, "none"), 4, "no model 'none'", "bundled: ")
+        assert_refused(run(*replay, ""), 4, "no model ''", "bundled: ")
         (tmp_path / "text.onnx").write_text("text")
         assert_refused(run(*replay, tmp_path / "text.onnx"), 4, "text.onnx")
         other = write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
