@@ -7,7 +7,6 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Final
 
 from edge.api import (
@@ -81,6 +80,8 @@ def _demo(arguments: Sequence[str]) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     if arguments and not arguments[0].startswith("-"):
+        from difflib import get_close_matches
+
         near = get_close_matches(arguments[0], COMMANDS, n=1)
         meant = (
             f"did you mean {near[0]}?" if near else f"commands are {', '.join(COMMANDS)}; to run, give options alone"

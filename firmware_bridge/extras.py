@@ -2,7 +2,6 @@
 
 import re
 import sys
-from importlib.metadata import PackageNotFoundError, requires
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -15,6 +14,8 @@ def how_to_install(extra: str) -> str:
     """The command that brings an extra of pyproject.toml, for a line that says what is missing."""
     if (_FOLDER / "pyproject.toml").is_file():
         return f"pip install '{_FOLDER}[{extra}]'"
+    from importlib.metadata import PackageNotFoundError, requires  # here alone: it takes long to import
+
     try:
         wanted = _wanted(requires(_PACKAGE) or [], extra)
     except PackageNotFoundError:  # a copy of the sources that was never installed

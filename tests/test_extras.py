@@ -27,7 +27,7 @@ def test_from_a_wheel_the_packages_are(monkeypatch, tmp_path, extra, wanted):
         *("tactile-edge-sr[one,two]; extra == 'both'", "e; extra == 'both'"),
     ]
     monkeypatch.setattr(extras, "_FOLDER", tmp_path)
-    monkeypatch.setattr(extras, "requires", lambda name: required)
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: required)
     assert how_to_install(extra) == f"pip install {wanted}"
 
 
