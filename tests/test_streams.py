@@ -48,13 +48,6 @@ def test_without_a_stderr_there_are_records_on_stdout_and_nothing_else(files, re
     assert len([json.loads(line) for line in done.stdout.splitlines()]) == 40
 
 
-def test_what_is_opened_next_does_not_take_the_place_of_a_closed_stream(files, tmp_path):
-    options = [*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", f"jsonl:{tmp_path}/out.jsonl"]
-    done = in_shell("<&- >&- 2>&-", *options, unbuffered=False)
-    assert done.returncode == 0
-    assert len([json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]) == 40
-
-
 def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
     """Not in the interpreter's own start, which no program can guard: in the first module of others."""
     (tmp_path / "numpy.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
