@@ -1,9 +1,10 @@
 """`edge-sr`: taxel scans in, super-resolved patterns out."""
 
 import argparse
+import contextlib
 import math
-import os
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Final
@@ -35,8 +36,8 @@ from edge.options import (
     run_parser,
     understood,
 )
+from edge.streams import guarded_streams, open_closed_streams
 
-STDOUT: Final = 1
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
 EXIT_SINK: Final = 5
@@ -46,17 +47,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     command = COMMANDS.get(arguments[0]) if arguments else None
+    open_closed_streams()
     try:
-        code = _run(arguments) if command is None else command(arguments[1:])
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        return code
-    except BrokenPipeError:
-        # Whoever read stdout has had enough; point it elsewhere, or Python complains at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), STDOUT)
+        with guarded_streams():
+            return _run(arguments) if command is None else command(arguments[1:])
         return 0
     except (BridgeError, EdgeError) as error:
-        print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
+        with contextlib.suppress(OSError):  # the terminal may have gone
+            print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
         return _exit_code(error)
 
 
@@ -81,6 +79,14 @@ def _demo(arguments: Sequence[str]) -> int:
 
 
 def _run(arguments: Sequence[str]) -> int:
+    if arguments and not arguments[0].startswith("-"):
+        from difflib import get_close_matches
+
+        near = get_close_matches(arguments[0], COMMANDS, n=1)
+        meant = (
+            f"did you mean {near[0]}?" if near else f"commands are {', '.join(COMMANDS)}; to run, give options alone"
+        )
+        raise UsageError(f"no command {arguments[0]!r}: {meant}")
     _follow(understood(run_parser(), arguments))
     return 0
 
@@ -162,6 +168,7 @@ def _bench(arguments: Sequence[str]) -> int:
         raise UsageError("--soak is a part of --system: add it")
     from edge.bench.command import Settings, run
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # what it has started is ended with it
     settings = Settings(
         out=options.out,
         rate_hz=options.rate_hz,

@@ -15,8 +15,9 @@ class Event:
     Attributes:
         time_ns: monotonic time, in [ns].
         kind: one of KINDS: the link's ("lost", "silent", "back", "trouble", "well"), of one sensor's silence while
-            others go on ("silent", "back"), "sink", one was given up, or what is told to those who look alone:
-            "refused", what was asked for and is not done, and "note", all else.
+            others go on ("silent", "back"), "sink", one was given up or nobody reads it, "note", what is to be known of
+            a recording, or what is told to those who look alone: "refused", what was asked for and is not done, and
+            "note", all else.
         sensor: of which sensor, or None.
         text: in a user's words.
     """

@@ -10,8 +10,9 @@ from typing import Final
 
 from edge.arguments import Parser, add_source, not_negative, port, positive, whole
 from edge.bundle import DEFAULT_MODEL, DEMO_MODEL
-from edge.sinks.forms import check_sink
+from edge.sinks.forms import check_apart, check_sink
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, check_thresholds
+from edge.zeroing import FEWEST_RECORDED
 from firmware_bridge.baseline import FEWEST_SCANS
 
 VIEW_PORT: Final = 8077
@@ -79,6 +80,12 @@ Keep the pad still and free meanwhile.
 example:
   edge-sr baseline --out zero.json
   edge-sr --baseline zero.json
+of a recording that begins in contact:
+  edge-sr baseline --out zero.json \\
+          --source replay:f.csv \\
+          --skip 190 --scans 60
+  edge-sr replay f.csv \\
+          --baseline zero.json
 """
 
 
@@ -139,7 +146,7 @@ def replay_parser() -> argparse.ArgumentParser:
         description="Makes patterns of a recording anew.",
         epilog=REPLAY_HELP,
     )
-    parser.add_argument("file", metavar="FILE", type=Path, help=".mcap, .npz or .csv")
+    parser.add_argument("file", metavar="FILE", help=".mcap, .npz or .csv; or several, FILE,FILE, of a sensor each")
     parser.add_argument("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL})")
     zeroing = parser.add_mutually_exclusive_group()
     zeroing.add_argument("--baseline", metavar="FILE", type=Path, help="another baseline")
@@ -166,11 +173,12 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
     """Options of a run, and of them all that can be wrong before anything is opened.
 
     Raises:
-        UsageError: no such sink, or thresholds that cannot be.
+        UsageError: no such sink, one twice, or thresholds that cannot be.
     """
     options = parser.parse_args(arguments)
     for text in options.sink:
         check_sink(text)
+    check_apart(options.sink)
     check_thresholds(options.contact_on_counts, options.contact_off_counts)
     return options
 
@@ -253,8 +261,8 @@ def baseline_parser() -> argparse.ArgumentParser:
     )
     add_source(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="where the baseline is kept")
-    scans_help = f"scans to use (default and least {FEWEST_SCANS})"
-    parser.add_argument("--scans", metavar="N", type=whole(FEWEST_SCANS), default=FEWEST_SCANS, help=scans_help)
+    scans_help = f"scans to use (default and least {FEWEST_SCANS}; of a recording least {FEWEST_RECORDED})"
+    parser.add_argument("--scans", metavar="N", type=whole(FEWEST_RECORDED), default=FEWEST_SCANS, help=scans_help)
     parser.add_argument("--skip", metavar="N", type=whole(0), default=0, help="scans to leave out first (default 0)")
     return parser
 

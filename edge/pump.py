@@ -70,3 +70,4 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
                     sink.write(result, known)
         finally:
             counters()  # what the last ones left out belongs to the run, too
+            statistics.sink_trouble = "; ".join(sink.trouble for sink in sinks if sink.trouble is not None) or None

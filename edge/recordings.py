@@ -12,12 +12,13 @@ from typing import Final
 from edge.commissioned import settled, with_recorded
 from edge.errors import SinkError, UsageError
 from edge.progress import Progress
+from edge.sinks.forms import check_apart
 from edge.source import Source
 from edge.statistics import Statistics
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.links.source import place_recordings
+from firmware_bridge.links.source import place_recordings, recording_paths
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.recording import Recording, npz_baselines
 from firmware_bridge.scan import Scan
@@ -36,7 +37,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
         options: of edge.options.record_parser; a sink is added.
 
     Raises:
-        UsageError: a file of another kind is asked for.
+        UsageError: a file of another kind is asked for, or a sink writes into it as well.
         SinkError: the file exists.
     """
     path = Path(options.file)
@@ -49,6 +50,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     if path.exists():  # before anything is begun
         raise SinkError(f"{path} exists: give another name, or delete it first")
     options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
+    check_apart(options.sink)
     statistics = Statistics()
     try:
         yield statistics
@@ -72,16 +74,18 @@ def open_recording(
     bar: bool = False,
 ) -> Source:
     """The source that plays a recording, as edge.api.open_recording; with a bar of how far it is, if asked for."""
-    replay = ReplayLink([path], rate_hz, paced=paced)
-    (recording,) = replay.recordings
-    link = _FollowedLink(replay, sum(len(track.counts) for track in recording.tracks)) if bar else replay
+    paths = recording_paths(str(path))
+    replay = ReplayLink(paths, rate_hz, paced=paced)
+    tracks = [track for recording in replay.recordings for track in recording.tracks]
+    link = _FollowedLink(replay, sum(len(track.counts) for track in tracks)) if bar else replay
     file = settled(sensor, None)
     known = with_recorded(file, link)
-    baselines = {} if zero else _in_its_time(recording, paced=paced) or known.baselines
+    recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
+    baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
     mountings = known.mountings
     sensors = {*mountings, *baselines}
     if sensor is None:  # else it is told which ones the file does not know
-        sensors |= {track.sensor for track in recording.tracks}
+        sensors |= {track.sensor for track in tracks}
     entries = {
         name: SensorEntry(
             mountings.get(name, Mounting()),
@@ -92,7 +96,7 @@ def open_recording(
         for name in sorted(sensors)
     }
     known = replace(known, sensors=entries)
-    return Source(place_recordings(link, [path], file.mountings), sensor_file=known, rate_hz=rate_hz)
+    return Source(place_recordings(link, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)
 
 
 class _FollowedLink(ChangedLink):

@@ -6,6 +6,7 @@ What a run may do without is imported where it is needed.
 import argparse
 import contextlib
 import os
+import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,7 @@ from edge.api import (
     DEMO_LOOP,
     DEMO_MODEL,
     Contract,
+    DeviceError,
     Fan,
     Sink,
     SinkClosedError,
@@ -63,8 +65,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
     with stop_on_signals() as stop, user_commands() as commands:
         loops = options.source == [DEMO_LOOP]
         demo = loops or options.source == ["demo"]
-        default = DEMO_MODEL if demo else DEFAULT_MODEL
-        name = options.model or default
+        name = (DEMO_MODEL if demo else DEFAULT_MODEL) if options.model is None else options.model
         ladder = None
         if options.budget_us is not None:
             ladder = open_ladder(
@@ -87,7 +88,8 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             source,
             contextlib.ExitStack() as closing,
         ):
-            messages = MessageSink(said=None if ladder is None else ladder.choice.why)
+            hint = _silence_hint(options.source)
+            messages = MessageSink(said=None if ladder is None else ladder.choice.why, hint=hint)
             opener = partial(open_sink, contract=model.contract, source=source)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say)
@@ -140,6 +142,9 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 duration_s=options.duration_s,
                 commands=commands,
             )
+        # A user who ends it before the first scan was due is no fault of the sensor.
+        if not statistics.scans and (statistics.events or not stop.is_set()):
+            raise DeviceError(f"no scan came from {source.name}: {hint}")
         if score is not None and not (loops and score.complete):
             _print_score(score, scores)
 
@@ -166,6 +171,11 @@ def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]"
     score = DemoScore(demo_recording(), contract, on_complete)
     print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
     return score
+
+
+def _silence_hint(sources: Sequence[str]) -> str:
+    source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
+    return f"is the sensor powered and its cable in? edge-sr doctor{source} says what is wrong"
 
 
 def _go_on(stream: TextIO, view: "LiveView | None", score: "DemoScore") -> None:

@@ -1,6 +1,7 @@
 """One model in onnxruntime: checked against its contract, arrays bound once for every number of windows."""
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +20,10 @@ WARM_UP_RUNS: Final = 10
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
 """Of onnxruntime, which may quote a whole graph."""
+_PLACE: Final = re.compile(
+    r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
+)
+"""File, line and signature of a function."""
 LOAD_ERRORS: Final = (
     ort_errors.Fail,
     ort_errors.InvalidArgument,
@@ -222,7 +227,9 @@ def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
 
 
 def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:LONGEST_REASON]
+    """What onnxruntime says, without where in its source, which may be all that there is room for."""
+    said = _PLACE.sub("", " ".join(str(error).split()))
+    return said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]}..."
 
 
 def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int | str, ...]]) -> None:

@@ -22,8 +22,14 @@ class Silence:
         missed: scans that did not come, as far as gaps show.
     """
 
-    def __init__(self, expected: Iterable[str] = ()) -> None:
-        """Begin without a scan; `expected` are names of sensors that there should be."""
+    def __init__(self, expected: Iterable[str] = (), *, recorded: bool = False) -> None:
+        """Begin without a scan.
+
+        Args:
+            expected: names of sensors that there should be.
+            recorded: scans are of a recording, which has no cable to see to.
+        """
+        self._recorded = recorded
         self.missed = 0
         self._expected = set(expected)
         self._first_ns: int | None = None
@@ -71,20 +77,22 @@ class Silence:
         for sensor, scan in self._last.items():
             if newest_ns - self._heard_ns(sensor, scan.time_ns) > SILENT_NS and sensor not in self._silent:
                 self._silent.add(sensor)
-                events.append(_silent(sensor, newest_ns, newest_ns - scan.time_ns))
+                events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none for so long"))
         if self._expected and newest_ns - self._first_ns > SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
-            events += [_silent(sensor, newest_ns, newest_ns - self._first_ns) for sensor in missing]
+            why = "the recording has none of it, though there is a baseline or a force for it"
+            events += [self._silence(sensor, newest_ns, self._first_ns, why) for sensor in missing]
         return events
+
+    def _silence(self, sensor: str, now_ns: int, since_ns: int, why_recorded: str) -> Event:
+        why = why_recorded if self._recorded else "see to its cable and its controller, since others go on"
+        return Event(
+            now_ns, "silent", sensor, f"no scan from sensor {sensor} for {(now_ns - since_ns) / 1e9:.1f} s: {why}"
+        )
 
     def _heard_ns(self, sensor: str, time_ns: int) -> int:
         since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
         return max([time_ns, *since_ns])
-
-
-def _silent(sensor: str, now_ns: int, for_ns: int) -> Event:
-    why = "see to its cable and its controller, since others go on"
-    return Event(now_ns, "silent", sensor, f"no scan from sensor {sensor} for {for_ns / 1e9:.1f} s: {why}")
 
 
 def _on_bus_ns(scan: Scan) -> int:

@@ -11,6 +11,10 @@ from firmware_bridge.drift import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32
 """Of the run-time histogram: a quantile is at most 2.2 % too high."""
+SHORTEST_NS: Final = 50_000_000
+"""Of a run whose rate is told: the first scans have waited for the model, and come all at once."""
+STAGES: Final = ("zeroing", "incomplete", "idle", "dropped", "contact")
+"""How far a sensor's scans may come on their way to a pattern."""
 LONGEST_US: Final = 2.0**26
 """About a minute; longer run times are counted as this long."""
 
@@ -60,6 +64,7 @@ class Statistics:
         commands_refused: lines on stdin, and messages of viewers, that were no command.
         model_patterns: of the patterns, how many each model made.
         model_changes: how often the model was another than before.
+        sink_trouble: what is wrong with the sinks at last; None while all is well.
     """
 
     def __init__(self) -> None:
@@ -81,10 +86,12 @@ class Statistics:
         self.commands_refused = 0
         self.model_patterns: dict[str, int] = {}
         self.model_changes = 0
+        self.sink_trouble: str | None = None
         self._model: str | None = None
         self._last_event: str | None = None
         self._spans: dict[str, _Span] = {}
         self._zeroed: dict[str, Result] = {}
+        self._farthest: dict[str, Result] = {}
 
     def add(self, result: Result) -> None:
         """Count one result."""
@@ -109,6 +116,9 @@ class Statistics:
             self.latency_us.add(result.latency_us)
         if result.baseline is not None:
             self._zeroed[scan.sensor] = result
+        before = self._farthest.get(scan.sensor)
+        if before is None or STAGES.index(result.state) >= STAGES.index(before.state):
+            self._farthest[scan.sensor] = result
         span = self._spans.get(scan.sensor)
         if span is None:
             span = self._spans[scan.sensor] = _Span(scan.time_ns)
@@ -146,7 +156,12 @@ class Statistics:
         if self.model_changes:
             patterns = ", ".join(f"{name} {count}" for name, count in self.model_patterns.items())
             lines.append(f"model changes: {self.model_changes} (patterns: {patterns}); at last {self._last_event}")
-        rates = [f"{rate_hz:.1f} Hz (sensor {name})" for name, rate_hz in sorted(self.rate_hz().items())]
+        lines += self._without_pattern()
+        rates = [
+            f"{rate_hz:.1f} Hz (sensor {name})"
+            for name, rate_hz in sorted(self.rate_hz().items())
+            if self._spans[name].duration_ns >= SHORTEST_NS
+        ]
         if rates:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
@@ -157,12 +172,28 @@ class Statistics:
         ]
         if self.unwritten:
             lines.append(f"records left out for slow readers: {self.unwritten}")
+        if self.sink_trouble:
+            lines.append(f"sinks: {self.sink_trouble}")
         if self.events:
             counts = ", ".join(f"{kind} {count}" for kind, count in self.events.items())
             lines.append(f"events: {counts}")
         if self.commands_refused:
             lines.append(f"refused: {self.commands_refused} lines or messages were no command")
         return "\n".join(lines)
+
+    def _without_pattern(self) -> list[str]:
+        """Why sensors had no pattern; one that nothing touched is told of only where no other had one."""
+        lines: list[str] = []
+        for name, result in sorted(self._farthest.items()):
+            why = {
+                "zeroing": f"not zeroed, {result.note or 'too few scans'}; or give --baseline, of the free pad",
+                "incomplete": result.note or "a taxel was not heard",
+                "idle": None if self.patterns else "nothing touched it",
+                "dropped": "newer scans overtook all that were in contact",
+            }.get(result.state)
+            if why is not None:
+                lines.append(f"sensor {name} has no pattern: {why}")
+        return lines
 
 
 def _drift_text(drift: Drift | None) -> str:

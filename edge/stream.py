@@ -75,7 +75,7 @@ class Stream:
         self._stop = threading.Event() if stop is None else stop
         self._duration_s = duration_s
         self._commands = commands
-        self._silence = Silence(runtime.expected)
+        self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
         self._deadlines: dict[str, Deadline] = {}
         self._clock_s = clock_s
         self._clock_ns = clock_ns

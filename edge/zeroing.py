@@ -13,6 +13,8 @@ from firmware_bridge.errors import BaselineRefusedError, DeviceError
 
 READ_TIMEOUT_S: Final = 0.1
 SILENCE_S: Final = 10.0
+FEWEST_RECORDED: Final = 30
+"""Of a recording, for which nobody can wait: where a pad is free for half a second alone, this is what there is."""
 
 
 def take_baselines(
@@ -27,7 +29,7 @@ def take_baselines(
 
     Args:
         source: open; what it gives meanwhile goes nowhere else.
-        scans: complete ones to take the median of, 100 or more.
+        scans: complete ones to take the median of, 100 or more; of a recording 30.
         skip: scans of each sensor to leave out first.
         stop: gives up early.
         clock_s: monotonic, in [s].
@@ -38,7 +40,7 @@ def take_baselines(
         LinkLostError: the link is gone.
         UsageError: a number of scans that cannot be.
     """
-    check_whole("scans", scans, FEWEST_SCANS)
+    check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
     check_whole("skip", skip, 0)
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}
@@ -54,7 +56,8 @@ def take_baselines(
             if any(isinstance(heard, Arrival) for heard in taken):
                 heard_s = clock_s()
             elif clock_s() - heard_s > SILENCE_S:
-                raise DeviceError(f"no scan from {source.name} for {SILENCE_S:.0f} s: is the sensor powered?")
+                silence = f"no scan from {source.name} for {SILENCE_S:.0f} s"
+                raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor says what is wrong")
             for heard in taken:
                 if not isinstance(heard, Arrival):
                     if heard.kind in ("lost", "silent"):

@@ -1,3 +1,6 @@
 """Checkpoints to single-file ONNX models with a contract: the only place that knows torch and ONNX."""
 
 import edge  # noqa: F401  before onnxruntime, whose telemetry it switches off
+from firmware_bridge.extras import need
+
+need("export", "torch", "onnx", "onnxscript")

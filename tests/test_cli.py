@@ -19,7 +19,7 @@ import pytest
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 
 from edge import bundle, cli
-from firmware_bridge.baseline import load_baselines, save_baselines
+from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.links import source
 from firmware_bridge.links.ports import Port
 from firmware_bridge.recording import load_recording
@@ -133,10 +133,13 @@ class TestRefusals:
             (["--budget-us", "0"], ["--budget-us: '0' is not a positive number"]),
             (["--recalibrate"], ["--recalibrate measures for --budget-us, which is not there"]),
             (["--mode", "x"], ["unrecognized arguments: --mode"]),
-            (["model"], ["unrecognized arguments: model"]),
+            (["model"], ["no command 'model': did you mean models?"]),
+            (["doctro"], ["no command 'doctro': did you mean doctor?"]),
+            (["x.mcap"], ["no command 'x.mcap': commands are demo, record, replay"]),
             (["models", "x"], ["unrecognized arguments: x", "edge-sr models --help"]),
             (["baseline"], ["--out"]),
-            (["baseline", "--out", "x", "--scans", "99"], ["'99' is not a whole number from 100"]),
+            (["baseline", "--out", "x", "--scans", "29"], ["'29' is not a whole number from 30"]),
+            (["baseline", "--out", "x", "--source", "demo", "--scans", "99"], ["scans is 99", "from 100"]),
             (["baseline", "--out", "x", "--skip", "-1"], ["--skip"]),
             (["replay", "--view", "a.mcap"], ["'a.mcap' is no port", "write FILE or command before it"]),
             (["--view", "demo"], ["'demo' is no port"]),
@@ -160,6 +163,8 @@ class TestRefusals:
         [
             (["--contact-on-counts", "10"], ["on 10", "off 750"]),
             (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "npz:FILE"]),
+            (["--sink", "mcap:/dev/full"], ["'mcap:/dev/full'", "a file whose name ends in .mcap"]),
+            (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["'jsonl:-' is there 2 times", "leave one"]),
             (["--sink", "ros2:4fingers"], ["'4fingers'", "no digit first"]),
             (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
         ],
@@ -194,6 +199,7 @@ class TestRefusals:
     def test_a_model_that_cannot_be_used_is_4(self, files, tmp_path):
         replay = ["--source", f"replay:{files}/rest.npz", "--model"]
         assert_refused(run(*replay, "none"), 4, "no model 'none'", "bundled: ")
+        assert_refused(run(*replay, ""), 4, "no model ''", "bundled: ")
         (tmp_path / "text.onnx").write_text("text")
         assert_refused(run(*replay, tmp_path / "text.onnx"), 4, "text.onnx")
         other = write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
@@ -290,7 +296,7 @@ class TestReplay:
         sources = ["--source", f"left=replay:{files / 'taps.npz'}", "--source", f"replay:{files / 'rest.npz'}"]
         done = run("--model", files / "tiny.onnx", *sources, "--rate-hz", 500, "--sink", "jsonl:-")
         assert done.returncode == 0, done.stderr
-        assert {record["sensor"] for record in records(done.stdout)} == {"left/4", "2/4"}
+        assert {record["sensor"] for record in records(done.stdout)} == {"left/4", "source2/4"}
         assert len(records(done.stdout)) == 160
 
     def test_duration_ends_it(self, files, tmp_path):
@@ -315,6 +321,25 @@ class TestReplay:
         after = used[used.index(4) :]
         assert 1 in after and after.index(1) < 30
         assert process.stderr is not None and "refused: 1 lines or messages were no command" in process.stderr.read()
+
+    def test_two_files_are_played_together_as_of_one_source(self, files, tmp_path):
+        data = dict(np.load(files / "taps.npz"))
+        np.savez(tmp_path / "other.npz", **(data | {"sensor": np.array(["6"] * 40)}))
+        paths = f"{files}/taps.npz,{tmp_path}/other.npz"
+        done = run("replay", paths, *base_options(files), "--sink", "jsonl:-")
+        assert done.returncode == 0, done.stderr
+        assert sorted(record["sensor"] for record in records(done.stdout)) == ["4"] * 40 + ["6"] * 40
+        assert "sensor 6 has no pattern: not zeroed, " in done.stderr
+
+    def test_a_sensor_of_the_baseline_that_was_not_recorded_has_no_cable(self, files, tmp_path):
+        other = Baseline.of("6", BASELINE.counts, BASELINE.created_unix_s, 100, "file")
+        save_baselines(tmp_path / "two.json", [BASELINE, other])
+        options = ["--model", files / "tiny.onnx", "--baseline", tmp_path / "two.json"]
+        done = run("replay", write_recording(tmp_path / "long.npz", [0] * 80), *options)
+        assert (
+            "no scan from sensor 6 for 0.5 s: the recording has none of it, though there is a baseline" in done.stderr
+        )
+        assert "cable" not in done.stderr
 
 
 class TestEnds:
@@ -394,6 +419,17 @@ class TestEnds:
         assert [record["scan"] for record in scans] == list(range(len(scans)))
         assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
         assert scans[-1]["counters"]["missed"] > 0
+
+    def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
+        leader, follower = pty.openpty()
+        name = f"slcan:{os.ttyname(follower)}"
+        done = run(*base_options(files), "--source", name, "--duration-s", "6")
+        os.close(leader), os.close(follower)
+        assert done.returncode == 3 and done.stdout == ""
+        doctor = f"edge-sr doctor --source {name} says what is wrong"
+        lines = done.stderr.splitlines()
+        assert re.match(rf"edge-sr: no scan in [56] s: is the sensor powered .*{doctor}$", lines[1])
+        assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
 
     def test_models_into_a_closed_pipe_stay_quiet(self, files):
         script = f"import sys; from edge import bundle, cli; bundle.BUNDLE_DIR = bundle.Path({str(files)!r})\n"
@@ -497,6 +533,15 @@ class TestBaseline:
         done = run("baseline", "--source", f"replay:{moving}", "--rate-hz", "1000", "--out", tmp_path / "zero.json")
         assert_refused(done, 3, "sensor 4: taxel (1, 1) z", "keep the pad still and free")
         assert not (tmp_path / "zero.json").exists()
+
+    def test_of_a_recording_a_few_free_scans_are_enough(self, files, tmp_path):
+        begins_in_contact = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
+        done = run(
+            "baseline", "--source", f"replay:{begins_in_contact}", "--rate-hz", "1000", "--out", tmp_path / "zero.json",
+            "--skip", "50", "--scans", "40",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert load_baselines(tmp_path / "zero.json")["4"].scans == 40
 
     def test_a_recording_too_short_is_3(self, files, tmp_path):
         source = f"replay:{files}/taps.npz"

@@ -110,6 +110,14 @@ class TestSensor:
         counts = np.rint(healthy_counts(6000) + drift).astype(np.int32)
         assert faults(as_scans(counts, times_ns(6000)), duration_s=60.0) == {"drift": verdict}
 
+    @pytest.mark.parametrize(
+        ("pressed_counts", "remedy"), [(150, "warm up for ten minutes"), (800, "something pressed")]
+    )
+    def test_a_press_that_begins_meanwhile_is_not_warming_up(self, pressed_counts, remedy):
+        counts = healthy_counts(6000)
+        counts[5000:, 2, 1, 1] += pressed_counts
+        assert remedy in remedy_of("drift", as_scans(counts, times_ns(6000)))
+
     def test_a_rest_at_the_seam_of_the_circle_is_like_any_other(self):
         counts = healthy_counts()
         counts[:, 2] = (counts[:, 2] - REST[2] + 65_535) % 65_536

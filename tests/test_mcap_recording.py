@@ -285,7 +285,7 @@ class TestReplay:
         (note,) = load_recording(path).notes
         assert f"zeroed again while it was recorded ({BASELINE.id}, then other)" in note
         link = ReplayLink([path])
-        assert [(one.kind, one.text) for one in link.notices()] == [("trouble", note)] and not link.notices()
+        assert [(one.kind, one.text) for one in link.notices()] == [("note", note)] and not link.notices()
 
     def test_a_recording_of_an_emulated_sensor_says_so(self, tmp_path):
         path, results = tmp_path / "out.mcap", make_results([make_scan()], source="emulated")

@@ -164,20 +164,35 @@ def test_slcan_sources(two_vscom, text, port, baudrate):
         "demo:",
         "demo",
         "Demo",
-        "/dev/ttyUSB0",
         "gs_usb:",
         "gs_usb0",
         "can",
         "can:",
         "can:socketcan",
         "can:socketcan:",
-        "can0",
     ],
 )
 def test_other_sources_are_refused(two_vscom, text):
     with pytest.raises(SourceError) as refused:
         open_source(text)
     assert repr(text) in str(refused.value) and all(form in str(refused.value) for form in FORMS)
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0"),
+        ("/dev/ttyACM0@115200", "slcan:/dev/ttyACM0@115200"),
+        ("can0", "can:socketcan:can0"),
+        ("slcan1", "can:socketcan:slcan1"),
+        ("ws://10.0.0.5:5000", "xela-server:ws://10.0.0.5:5000"),
+        ("press.mcap", "replay:press.mcap"),
+    ],
+)
+def test_a_source_without_its_form_is_refused_with_what_was_meant(two_vscom, text, meant):
+    with pytest.raises(SourceError) as refused:
+        open_source(text)
+    assert str(refused.value) == f"source is {text!r}: did you mean {meant}?"
 
 
 @pytest.mark.parametrize("baud", ["", "fast", "0", "-1", "²", "0115200", "99999999999", "9" * 5000])

@@ -238,6 +238,14 @@ def test_no_file_a_directory_and_no_permission_are_refused(tmp_path):
         ModelSession(tmp_path)
 
 
+def test_a_model_that_is_too_new_is_refused_with_the_reason_to_its_end(tmp_path):
+    model = onnx.load(write_model(tmp_path / "new.onnx"))
+    model.ir_version = 99
+    onnx.save(model, tmp_path / "new.onnx")
+    with pytest.raises(ModelError, match=r"FAIL : Unsupported model IR version: 99, max supported IR version: \d+$"):
+        ModelSession(tmp_path / "new.onnx")
+
+
 @pytest.mark.parametrize("content", [b"", b"not a model", bytes(range(256)) * 40])
 def test_what_is_no_onnx_is_refused(tmp_path, content):
     path = tmp_path / "text.onnx"

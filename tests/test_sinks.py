@@ -330,6 +330,23 @@ class TestFan:
             fan.close()
         assert good.closed
 
+    def test_trouble_that_lasts_is_told_once_and_again_when_it_comes_back(self):
+        class Troubled(ListSink):
+            trouble = None
+
+        now_ns, told = [0], []
+        fan, bad, good = Fan(told.append, lambda: now_ns[0]), Troubled(), ListSink()
+        fan.add(bad)
+        fan.add(good)
+        for time_ms, trouble in ((100, "nobody"), (600, "nobody"), (1200, "nobody"), (1800, None), (2400, "nobody")):
+            now_ns[0], bad.trouble = time_ms * 1_000_000, trouble
+            fan.write(make_results(1)[0], RUN)
+            assert fan.trouble == trouble
+        assert [(event.time_ns, event.kind, event.text) for event in told] == [
+            (time_ns, "sink", "nobody") for time_ns in (600_000_000, 2_400_000_000)
+        ]
+        assert good.events == told
+
     def test_one_that_fails_while_nothing_comes_is_given_up_too(self):
         fan, good, bad = Fan(lambda event: None), ListSink(), ListSink()
         bad.wait = lambda: self.Failing(SinkError("disk full")).fail(None)
@@ -405,6 +422,19 @@ def test_what_others_wrote_does_nothing_to_the_terminal():
     stream = io.StringIO()
     MessageSink(stream).tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
     assert stream.getvalue() == "edge-sr: \\x1b[2J\\x9b\\rpad\\n\\ud800 in µm\n"
+
+
+def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
+    stream, now_s = io.StringIO(), [0.0]
+    messages = MessageSink(stream, hint="is it powered?", clock_s=lambda: now_s[0])
+    for now_s[0] in np.arange(0, 60, 0.5):
+        messages.wait()
+    hints = [f"edge-sr: no scan in {silent_s} s: is it powered?" for silent_s in (5, 10, 20, 40)]
+    assert stream.getvalue().splitlines() == hints
+    messages.write(make_results(1)[0], RUN)
+    now_s[0] = 1000.0
+    messages.wait()
+    assert stream.getvalue().splitlines() == hints
 
 
 @pytest.mark.parametrize(
@@ -761,7 +791,7 @@ def test_the_npz_sink_gets_the_shapes_of_the_contract(tmp_path):
     sink.close()
 
 
-@pytest.mark.parametrize("text", ["", "jsonl", "jsonl:", "npz:", "npz:a", "csv:a", "status:x", "out.jsonl", "JSONL:a"])
+@pytest.mark.parametrize("text", ["", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "out.jsonl", "JSONL:a"])
 def test_other_forms_are_refused_listing_those_there_are(text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError) as refused:
@@ -770,3 +800,10 @@ def test_other_forms_are_refused_listing_those_there_are(text, tmp_path, monkeyp
     for form in FORMS:
         assert form in str(refused.value)
     assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["npz:a", "npz:a.mcap", "mcap:/dev/full", "mcap:a.npz"])
+def test_a_file_with_another_ending_is_refused_for_that(text):
+    ending = f".{text.partition(':')[0]}"
+    with pytest.raises(UsageError, match=rf"^sink '{text}' names '\S+', expected a file whose name ends in \{ending}$"):
+        open_sink(text, make_contract())

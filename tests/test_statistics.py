@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from edge_samples import BASELINE, make_scan
@@ -72,11 +74,12 @@ def test_rate_is_held_per_sensor_over_the_whole_run():
 def test_summary_tells_all_of_it():
     statistics = Statistics()
     for number in range(3):
-        statistics.add(result(make_scan(number, absent=(0,)), "contact", 200.0))
-    zeroed = Result(make_scan(3), "device", "m", "idle", baseline=BASELINE, baseline_age_s=90.0)
+        statistics.add(result(make_scan(number, absent=(0,), time_ns=number * 20_000_000), "contact", 200.0))
+    zeroed = Result(make_scan(3, time_ns=60_000_000), "device", "m", "idle", baseline=BASELINE, baseline_age_s=90.0)
     statistics.add(zeroed)
     statistics.overruns = 7
     statistics.commands_refused = 2
+    statistics.sink_trouble = "nobody subscribes to zenoh:a"
     for kind in ("lost", "back", "lost"):
         statistics.tell(Event(0, kind, None, ""))
     text = statistics.summary(source="EMULATED demo", wanted_rate_hz=100)
@@ -84,11 +87,49 @@ def test_summary_tells_all_of_it():
         "EMULATED demo: 4 scans, 3 patterns (0 reused), 0 dropped, 7 overrun, 0 missed",
         "torn: 3 on the wire, 0 renewed in part; 0 repeated",
         "run time: p50 200 us, p99 200 us, max 200 us",
-        "rate held: 100.0 Hz (sensor 4), 100 Hz asked for",
+        "rate held: 50.0 Hz (sensor 4), 100 Hz asked for",
         f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
+        "sinks: nobody subscribes to zenoh:a",
         "events: lost 2, back 1",
         "refused: 2 lines or messages were no command",
     ]
+
+
+def noted(number, state, note=None, sensor="4"):
+    return replace(result(make_scan(number, sensor=sensor), state), note=note)
+
+
+@pytest.mark.parametrize(
+    ("results", "why"),
+    [
+        ([noted(0, "zeroing")], "not zeroed, too few scans; or give --baseline, of the free pad"),
+        ([noted(0, "zeroing"), noted(1, "zeroing", "it moved")], "not zeroed, it moved; or give --baseline, of the"),
+        ([noted(0, "incomplete", "taxel 3 is dead"), noted(1, "zeroing")], "taxel 3 is dead"),
+        ([noted(0, "zeroing", "it moved"), noted(1, "idle")], "nothing touched it"),
+        ([noted(0, "idle"), noted(1, "dropped"), noted(2, "idle")], "newer scans overtook all"),
+    ],
+)
+def test_summary_says_why_there_is_no_pattern(results, why):
+    statistics = Statistics()
+    for one in results:
+        statistics.add(one)
+    (line,) = [line for line in statistics.summary(source="x").splitlines() if "no pattern" in line]
+    assert line.startswith(f"sensor 4 has no pattern: {why}")
+
+
+def test_summary_is_silent_of_a_sensor_that_nothing_touched_while_another_was():
+    statistics = Statistics()
+    for one in (noted(0, "contact"), noted(0, "idle", sensor="6"), noted(0, "zeroing", sensor="7")):
+        statistics.add(one)
+    lines = [line for line in statistics.summary(source="x").splitlines() if "no pattern" in line]
+    assert len(lines) == 1 and lines[0].startswith("sensor 7 has no pattern: not zeroed")
+
+
+def test_summary_tells_no_rate_of_scans_that_came_in_one_burst():
+    statistics = Statistics()
+    for number in range(6):
+        statistics.add(result(make_scan(number, time_ns=number * 265_000)))
+    assert "rate" not in statistics.summary(source="x")
 
 
 def test_summary_of_nothing():

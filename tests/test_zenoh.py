@@ -251,6 +251,21 @@ class TestWhoComesAndGoes:
         scans = [json.loads(payload)["scan"] for key, *_, payload in messages if key.endswith("/scan")]
         assert scans[-1] == 2 and 0 not in scans
 
+    def test_that_nobody_subscribes_is_told_until_somebody_does(self, endpoint):
+        with listening(endpoint) as place:
+            sink, (result,) = ZenohSink(f"grip?connect={endpoint}"), make_results(1)
+            assert sink.trouble is None
+            sink.write(result, {})
+            assert (
+                sink.trouble == f"nobody subscribes to zenoh:grip?connect={endpoint}: see to its reader, or the router"
+            )
+            for key in ("grip/*/scan", "grip/4/pattern", "grip/event"):
+                reader = place.declare_subscriber(key)
+                wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
+                reader.undeclare()
+                wait_for(lambda: sink.write(result, {}) or sink.trouble is not None)
+            sink.close()
+
     def test_a_reader_that_goes_ends_nothing_and_the_next_is_found(self, endpoint, consume):
         results = make_results(2)
         first, sink = consume(endpoint), ZenohSink(f"grip?connect={endpoint}")
@@ -360,7 +375,7 @@ class TestOpening:
 
     def test_without_the_package_it_says_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "zenoh", None)
-        with pytest.raises(SinkError, match=r"pip install '\.\[zenoh\]'"):
+        with pytest.raises(SinkError, match=rf"needs eclipse-zenoh: pip install '{ROOT}\[zenoh\]'"):
             open_sink("zenoh:a", CONTRACT)
 
 

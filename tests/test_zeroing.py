@@ -47,7 +47,7 @@ def test_silence_is_told_and_measured_from_the_last_scan():
     class Script:
         """Gives 30 scans, then nothing; every take takes a second."""
 
-        name, taken = "fake", 0
+        name, kind, taken = "fake", "device", 0
 
         def take(self, timeout_s):
             self.taken += 1

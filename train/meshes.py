@@ -118,12 +118,12 @@ def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> Non
     if extent_mm.max() > largest_mm:
         raise MeshError(
             f"{path}: {sides} mm with unit_mm={unit_mm:g}, at most {largest_mm:g} mm; "
-            "if its unit is another give unit_mm (25.4 for inches, 0.001 for micrometres), else cut out the part to tap"
+            "a file is taken to be in mm: scale it if it is not (micrometres by 0.001), else cut out the part to tap"
         )
     if extent_mm.max() < smallest_mm:
         raise MeshError(
             f"{path}: {sides} mm with unit_mm={unit_mm:g}, at least {smallest_mm:g} mm; "
-            "if it is in metres give unit_mm=1000, in inches unit_mm=25.4"
+            "a file is taken to be in mm: if it is in metres scale it by 1000, if in inches by 25.4"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
     if spreads[0] <= _FLAT**2 * spreads[-1]:

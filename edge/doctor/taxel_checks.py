@@ -10,7 +10,7 @@ from edge.doctor.samples import Samples, around_counts
 from edge.scene import NOISE_COUNTS
 from edge.taps import OFF_COUNTS
 from edge.taxels import RANGE_ENDS
-from firmware_bridge.baseline import CREEP_LIMIT_COUNTS
+from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 from firmware_bridge.geometry import AXES
 
 NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))
@@ -107,6 +107,8 @@ def check_drift(samples: Samples) -> Finding:
     )
     norm = f"under {CREEP_LIMIT_COUNTS:.0f} on a taxel"
     remedy = "let it warm up for ten minutes, unloaded and still, then zero again"
+    if float(np.nanmax(sizes[2])) > LOAD_LIMIT_COUNTS:
+        remedy = "more than warming up does: something pressed it or let go of it meanwhile; free it and look again"
     if sizes[axis, taxel] > LONE_DRIFT_COUNTS or abs(z_sum) >= OFF_COUNTS:
         return Finding("drift", "wrong", measured, norm, remedy)
     if sizes[axis, taxel] > CREEP_LIMIT_COUNTS:

@@ -12,11 +12,16 @@ class Sink(Protocol):
 
     Attributes:
         unwritten: records left out so far, because whoever reads them is too slow.
+        trouble: what its user must know of it, in plain words; None while all is well.
     """
 
     @property
     def unwritten(self) -> int:  # noqa: D102 - above
         return 0
+
+    @property
+    def trouble(self) -> str | None:  # noqa: D102 - above
+        return None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Take one result, and what was received, dropped and lost up to it.

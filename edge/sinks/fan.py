@@ -3,11 +3,15 @@
 import sys
 import time
 from collections.abc import Callable, Mapping
+from typing import Final
 
 from edge.errors import SinkClosedError, SinkError
 from edge.event import Event
 from edge.result import Result
 from edge.sinks.base import Sink
+
+LOOK_NS: Final = 500_000_000
+"""Between two looks at what sinks report: who reads them may need a moment to be found."""
 
 
 class Fan(Sink):
@@ -21,7 +25,7 @@ class Fan(Sink):
         """Begin without a sink.
 
         Args:
-            tell: is told of a sink that is given up, before the others.
+            tell: is told of a sink that is given up, or reports trouble, before the others.
             clock_ns: monotonic, in [ns].
         """
         self.failures: list[SinkError] = []
@@ -30,6 +34,8 @@ class Fan(Sink):
         self._counters: Mapping[str, int] = {}
         self._tell = tell
         self._clock_ns = clock_ns
+        self._look_ns = clock_ns() + LOOK_NS
+        self._known_trouble: set[str] = set()
 
     def add(self, sink: Sink) -> None:
         """Take one more sink, which is open; the last to fail ends the run."""
@@ -39,6 +45,11 @@ class Fan(Sink):
     def unwritten(self) -> int:
         """Records left out, of all sinks."""
         return self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
+
+    @property
+    def trouble(self) -> str | None:
+        """What any of its sinks reports."""
+        return "; ".join(sorted(self._troubles())) or None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Hand on one result.
@@ -80,6 +91,14 @@ class Fan(Sink):
                 act(sink)
             except SinkError as error:
                 self._give_up(sink, error, counters)
+        if self._clock_ns() >= self._look_ns:
+            self._look_ns = self._clock_ns() + LOOK_NS
+            known, self._known_trouble = self._known_trouble, self._troubles()
+            for trouble in sorted(self._known_trouble - known):
+                self._tell_all(trouble, counters)
+
+    def _troubles(self) -> set[str]:
+        return {sink.trouble for sink in self._sinks if sink.trouble is not None}
 
     def _give_up(self, sink: Sink, error: SinkError, counters: Mapping[str, int]) -> None:
         self._sinks.remove(sink)
@@ -93,6 +112,9 @@ class Fan(Sink):
             self.failures.append(another)
         if not self._sinks:
             raise self.failures[0] if self.failures else error
-        event = Event(self._clock_ns(), "sink", None, f"{error}; the other sinks go on")
+        self._tell_all(f"{error}; the other sinks go on", counters)
+
+    def _tell_all(self, text: str, counters: Mapping[str, int]) -> None:
+        event = Event(self._clock_ns(), "sink", None, text)
         self._tell(event)
         self.tell(event, counters)

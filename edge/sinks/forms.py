@@ -1,6 +1,6 @@
 """Sinks as a user writes them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -27,8 +27,10 @@ def check_sink(text: str) -> tuple[str, str]:
     """
     form, _, target = text.partition(":")
     ending = f".{form}" if form in ("npz", "mcap") else ""
-    if text != "status" and (form not in _TARGETED or not target.endswith(ending) or not target):
+    if text != "status" and (form not in _TARGETED or not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")
+    if not target.endswith(ending):
+        raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in {ending}")
     if form == "ros2":
         base_topic(target)
     if form == "zenoh":
@@ -36,6 +38,17 @@ def check_sink(text: str) -> tuple[str, str]:
 
         understood(target)
     return form, target
+
+
+def check_apart(texts: Sequence[str]) -> None:
+    """Each sink once: two would write into one place what is the same, or both.
+
+    Raises:
+        UsageError: one is there twice.
+    """
+    for text in texts:
+        if texts.count(text) > 1:
+            raise UsageError(f"sink {text!r} is there {texts.count(text)} times: leave one")
 
 
 def open_sink(

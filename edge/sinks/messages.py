@@ -1,7 +1,8 @@
 """Events as lines on stderr, above the live line where there is one."""
 
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
 from edge.event import Event
@@ -9,24 +10,39 @@ from edge.result import Result
 from edge.sinks.base import Sink
 
 CLEAR_LINE: Final = "\r\x1b[K"
+FIRST_HINT_S: Final = 5.0
+"""After so long without a scan, then after twice, four times, ... as long."""
 
 
 class MessageSink(Sink):
     """Writes each event as a line."""
 
-    def __init__(self, stream: TextIO | None = None, *, said: str | None = None) -> None:
+    def __init__(
+        self,
+        stream: TextIO | None = None,
+        *,
+        said: str | None = None,
+        hint: str = "",
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Begin without an event.
 
         Args:
             stream: written to; stderr unless given.
             said: what was said before the first result, which tells it once more, such as why it is this model.
+            hint: what to do while no scan has come at all; it is said ever more seldom.
+            clock_s: monotonic, in [s].
         """
         self._stream = sys.stderr if stream is None else stream
         self._said = said
+        self._hint = hint
+        self._clock_s = clock_s
+        self._begun_s = clock_s()
+        self._patience_s = FIRST_HINT_S
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Say what happened before this scan, but for what was said already."""
-        event, said, self._said = result.event, self._said, None
+        event, said, self._said, self._hint = result.event, self._said, None, ""
         if event is not None and said is not None:
             event = f"{event}; ".removeprefix(f"{said}; ").removesuffix("; ")
         if event:
@@ -35,6 +51,13 @@ class MessageSink(Sink):
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Say what happened."""
         self.say(event)
+
+    def wait(self) -> None:
+        """Say that nothing has come, and what to do."""
+        silent_s = self._clock_s() - self._begun_s
+        if self._hint and silent_s >= self._patience_s:
+            self._patience_s *= 2
+            self._say(f"no scan in {silent_s:.0f} s: {self._hint}")
 
     def say(self, event: Event) -> None:
         """Say it without counters."""

@@ -62,6 +62,7 @@ class ZenohSink(Sink):
             SinkError: no zenoh, or it cannot be opened.
         """
         key, configuration = understood(target)
+        self._target = target
         try:
             import zenoh
         except ImportError as error:
@@ -74,10 +75,16 @@ class ZenohSink(Sink):
             self._session = zenoh.open(_config(configuration))
             self.zid = str(self._session.zid())
             self._events = self._publisher(f"{key}/event", _JSON)
+            self._read = True  # until a result shows that nobody subscribes
             self._alive = self._session.liveliness().declare_token(f"{key}/alive/{self.zid}")
         except zenoh.ZError as error:
             raise SinkError(f"zenoh cannot be opened: {_reason(error)}") from error
         self._publishers: dict[str, tuple[zenoh.Publisher, zenoh.Publisher]] = {}
+
+    @property
+    def trouble(self) -> str | None:
+        """That nobody subscribed when the last result was put."""
+        return None if self._read else f"nobody subscribes to zenoh:{self._target}: see to its reader, or the router"
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Put the scan, and its pattern where that is new.
@@ -87,6 +94,7 @@ class ZenohSink(Sink):
         """
         publishers = self._publishers.get(result.scan.sensor) or self._declare(result.scan.sensor)
         said = record(result, counters)
+        self._read = any(map(_matched, (*publishers, self._events)))
         self._put(publishers[0], orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
         if result.pattern is not None and result.reused_from is None:
             maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
@@ -170,6 +178,11 @@ def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
     for name, value in configuration.items():
         config.insert_json5(name, json.dumps(value))
     return config
+
+
+def _matched(publisher: "zenoh.Publisher") -> bool:
+    # An object, whatever zenoh's own stubs say of it, and always true.
+    return publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _reason(error: Exception) -> str:

@@ -8,7 +8,7 @@ from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan import Scan
 
 SourceKind = Literal["device", "replay", "emulated"]
-NoticeKind = Literal["lost", "silent", "back", "trouble", "well"]
+NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
 
 class Notice(NamedTuple):
@@ -18,7 +18,7 @@ class Notice(NamedTuple):
         time_ns: monotonic time, in [ns].
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
             whatever was known of its sensors' readings is old; "trouble", it works, but reports something; "well", it
-            no longer does.
+            no longer does; "note", what is to be known of a recording.
         source: name of the link.
         text: in a user's words.
         sensors: how the names of the sensors begin that it is about.

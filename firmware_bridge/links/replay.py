@@ -122,7 +122,7 @@ class ReplayLink(Link):
     def notices(self) -> list[Notice]:
         """What is to be known of the files, once."""
         notes, self._notes = self._notes, []
-        return [Notice(self._start_ns, "trouble", self.name, note) for note in notes]
+        return [Notice(self._start_ns, "note", self.name, note) for note in notes]
 
     def counters(self) -> dict[str, int]:
         """Scans, and how many of them were torn or repeated, as the recording has them."""

@@ -32,6 +32,8 @@ FORMS: Final = (
 DEMO_LOOP: Final = "demo:loop"
 _NAME = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
 _BAUD = re.compile(r"[1-9][0-9]{0,7}")
+_CAN_NETWORK = re.compile(r"v?(?:x|sl)?can[0-9]+")
+_RECORDINGS: Final = (".mcap", ".npz", ".csv")
 _FINITE: Final = ("demo", "replay:")
 """Sources that come to an end, and do not come back from it."""
 
@@ -51,7 +53,7 @@ def open_sources(
 
     Args:
         texts: each one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4". Of several sources, those without
-            a name are called by their place, from 1.
+            a name are called by their place, source1 and so on.
         rate_hz: as in `open_source`.
         demo_recording: as in `open_source`.
         model: as in `open_source`.
@@ -66,7 +68,7 @@ def open_sources(
     named: dict[str, Link] = {}
     for number, text in enumerate(texts or [None], 1):
         match = None if text is None else _NAME.fullmatch(text)
-        name, form = (match[1], match[2]) if match else (str(number) if len(texts) > 1 else "", text)
+        name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
         own = {sensor.removeprefix(f"{name}/"): one for sensor, one in mountings.items() if _is_of(sensor, name)}
         link = open_source(form, rate_hz, demo_recording, model, own)
         if give_up_s is not None and not (form or "").startswith(_FINITE):
@@ -119,14 +121,18 @@ def open_source(
     if scheme == "replay" and rest:
         from firmware_bridge.links.replay import ReplayLink
 
-        # A file may have a comma in its name.
-        paths = [rest] if Path(rest).exists() else rest.split(",")
+        paths = recording_paths(rest)
         return place_recordings(ReplayLink(paths, rate_hz), paths, mountings)
     if text in ("demo", DEMO_LOOP) and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
 
         return DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP)
     raise _refusal(text)
+
+
+def recording_paths(text: str) -> list[str]:
+    """Files that FILE[,FILE] names; one may have a comma in its name."""
+    return [text] if Path(text).exists() else text.split(",")
 
 
 def place_recordings(link: Link, paths: Sequence[str | Path], mountings: Mapping[str, Mounting]) -> Link:
@@ -177,4 +183,19 @@ def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: boo
 
 
 def _refusal(text: str) -> SourceError:
+    form = _meant(text)
+    if form is not None:
+        return SourceError(f"source is {text!r}: did you mean {form}?")
     return SourceError(f"source is {text!r}, expected one of: {', '.join(FORMS)}")
+
+
+def _meant(text: str) -> str | None:
+    """The form of what is named without one."""
+    if _CAN_NETWORK.fullmatch(text):
+        return f"can:socketcan:{text}"
+    path = Path(text.partition("@")[0])
+    if text.startswith("/dev/") or path.is_char_device():
+        return f"slcan:{text}"
+    if text.startswith(("ws://", "wss://")):
+        return f"xela-server:{text}"
+    return f"replay:{text}" if path.suffix.lower() in _RECORDINGS or path.is_file() else None

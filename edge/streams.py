@@ -1,0 +1,99 @@
+"""Standard streams as a program finds them: closed, full, or with a reader that has gone."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, Final, TextIO, cast
+
+from edge.errors import SinkError
+
+STDIN, STDOUT, STDERR = 0, 1, 2
+_MODES: Final = {STDIN: os.O_RDONLY, STDOUT: os.O_RDONLY, STDERR: os.O_WRONLY}
+"""Of what takes the place of a closed stream. Into stdout nothing can be written, as before: results are not lost
+unsaid. stderr takes what nobody reads."""
+
+
+def open_closed_streams() -> None:
+    """Take up the numbers of closed standard streams, or the next file to be opened has one: a port, or the records.
+
+    What Python prints to a closed stderr would go to stdout, between records.
+    """
+    for number, mode in _MODES.items():
+        with contextlib.suppress(OSError):
+            os.fstat(number)
+            continue
+        os.open(os.devnull, mode)  # the lowest free number, and those below are taken
+    sys.stdout = os.fdopen(STDOUT, "w", closefd=False) if sys.stdout is None else sys.stdout
+    sys.stderr = os.fdopen(STDERR, "w", closefd=False) if sys.stderr is None else sys.stderr
+
+
+@contextlib.contextmanager
+def guarded_streams() -> Iterator[None]:
+    """Stdout whose faults are those of a sink, and stderr that has none: prose that nobody can read ends no run.
+
+    A reader of stdout that has had enough ends what is done, without a word.
+
+    Raises:
+        SinkError: stdout takes no more.
+    """
+    streams = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = cast("TextIO", _Told(sys.stdout)), cast("TextIO", _Unheard(sys.stderr))
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        _stand_in(sys.stdout, STDOUT)
+    except SinkError:
+        _stand_in(sys.stdout, STDOUT)
+        raise
+    finally:
+        sys.stdout, sys.stderr = streams
+
+
+def _stand_in(stream: TextIO, number: int) -> None:
+    """Point a stream elsewhere, or Python tries again at exit what is left in it, and complains."""
+    with contextlib.suppress(OSError, ValueError):  # a test's stand-in has no number
+        if stream.fileno() == number:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+
+
+class _Told:
+    """A stream that says in one line why it takes no more."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with self._refused():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with self._refused():
+            self._stream.flush()
+
+    @contextlib.contextmanager
+    def _refused(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise SinkError(f"cannot write to stdout: {error.strerror}") from error
+
+
+class _Unheard(_Told):
+    """A stream that takes all there is, also where it cannot be written: full, or its window closed."""
+
+    @contextlib.contextmanager
+    def _refused(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError:
+            _stand_in(self._stream, STDERR)

@@ -1,0 +1,62 @@
+"""Standard streams that are closed or full, and Ctrl-C before anything listens for it: real ones, of real processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from edge_samples import ROOT
+from test_cli import TIMEOUT_S, base_options, files
+
+__all__ = ["files"]
+
+REPLAY = ["replay", "{files}/taps.npz"]
+
+
+def in_shell(redirection, *arguments, unbuffered):
+    """A run whose streams a shell has redirected; all that is left of them is read."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    environment |= {"PYTHONUNBUFFERED": "1"} if unbuffered else {}
+    return subprocess.run(
+        ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "edge.cli", *map(str, arguments)],
+        cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL, env=environment,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("unbuffered", [False, True])
+@pytest.mark.parametrize(("redirection", "why"), [(">/dev/full", "No space left"), (">&-", "Bad file descriptor")])
+@pytest.mark.parametrize("command", ["demo --duration-s 0.1", "models", "doctor --source demo --no-press --drift-s 1"])
+def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why, unbuffered):
+    done = in_shell(redirection, *command.split(" "), unbuffered=unbuffered)
+    assert done.returncode == 5 and done.stdout == ""
+    assert done.stderr.splitlines()[-1].startswith(f"edge-sr: cannot write to stdout: {why}"), done.stderr
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+def test_help_that_nobody_gets_is_5():
+    done = in_shell(">/dev/full", "--help", unbuffered=False)
+    assert (done.returncode, done.stderr) == (5, "edge-sr: cannot write to stdout: No space left on device\n")
+
+
+@pytest.mark.parametrize("redirection", ["2>&-", "2>/dev/full", "<&- 2>&-", "2</dev/null"])
+def test_without_a_stderr_there_are_records_on_stdout_and_nothing_else(files, redirection):
+    options = [*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
+    done = in_shell(redirection, *options, unbuffered=False)
+    assert done.returncode == 0 and done.stderr == ""
+    assert len([json.loads(line) for line in done.stdout.splitlines()]) == 40
+
+
+def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
+    """Not in the interpreter's own start, which no program can guard: in the first module of others."""
+    (tmp_path / "numpy.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    command = [sys.executable, "-m", "edge", "demo"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None and process.stdout.readline() == "importing\n"
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert (process.returncode, errors) == (-signal.SIGINT, "")
