@@ -160,12 +160,13 @@ def open_source(
     return Source(link, sensor_file=with_recorded(known, link), rate_hz=rate_hz)
 
 
-def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
+def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
     """A model ready to run, and what it is for, its contract; do it in the thread that is to run it.
 
     Args:
         model: a file, or the name of a bundled one.
         threads: that share the work of one run.
+        stop: gives up early.
 
     Raises:
         ModelError: no such model, or one that cannot be used; the bundled ones, or what is wrong, are named.
@@ -174,7 +175,7 @@ def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
     check_whole("threads", threads, 1)
     from edge.session import ModelSession
 
-    return ModelSession(find_model(model), threads)
+    return ModelSession(find_model(model), threads, stop)
 
 
 def open_runtime(

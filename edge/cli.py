@@ -26,6 +26,7 @@ from edge.api import (
     take_baselines,
 )
 from edge.arguments import EXIT_USAGE
+from edge.loading import unfinished
 from edge.options import (
     baseline_parser,
     devices_parser,
@@ -44,7 +45,14 @@ EXIT_SINK: Final = 5
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    code = _main(sys.argv[1:] if arguments is None else arguments)
+    if unfinished():
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _main(arguments: Sequence[str]) -> int:
     command = COMMANDS.get(arguments[0]) if arguments else None
     try:
         code = _run(arguments) if command is None else command(arguments[1:])
