@@ -218,7 +218,12 @@ COMMANDS: Final = {
 
 def _open_source(options: argparse.Namespace, give_up_s: float) -> Source:
     return open_source(
-        *options.source, sensor=options.sensor, id_map=options.id_map, rate_hz=options.rate_hz, give_up_s=give_up_s
+        *options.source,
+        sensor=options.sensor,
+        id_map=options.id_map,
+        rate_hz=options.rate_hz,
+        give_up_s=give_up_s,
+        force=options.force,
     )
 
 

@@ -38,14 +38,10 @@ def one_node(operator: str, domain: str = "") -> bytes:
 
 
 class TestOperators:
-    @pytest.mark.parametrize(
-        "operator", ["Loop", "If", "Scan", "LSTM", "RandomNormal", "SequenceMap", "Range", "relu", ""]
-    )
+    @pytest.mark.parametrize("operator", ["Loop", "If", "Scan", "LSTM", "RandomNormal", "SequenceMap", "Range", "relu"])
     def test_one_that_is_not_listed_is_refused_before_onnxruntime_sees_it(self, tmp_path, monkeypatch, operator):
         path = tmp_path / "m.onnx"
-        path.write_bytes(one_node("Relu").replace(b"\x22\x04Relu", bytes([0x22, len(operator)]) + operator.encode()))
-        if len(operator) != 4:  # lengths of the messages around it no longer fit
-            path.write_bytes(one_node(operator) if operator else one_node("Relu").replace(b"Relu", b"\xe5elu"))
+        path.write_bytes(one_node(operator))
         monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: pytest.fail("it was asked"))
         with pytest.raises(
             ModelError, match=r"m\.onnx: has operator '.*', expected only those that docs/formats.md lists"
