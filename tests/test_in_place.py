@@ -67,9 +67,9 @@ def test_what_cannot_be_written_or_read_back_leaves_what_was_there(tmp_path, wri
 def test_what_is_no_plain_file_is_not_replaced(tmp_path):
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "folder", Path("/dev/null"), tmp_path / "none" / "a.json"):
-        with pytest.raises(OSError, match=r"folder|plain file|No such file"):
+        with pytest.raises(OSError, match=r"directory|plain file|No such file"):
             check_writable(path)
-        with pytest.raises(OSError, match=r"folder|plain file|No such file"):
+        with pytest.raises(OSError, match=r"directory|plain file|No such file"):
             written(path, "1")
     assert Path("/dev/null").is_char_device() and listing(tmp_path / "folder") == []
 
