@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from edge.asked import check_positive, check_whole
 from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.commands import Command, Commands
-from edge.commissioned import link_to, references, settled, with_recorded
+from edge.commissioned import link_to, references, refuse_emulated, settled, with_recorded
 from edge.contract import Contract
 from edge.errors import (
     EdgeError,
@@ -135,6 +135,7 @@ def open_source(
     id_map: str | None = None,
     rate_hz: float | None = None,
     give_up_s: float = math.inf,
+    force: bool = False,
 ) -> Source:
     """A source of scans, opened and closed by a with statement; what is lost meanwhile is opened again.
 
@@ -146,6 +147,7 @@ def open_source(
         id_map: which CAN id is which taxel, one of ID_MAPS.
         rate_hz: plays a recording at this rate; of a device, what its patterns' deadlines are by, in [Hz].
         give_up_s: how long a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
+        force: use a sensor file of an emulated sensor on a device, which is refused else when the source is opened.
 
     Raises:
         SourceError: no such form, one name twice, or sources of several kinds.
@@ -161,15 +163,16 @@ def open_source(
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
     known = settled(sensor, id_map)
     link = link_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
-    return Source(link, sensor_file=with_recorded(known, link), rate_hz=rate_hz)
+    return Source(link, sensor_file=with_recorded(known, link), rate_hz=rate_hz, force=force)
 
 
-def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
+def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
     """A model ready to run, and what it is for, its contract; do it in the thread that is to run it.
 
     Args:
         model: a file, or the name of a bundled one.
         threads: that share the work of one run.
+        stop: gives up early.
 
     Raises:
         ModelError: no such model, or one that cannot be used; the bundled ones, or what is wrong, are named.
@@ -178,7 +181,7 @@ def load_model(model: str | Path, threads: int = 1) -> "ModelSession":
     check_whole("threads", threads, 1)
     from edge.session import ModelSession
 
-    return ModelSession(find_model(model), threads)
+    return ModelSession(find_model(model), threads, stop)
 
 
 def open_runtime(
@@ -378,6 +381,7 @@ def examine(
     stop = threading.Event() if stop is None else stop
     watch = Watch(texts, known, references=references(baselines, known), rate_hz=rate_hz, stop=stop)
     with watch.link:
+        refuse_emulated(known, watch.link.kind, force=False)
         watch.run(duration_s)
         watched = watch.watched()
     return judge(watched, time.time()).findings

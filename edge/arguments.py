@@ -41,6 +41,8 @@ def add_source(parser: argparse.ArgumentParser) -> None:
     )
     sensor_help = "what edge-sr doctor wrote: id map, order, axes, gains, force, baseline; other options go before it"
     parser.add_argument("--sensor", metavar="FILE", type=Path, help=sensor_help)
+    force_help = "use a sensor file of an emulated sensor on a device"
+    parser.add_argument("--force", action="store_true", help=force_help)
     parser.add_argument(
         "--rate-hz",
         metavar="R",

@@ -1,6 +1,5 @@
 """Calibrated run times, kept from one run to the next: for this machine, these versions and this model file only."""
 
-import contextlib
 import hashlib
 import importlib.metadata
 import json
@@ -17,6 +16,7 @@ import onnxruntime
 
 from edge.calibration import ROUND_TICKS, ROUNDS, RunTime
 from firmware_bridge.bounded import read_bounded
+from firmware_bridge.in_place import write_in_place
 
 FILE_NAME: Final = "calibration.json"
 MOST_FILE_BYTES: Final = 1 << 20
@@ -76,16 +76,15 @@ class CalibrationCache:
             self._entries[self._key(model)] = {"model": model.stem, **asdict(run_time), "unix_s": now_s}
         if self._path is None or not run_times:
             return
-        # Beside it and then renamed, so that another run never reads half of it.
-        draft = self._path.with_name(f"{self._path.name}.{os.getpid()}")
+        text = json.dumps(self._entries, indent=1)
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            draft.write_text(json.dumps(self._entries, indent=1))
-            draft.replace(self._path)
+            # In place, so that another run never reads half of it.
+            write_in_place(
+                self._path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), keep_before=False
+            )
         except OSError as error:
             self.notes.append(f"run times are not kept: {self._path}: {error.strerror}")
-            with contextlib.suppress(OSError):
-                draft.unlink()
 
     def _key(self, model: Path) -> str:
         facts = {**self._place, "model_sha256": hashlib.sha256(model.read_bytes()).hexdigest()}

@@ -27,6 +27,7 @@ from edge.api import (
     take_baselines,
 )
 from edge.arguments import EXIT_USAGE
+from edge.loading import unfinished
 from edge.options import (
     baseline_parser,
     devices_parser,
@@ -45,7 +46,14 @@ EXIT_SINK: Final = 5
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    code = _main(sys.argv[1:] if arguments is None else arguments)
+    if unfinished():
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _main(arguments: Sequence[str]) -> int:
     command = COMMANDS.get(arguments[0]) if arguments else None
     open_closed_streams()
     try:
@@ -217,7 +225,12 @@ COMMANDS: Final = {
 
 def _open_source(options: argparse.Namespace, give_up_s: float) -> Source:
     return open_source(
-        *options.source, sensor=options.sensor, id_map=options.id_map, rate_hz=options.rate_hz, give_up_s=give_up_s
+        *options.source,
+        sensor=options.sensor,
+        id_map=options.id_map,
+        rate_hz=options.rate_hz,
+        give_up_s=give_up_s,
+        force=options.force,
     )
 
 

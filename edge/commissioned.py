@@ -8,9 +8,10 @@ from pathlib import Path
 from edge.bundle import demo_recording
 from edge.errors import UsageError
 from firmware_bridge.baseline import Baseline, load_baselines
-from firmware_bridge.links.base import Link
+from firmware_bridge.errors import SensorFileError
+from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.source import DEMO_LOOP, open_sources
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.xela import ID_MAPS, USPA44_MAP, ModelMap
 
 
@@ -73,6 +74,28 @@ def with_recorded(known: SensorFile, link: Link) -> SensorFile:
     """What is known, and of sensors that it does not name how they sat when they were recorded."""
     recorded = {name: SensorEntry(mounting) for name, mounting in link.mountings.items()}
     return replace(known, sensors=recorded | dict(known.sensors))
+
+
+def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
+    """Refuse to use of a device what was found of an emulated sensor.
+
+    Args:
+        known: of the sensors.
+        kind: of the opened source.
+        force: use it all the same.
+
+    Raises:
+        SensorFileError: the sensor file is of an emulated sensor, in part or whole.
+    """
+    if kind != "device" or force:
+        return
+    for name, entry in known.sensors.items():
+        if entry.emulated:
+            parts = ", ".join(part for part in PARTS if part in entry.emulated)
+            raise SensorFileError(
+                f"the sensor file has {parts} of an emulated sensor {name}, and this is a device: write a new one with "
+                "edge-sr doctor --out, or add --force"
+            )
 
 
 def references(baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile) -> Mapping[str, Baseline]:

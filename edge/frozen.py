@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.npz import read_npz
 
 MOST_BYTES: Final = 1 << 31
@@ -103,8 +104,13 @@ class FrozenSet:
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write as a compressed npz."""
-        np.savez_compressed(path, **{field.name: getattr(self, field.name) for field in fields(self)})
+        """Write as a compressed npz, in place.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        write_in_place(path, lambda draft: np.savez_compressed(draft, **arrays), load_frozen_set)
 
 
 def load_frozen_set(path: Path) -> FrozenSet:

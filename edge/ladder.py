@@ -113,7 +113,7 @@ def open_ladder(
     Raises:
         ModelError: the model cannot be used, or does not tell its error.
     """
-    sessions = candidate_sessions(model, tell)
+    sessions = candidate_sessions(model, tell, stop)
     kept = CalibrationCache(cache, rate_hz)
     found = {} if recalibrate else {path: entry for path in sessions if (entry := kept.find(path)) is not None}
     missing = {path: session for path, session in sessions.items() if path not in found}
@@ -140,7 +140,9 @@ def open_ladder(
     return Ladder(choice, budget_us, {one.name: one for one in sessions.values() if one.name in names})
 
 
-def candidate_sessions(model: Path, tell: Callable[[str], object]) -> dict[Path, ModelSession]:
+def candidate_sessions(
+    model: Path, tell: Callable[[str], object], stop: threading.Event | None = None
+) -> dict[Path, ModelSession]:
     """A model and all that may stand in for it, by file: patterns of the same meaning, no more taps, error known.
 
     A model in integers was asked for to save time, so float32 does not stand in for it. What lies beside a file as its
@@ -149,13 +151,13 @@ def candidate_sessions(model: Path, tell: Callable[[str], object]) -> dict[Path,
     Raises:
         ModelError: the model cannot be used, or does not tell its error.
     """
-    asked = ModelSession(model)
+    asked = ModelSession(model, stop=stop)
     _psnr_db(asked)
     bundled = model.resolve() in bundled_models()
     sessions = {model: asked}
     for path in alternatives(model):
         try:
-            session = ModelSession(path)
+            session = ModelSession(path, stop=stop)
             misfit = _misfit(session, asked)
         except ModelError as error:
             misfit = str(error)

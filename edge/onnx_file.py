@@ -1,8 +1,9 @@
 """What a file must be before onnxruntime sees it: one plain graph that holds its own weights, of bounded size.
 
 onnxruntime follows a tensor into a side file below the model's folder, and a graph into graphs within it, which may
-run for ever. No model of ours has either. The walk below knows the fields that lead to them, passes over all else,
-weights among it, and refuses what it does not understand: what it let pass unread, onnxruntime might read.
+run for ever. No model of ours has either. The walk below knows the fields that lead to them and to the operators, of
+which only those of plain networks are allowed, passes over all else, weights among it, and refuses what it does not
+understand: what it let pass unread, onnxruntime might read.
 
 Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
 """
@@ -21,6 +22,22 @@ MOST_FIELDS: Final = 1 << 20
 """Some seconds of walking; the bundled models have a thousand and a half."""
 MOST_DIMS: Final = 64
 """Of weights: the product of a million dimensions takes hours."""
+_NAMES: Final = """
+Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
+ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
+Gather GatherElements Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GridSample GroupNormalization
+HardSigmoid HardSwish Identity InstanceNormalization LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
+MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg Not Or PRelu Pad Pow QLinearConv QLinearMatMul QuantizeLinear
+Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Relu Reshape Resize Round Selu Shape
+Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile Transpose Unsqueeze
+Where
+"""
+OPERATORS: Final = frozenset(_NAMES.split())
+"""Those that are allowed: of the exported models, of the networks that they are compared with, and of others like them.
+No control flow, no recurrence, nothing random, no text. docs/formats.md lists them too."""
+ONNX_DOMAINS: Final = ("", "ai.onnx")
+"""Two names of one set of operators; all others are of one vendor, or of the file itself."""
+_LONGEST_NAME: Final = 40
 _HIGHEST_TAG: Final = (1 << 32) - 1
 _TAG_BYTES: Final = 5
 _VARINT_BYTES: Final = 10
@@ -36,6 +53,8 @@ _Message = Mapping[int, "_Message | str"]
 """Number of a field -> what message it holds, or why it is refused."""
 _DIMS: Final = 1
 _LOCATION: Final = 14
+_OPERATOR: Final = 4
+_DOMAIN: Final = 7
 _TENSOR: Final[_Message] = {13: _SIDE_FILE}
 _ATTRIBUTE: Final[_Message] = {5: _TENSOR, 6: _NESTED, 10: _TENSOR, 11: _NESTED, 22: _SPARSE, 23: _SPARSE}
 _NODE: Final[_Message] = {5: _ATTRIBUTE}
@@ -75,7 +94,7 @@ def check_plain(content: bytes) -> None:
 
     Raises:
         ModelError: weights in another file, sparse or of more elements than the file can hold; graphs within the
-            graph; or not the encoding that ONNX has.
+            graph; an operator that is not one of OPERATORS; or not the encoding that ONNX has.
     """
     waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
     fields = 0
@@ -96,9 +115,19 @@ def check_plain(content: bytes) -> None:
                     raise ModelError(_SIDE_FILE)
                 if field.number == _DIMS:
                     dims += _dims(content, field)
+            if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
+                _check_operator(field.number, content[field.start : field.end])
         # Four bits are the least that an element takes.
         if dims and (len(dims) > MOST_DIMS or prod(dims) > 2 * len(content)):
             raise ModelError(f"has weights of shape {dims[:8]}, more than its {len(content)} bytes can hold")
+
+
+def _check_operator(field: int, name: bytes) -> None:
+    text = name[:_LONGEST_NAME].decode(errors="replace")
+    if field == _OPERATOR and text not in OPERATORS:
+        raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
+    if field == _DOMAIN and text not in ONNX_DOMAINS:
+        raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
 
 
 def _dims(content: bytes, field: _Field) -> Iterator[int]:

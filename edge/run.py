@@ -78,7 +78,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             )
         if stop.is_set():
             return
-        model = load_model(name) if ladder is None else ladder.model
+        model = load_model(name, stop=stop) if ladder is None else ladder.model
         scores = sys.stderr if stdout_taken else sys.stdout
         score = None
         statistics = Statistics() if statistics is None else statistics

@@ -2,6 +2,7 @@
 
 import os
 import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +14,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 
 from edge.contract import ANY_BATCH, DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.errors import ModelError, WindowError
+from edge.loading import flush_denormals, within_limit
 from edge.onnx_file import read_model
 
 WARM_UP_RUNS: Final = 10
@@ -24,7 +26,8 @@ _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
 """File, line and signature of a function."""
-LOAD_ERRORS: Final = (
+ORT_ERRORS: Final = (
+    ort_errors.EPFail,
     ort_errors.Fail,
     ort_errors.InvalidArgument,
     ort_errors.InvalidGraph,
@@ -32,6 +35,8 @@ LOAD_ERRORS: Final = (
     ort_errors.NoModel,
     ort_errors.NotImplemented,
     ort_errors.RuntimeException,
+    RuntimeError,  # what its C++ throws otherwise
+    MemoryError,
     UnicodeDecodeError,  # names in its messages are the file's
 )
 
@@ -45,19 +50,21 @@ class ModelSession:
     the first session and on threads which that one starts later. Everything else on them computes like this as well.
     """
 
-    def __init__(self, path: Path, threads: int = 1) -> None:
+    def __init__(self, path: Path, threads: int = 1, stop: threading.Event | None = None) -> None:
         """Load, check and warm up.
 
         Args:
             path: of the model.
             threads: that share the work of one run.
+            stop: gives up early.
 
         Raises:
-            ModelError: no such file, not a model, weights in a side file, no contract, or a graph
-                that does not keep the contract; the key or tensor is named.
+            ModelError: no such file, not a model, weights in a side file, an operator that is not allowed, no contract,
+                or a graph that does not keep the contract; the key or tensor is named. Or it takes too long.
         """
+        self._path = path
         self.name = path.stem.encode(errors="replace").decode()  # records are UTF-8, file names need not be
-        self._session = load_session(path, threads)
+        self._session = load_session(path, threads, stop)
         try:
             self.contract = Contract.from_metadata(self._session.get_modelmeta().custom_metadata_map)
             if self.contract.batch not in (1, ANY_BATCH):
@@ -75,11 +82,7 @@ class ModelSession:
         self._deviation: NDArray[np.float32] | None = None
         self._traction: NDArray[np.float32] | None = None
         self._unknown_pad = self.contract.pad_row(None)
-        try:
-            for _ in range(WARM_UP_RUNS):
-                self.run(np.zeros(self._shape, dtype=np.float32))
-        except LOAD_ERRORS as error:
-            raise ModelError(f"{path}: cannot be run: {_reason(error)}") from error
+        within_limit(self._warm_up, path, stop)
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
@@ -111,8 +114,8 @@ class ModelSession:
 
         Raises:
             WindowError: wrong shape or type, or not finite.
-            ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
-                above zero.
+            ModelError: the model cannot be run on it, or gave a pattern or a traction that is not finite, or a deviation
+                that is not finite and above zero.
         """
         pattern = self.run_together([window], None if pad is None else [pad])[0]
         if self._deviation is not None:
@@ -151,7 +154,10 @@ class ModelSession:
             run.window[index] = window.reshape(run.window.shape[1:])
             if run.pad is not None:
                 run.pad[index] = pad
-        run()
+        try:
+            run()
+        except ORT_ERRORS as error:
+            raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
         pattern, self._deviation, self._traction = run.pattern, run.deviation, run.traction
         if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
@@ -162,6 +168,10 @@ class ModelSession:
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
         return pattern
+
+    def _warm_up(self) -> None:
+        for _ in range(WARM_UP_RUNS):
+            self.run(np.zeros(self._shape, dtype=np.float32))
 
     @property
     def _shape(self) -> tuple[int, int, int, int]:
@@ -202,12 +212,8 @@ def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> N
     bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
 
 
-def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
-    """Any ONNX file in the runtime's own settings, its contract not asked for.
-
-    Raises:
-        ModelError: no such file, not a model, or not one plain graph with its weights.
-    """
+def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
+    """The runtime's own settings."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = LOG_FATAL_ONLY
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -216,13 +222,30 @@ def load_session(path: Path, threads: int = 1) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
-    # A second lock behind `read_model`: nothing can lie below the null device.
+    # Second locks behind `read_model`. Nothing can lie below the null device; and by its first bytes a file may also be
+    # of onnxruntime's own format, which is not looked into.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    return options
+
+
+def load_session(path: Path, threads: int = 1, stop: threading.Event | None = None) -> onnxruntime.InferenceSession:
+    """Any ONNX file in the runtime's own settings, its contract not asked for.
+
+    Raises:
+        ModelError: no such file, not a model, not one plain graph with its weights, or it takes too long.
+    """
     content = read_model(path)
-    # Its fallback tries the same again, and prints on stdout, where records go.
-    try:
+    flush_denormals(session_options)
+    options = session_options(threads)
+
+    def load() -> onnxruntime.InferenceSession:
+        # Its fallback tries the same again, and prints on stdout, where records go.
         return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
-    except LOAD_ERRORS as error:
+
+    try:
+        return within_limit(load, path, stop)
+    except ORT_ERRORS as error:
         raise ModelError(f"{path}: not a model that onnxruntime can load: {_reason(error)}") from error
 
 

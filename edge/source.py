@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from queue import Empty, SimpleQueue
 from typing import Final, NamedTuple, Self
 
+from edge.commissioned import refuse_emulated
 from edge.errors import UsageError
 from firmware_bridge.links.base import Link, Notice, SourceKind
 from firmware_bridge.scan import Scan
@@ -48,6 +49,7 @@ class Source:
         *,
         sensor_file: SensorFile | None = None,
         rate_hz: float | None = None,
+        force: bool = False,
     ) -> None:
         """Prepare to read a link that is not open yet.
 
@@ -56,11 +58,13 @@ class Source:
             capacity_scans: how many scans may wait.
             sensor_file: what is known of the sensors; nothing without.
             rate_hz: of each sensor, in [Hz].
+            force: use of a device also what the sensor file has of an emulated sensor.
         """
         self.name = link.name
         self.patient = link.patient
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
         self.rate_hz = rate_hz
+        self._force = force
         self.overruns = 0
         self.thread_ids: tuple[int, ...] = ()
         self._link = link
@@ -82,6 +86,7 @@ class Source:
             raise UsageError(f"source {self.name} was opened before: make another, with open_source")
         with ExitStack() as opening:
             opening.enter_context(self._link)
+            refuse_emulated(self.sensor_file, self._link.kind, self._force)
             if not self.patient:
                 self._begin(opening)
             self._open = opening.pop_all()

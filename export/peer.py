@@ -15,10 +15,12 @@ from typing import Final
 import torch
 
 from edge.bench.subjects import WEIGHTS_KEY
+from edge.session import load_session
 from export.errors import ExportError
 from export.graph import to_model
 from export.rounding import folded
 from firmware_bridge.geometry import USPA44
+from firmware_bridge.in_place import check_writable, write_in_place
 from train.networks.cost import macs, parameters_count
 from train.networks.registry import NETWORKS, build
 
@@ -41,17 +43,11 @@ def export_peer(name: str, path: Path, seed: int = 0, scale: int = SCALE) -> str
     """
     torch.manual_seed(seed)
     net = folded(build(name, scale).eval())
-    new = not path.exists()
-    path.touch()  # one that cannot be written is told before the work, not after it
-    try:
-        model = to_model(net, USPA44)
-    except ExportError:
-        if new:
-            path.unlink()
-        raise
+    check_writable(path)  # before the work, not after it
+    model = to_model(net, USPA44)
     model.metadata_props.add(key=WEIGHTS_KEY, value=f"random, of {name}, seed {seed}")
     content = model.SerializeToString(deterministic=True)
-    path.write_bytes(content)
+    write_in_place(path, lambda draft: draft.write_bytes(content), load_session)
     work = f"{parameters_count(net) / 1e6:.2f} M weights, {macs(net) / 1e6:.1f} MMAC"
     return f"{path}: {name} x{scale}, {work}, {len(content) / 1e6:.2f} MB, weights random, seed {seed}"
 

@@ -12,8 +12,9 @@ from edge.contract import ANY_BATCH, Contract
 from edge.frozen import FrozenSet
 from edge.judge import judge_model, mean_error
 from edge.progress import tracked
-from edge.session import ModelSession
+from edge.session import ModelSession, load_session
 from export.reference import origin
+from firmware_bridge.in_place import write_in_place
 from train.confidence import fit_confidence
 
 
@@ -71,7 +72,7 @@ class Writer:
             contract.confidence.update(fit_confidence(session, fitting))
         content = self._bytes(model, contract)
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # as the runtime will
-        (self.folder / f"{name}.onnx").write_bytes(content)
+        write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
         return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*said, *facts])}"
 
     def _session(self, name: str, single: onnx.ModelProto, contract: Contract) -> ModelSession:

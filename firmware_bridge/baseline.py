@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.geometry import AXES
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
 
@@ -207,7 +207,7 @@ class BaselineEstimator:
 
 
 def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orders = _AS_WIRED) -> None:
-    """Write baselines, one per sensor, as one JSON file. A file that is there is replaced whole or not at all.
+    """Write baselines, one per sensor, as one JSON file, in place; one that is there stays as NAME.bak.
 
     Args:
         path: of the file.
@@ -234,12 +234,13 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orde
     if len(set(sensors)) < len(sensors):
         raise ValueError(f"baselines of sensors {', '.join(sensors)}: expected each sensor once")
     text = json.dumps({"format": FILE_FORMAT, "version": FILE_VERSION, "baselines": entries}, indent=1, allow_nan=False)
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        part.write_text(text + "\n", encoding="utf-8")
-        part.replace(path)
+        write_in_place(
+            path,
+            lambda draft: draft.write_text(text + "\n", encoding="utf-8"),
+            lambda draft: load_baselines(draft, orders),
+        )
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
@@ -339,8 +340,9 @@ def _read_entry(path: Path, entry: Any) -> Baseline:
     if type(scans) is not int or scans < 1:
         _refuse_file(path, "scans", scans, "a whole number from 1")
     baseline = Baseline.of(sensor, _read_counts(path, entry.get("counts")), created_unix_s, scans, "file")
-    if entry.get("id") != baseline.id:
-        _refuse_file(path, "id", entry.get("id"), f"'{baseline.id}', which the counts give: the file was changed")
+    if entry.get("id", baseline.id) != baseline.id:
+        expected = f"'{baseline.id}', which the counts give, or none: the file was changed"
+        _refuse_file(path, "id", entry["id"], expected)
     return baseline
 
 

@@ -42,17 +42,30 @@ MOST_BYTES: Final = 1 << 16
 """A sensor takes 2 kB."""
 LONGEST_LINE_BYTES: Final = 2048
 """Twice a line of all gains. Python's reader takes time that grows with the square of a key's dots: 60 kB took 27 s."""
+PARTS: Final = ("mounting", "force", "baseline")
+"""Of an entry: what can be assumed, or be of an emulated sensor."""
 _GRID: Final = (USPA44.rows, USPA44.cols)
 
 
 @dataclass(frozen=True)
 class SensorEntry:
-    """What is known of one sensor: how it sits, its summed z per [N], what its free pad reads, and the pad itself."""
+    """What is known of one sensor.
+
+    Attributes:
+        mounting: how it sits.
+        counts_per_newton: its summed z per [N].
+        baseline: what its free pad reads.
+        pad: the pad itself.
+        assumed: which of PARTS nobody has looked at.
+        emulated: which of PARTS were found of an emulated sensor.
+    """
 
     mounting: Mounting = field(default_factory=Mounting)
     counts_per_newton: float | None = None
     baseline: Baseline | None = None
     pad: Pad | None = None
+    assumed: frozenset[str] = frozenset()
+    emulated: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -139,6 +152,7 @@ def _entry(path: Path, name: str, values: Mapping[str, Any]) -> SensorEntry:
     counts_per_newton = table.take("counts_per_newton", positive, required=False)
     pad = table.take("pad", a_table, required=False)
     baseline = table.take("baseline", a_table, required=False)
+    marks = {key: table.take(key, _parts, required=False) or frozenset() for key in ("assumed", "emulated")}
     table.end()
     known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
     mounting = Mounting(**{key: value for key, value in known.items() if value is not None})
@@ -147,6 +161,7 @@ def _entry(path: Path, name: str, values: Mapping[str, Any]) -> SensorEntry:
         counts_per_newton,
         None if baseline is None else _baseline(path, name, baseline),
         None if pad is None else _pad(path, name, pad),
+        **marks,
     )
 
 
@@ -168,14 +183,16 @@ def _pad(path: Path, name: str, values: Mapping[str, Any]) -> Pad:
 
 def _baseline(path: Path, name: str, values: Mapping[str, Any]) -> Baseline:
     table = Table(path, f"sensors.{name}.baseline.", values)
-    expected_id = table.take("id", text_value)
+    expected_id = table.take("id", text_value, required=False)
     created_unix_s = table.take("created_unix_s", positive)
     scans = table.take("scans", whole)
     axes = [table.take(axis, _rest_counts) for axis in AXES]
     table.end()
     baseline = Baseline.of(name, np.stack(axes), created_unix_s, scans, "file")
-    if baseline.id != expected_id:
-        table.refuse("id", repr(expected_id), f"'{baseline.id}', which the counts give; the baseline was changed")
+    if expected_id not in (None, baseline.id):
+        table.refuse(
+            "id", repr(expected_id), f"'{baseline.id}', which the counts give, or none; the baseline was changed"
+        )
     return baseline
 
 
@@ -185,6 +202,12 @@ def _order(value: Any) -> tuple[int, ...]:
     if not all(type(cell) is int for cell in cells) or sorted(cells) != list(range(USPA44.taxel_count)):
         raise ValueError(expected)
     return tuple(cells)
+
+
+def _parts(value: Any) -> frozenset[str]:
+    if not isinstance(value, list) or not all(isinstance(one, str) and one in PARTS for one in value):
+        raise ValueError(f"a list of {', '.join(PARTS)}")
+    return frozenset(value)
 
 
 def _signs(value: Any) -> tuple[int, ...]:

@@ -4,7 +4,6 @@ A pad's numbers then lie in the file as they lie on the pad, and the comments sa
 """
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,29 +12,30 @@ import numpy as np
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.pad import PAD_RANGES, Pad
-from firmware_bridge.sensor_file import FILE_FORMAT, FILE_VERSION, SensorFile
+from firmware_bridge.sensor_file import FILE_FORMAT, FILE_VERSION, PARTS, SensorEntry, SensorFile, load_sensor_file
 
 
 def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
-    """Write a sensor file. One that is there is replaced whole or not at all.
+    """Write a sensor file in place; one that is there stays as NAME.bak.
 
     Raises:
-        SensorFileError: the file cannot be written, or holds a baseline with a taxel that was silent.
+        SensorFileError: the file cannot be written, or would hold no sensor, or a baseline with a silent taxel.
     """
     path = Path(path)
+    if not sensor_file.sensors:
+        raise SensorFileError(f"{path}: not written, for no sensor is known: see that one is heard")
     for name, entry in sensor_file.sensors.items():
         if entry.baseline is not None and np.isnan(entry.baseline.counts).any():
             raise SensorFileError(
                 f"{path}: a taxel of sensor {name} was silent while zeroing: zero again when it is not"
             )
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    text = _text(sensor_file)
     try:
-        part.write_text(_text(sensor_file), encoding="utf-8")
-        part.replace(path)
+        write_in_place(path, lambda draft: draft.write_text(text, encoding="utf-8"), load_sensor_file)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise SensorFileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
@@ -52,11 +52,24 @@ def _text(sensor_file: SensorFile) -> str:
         lines += ["", f"[sensors.{_quoted(name)}]", *_mounting_lines(entry.mounting)]
         if entry.counts_per_newton is not None:
             lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
+        lines += _mark_lines(entry)
         if entry.pad is not None:
             lines += ["", f"[sensors.{_quoted(name)}.pad]", *_pad_lines(entry.pad)]
         if entry.baseline is not None:
             lines += ["", f"[sensors.{_quoted(name)}.baseline]", *_baseline_lines(entry.baseline)]
     return "\n".join([*lines, ""])
+
+
+def _mark_lines(entry: SensorEntry) -> list[str]:
+    marks = (
+        ("assumed", entry.assumed, "as wired; nobody has looked"),
+        ("emulated", entry.emulated, "found of an emulated sensor: not for a device"),
+    )
+    return [
+        f"{key} = {json.dumps([part for part in PARTS if part in parts])}  # {why}"
+        for key, parts, why in marks
+        if parts
+    ]
 
 
 def _mounting_lines(mounting: Mounting) -> list[str]:

@@ -226,7 +226,19 @@ def test_saved_baselines_come_back(tmp_path):
         assert (got.counts == baseline.counts).all() and got.counts.shape == (3, 4, 4)
         assert (got.id, got.created_unix_s, got.scans) == (baseline.id, baseline.created_unix_s, 100)
         assert got.origin == "file"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["zero.json"]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["zero.json", "zero.json.bak"]
+    assert (tmp_path / "zero.json.bak").read_text() == "old"
+
+
+def test_a_baseline_written_by_hand_as_the_docs_say_needs_no_id(tmp_path):
+    path = tmp_path / "zero.json"
+    entry = {"sensor": "4", "created_unix_s": 1_790_000_000, "scans": 100, "counts": [[[16_000] * 4] * 4] * 3}
+    path.write_text(json.dumps({"format": "tactile-baseline", "version": 1, "baselines": [entry]}))
+    baseline = load_baselines(path)["4"]
+    assert (baseline.counts == 16_000).all() and len(baseline.id) == 8
+    entry["counts"] = [[[16_001] * 4] * 4] * 3
+    path.write_text(json.dumps({"format": "tactile-baseline", "version": 1, "baselines": [entry]}))
+    assert load_baselines(path)["4"].id != baseline.id
 
 
 def test_saving_each_sensor_once(tmp_path):

@@ -130,6 +130,19 @@ def test_exporting_again_gives_the_same_bytes_without_traces_of_the_machine(fold
     assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
 
 
+def test_a_model_is_replaced_by_one_that_loads_and_stays_as_bak(folder, frozen, tmp_path, monkeypatch):
+    path = tmp_path / "sure.onnx"
+    path.write_bytes(b"the one before")
+    refused = ModelError("it does not load")
+    with monkeypatch.context() as unloadable, pytest.raises(ModelError, match="it does not load"):
+        unloadable.setattr("export.writing.load_session", lambda draft: (_ for _ in ()).throw(refused))
+        export(folder / "sure.pt", tmp_path, frozen)
+    assert path.read_bytes() == b"the one before" and [one.name for one in tmp_path.iterdir()] == ["sure.onnx"]
+    export(folder / "sure.pt", tmp_path, frozen)
+    assert path.read_bytes() == (folder / "sure.onnx").read_bytes()
+    assert (tmp_path / "sure.onnx.bak").read_bytes() == b"the one before"
+
+
 def test_a_seed_size_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path):
     path = save_untrained(tmp_path / "peer.pt", "stsr", 4)
     line = export(path, tmp_path, at_frames(frozen, slice(0, 96, 30)))

@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from edge.bundle import BUNDLE_DIR
 from edge.classical import fitted_methods
+from edge.errors import EdgeError
 from edge.judge import judge
 from edge.taps import ON_COUNTS
 from firmware_bridge.recording import load_recording
@@ -90,6 +92,24 @@ def test_the_demo_presses_holds_and_lifts_four_times(tmp_path):
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
     with pytest.raises(SystemExit, match=r"^freeze: .*no such file"):
         main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
+
+
+def test_files_are_replaced_by_those_that_load_and_stay_as_bak(tmp_path, monkeypatch, frozen):
+    bundled = {name: dict(np.load(BUNDLE_DIR / f"{name}.npz")) for name in ("classical", "taxels", "demo")}
+    made = {"load_sequences": None, "join": None, "freeze": frozen, "demo_recording": bundled["demo"]}
+    made |= {"fit_classical": bundled["classical"], "fit_taxels": bundled["taxels"]}
+    for name, value in made.items():
+        monkeypatch.setattr(f"train.freeze.{name}", lambda *_, value=value: value)
+    names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "taxels")]
+    main([str(tmp_path), "--data", "seen.npz"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    main([str(tmp_path), "--data", "seen.npz"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, *(f"{name}.bak" for name in names)])
+    before = (tmp_path / "taxels.npz").read_bytes()
+    monkeypatch.setattr("train.freeze.fit_taxels", lambda _: {"covariances": np.zeros(3)})
+    with pytest.raises(EdgeError, match="cannot be read"):
+        main([str(tmp_path), "--data", "seen.npz"])
+    assert (tmp_path / "taxels.npz").read_bytes() == before
 
 
 def test_taxels_covary_as_their_readings_do(sequences):

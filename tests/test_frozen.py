@@ -54,6 +54,14 @@ def test_a_file_gives_back_the_set(small, tmp_path):
     assert load_frozen_set(tmp_path / "set.npz").sha256() == small.sha256()
 
 
+def test_a_set_that_cannot_be_read_back_does_not_replace_one_that_can(small, tmp_path):
+    path = tmp_path / "set.npz"
+    small.save(path)
+    with pytest.raises(FrozenSetError):
+        replace(small, full_scale_mm=0.0).save(path)
+    assert load_frozen_set(path).sha256() == small.sha256() and [one.name for one in tmp_path.iterdir()] == ["set.npz"]
+
+
 def test_the_hash_sees_every_array(small):
     changed = replace(small, indentation_mm=small.indentation_mm + np.float32(1e-6))
     assert changed.sha256() != small.sha256()

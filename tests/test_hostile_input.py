@@ -324,7 +324,7 @@ class TestModels:
 
     def test_graphs_within_the_graph_functions_and_sparse_weights(self):
         inner = helper.make_graph([], "inner", [], [])
-        node = helper.make_node("If", ["x"], ["y"], then_branch=inner, else_branch=inner)
+        node = helper.make_node("Identity", ["x"], ["y"], then_branch=inner, else_branch=inner)
         model = onnx.ModelProto(graph=helper.make_graph([node], "g", [], []))
         with pytest.raises(ModelError, match="graphs within its graph"):
             check_plain(model.SerializeToString())

@@ -81,6 +81,15 @@ def test_a_short_file_by_hand_is_enough(tmp_path):
     assert read.adapter is None and not read.baselines and not read.counts_per_newton
 
 
+def test_a_baseline_by_hand_needs_no_id(tmp_path):
+    counts = "".join(f"{axis} = {[[16_000.0] * 4] * 4}\n" for axis in "xyz")
+    (tmp_path / "s.toml").write_text(
+        'format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.1.baseline]\n'
+        f"created_unix_s = 1790000000\nscans = 100\n{counts}"
+    )
+    assert (load_sensor_file(tmp_path / "s.toml").baselines["1"].counts == 16_000).all()
+
+
 GRID = "[[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11], [12, 13, 14, 15]]"
 GOOD = {
     "format": '"tactile-sensor"', "version": "1", "model": '"uSPa44"', "adapter": '"D30BL366"',
@@ -119,7 +128,7 @@ def text_of(**changes):
         ("gains", f"[{GRID}, {GRID}]", "positive numbers, 3, or 3 x 4 x 4"),
         ("counts_per_newton", "nan", "a positive number"),
         ("counts_per_newton", "true", "a positive number"),
-        ("id", '"ffff"', "which the counts give; the baseline was changed"),
+        ("id", '"ffff"', "which the counts give, or none; the baseline was changed"),
         ("created_unix_s", "0", "a positive number"),
         ("scans", "1.0", "a whole number from 1"),
         ("x", GRID.replace("15", "65536"), "numbers 0..65535"),

@@ -69,9 +69,12 @@ def test_a_network_that_is_there_and_was_trained_alike_is_not_trained_again(fold
     assert (tmp_path / "small.pt").stat().st_mtime_ns == first
     fit_network(TRAINING, data, replace(validation, full_scale_mm=1.0), tmp_path)  # its deviations are set on that
     assert (tmp_path / "small.pt").stat().st_mtime_ns > first
+    assert (tmp_path / "small.pt.bak").read_bytes() == (folder / "small.pt").read_bytes()
+    assert (tmp_path / "small.json.bak").read_bytes() == (folder / "small.json").read_bytes()
     (tmp_path / "small.json").unlink()
     fit_network(TRAINING, data, validation, tmp_path)
-    assert (tmp_path / "small.json").exists() and not (tmp_path / "small.draft").exists()
+    names = {path.name for path in tmp_path.iterdir() if path.is_file()}
+    assert names == {"small.pt", "small.json", "small.pt.bak", "small.json.bak"}
 
 
 def test_training_lowers_the_error(folder, validation):

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.npz import read_npz
 from train.errors import DatasetError
 from train.nuisances import Nuisances, Seed, read_windows
@@ -167,13 +168,15 @@ class Sequences:
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = {"scale": self.scale, "seed": self.seed, "config": self.config, "sha256": self.sha256()}
-        draft = path.with_name(path.name + ".draft")
-        try:
+
+        def write(draft: Path) -> None:
             with draft.open("wb") as file:
                 np.savez(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=json.dumps(facts), **arrays)
-            draft.replace(path)
+
+        try:
+            # Read back for its facts alone: all of it would take as much memory again.
+            write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], _MOST_FACTS_BYTES), keep_before=False)
         except OSError as error:
-            draft.unlink(missing_ok=True)
             raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
 
 

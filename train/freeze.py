@@ -5,17 +5,20 @@ python -m train.freeze edge/models --data data/train.npz
 
 import argparse
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map
+from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
+from edge.estimate import load_estimator
 from edge.frozen import FrozenSet
 from edge.progress import tracked
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.in_place import write_in_place
+from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION, load_recording
 from train.batches import Draw, WindowBatches
 from train.dataset import Sequences, between_frames, join, load_sequences
 from train.depth import Pose
@@ -157,14 +160,15 @@ def main(arguments: list[str] | None = None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     frozen = freeze(held_out("test"), Nuisances(), SEED)
     frozen.save(folder / "frozen.npz")
-    made = {
-        "classical": fit_classical(sequences),
-        "taxels": fit_taxels(sequences),
-        "demo": demo_recording(),
-    }
-    for name, arrays in made.items():
-        np.savez_compressed(folder / f"{name}.npz", allow_pickle=False, **arrays)
+    _save(folder / "classical.npz", fit_classical(sequences), lambda draft: fitted_methods(draft, frozen.scale))
+    grid = (USPA44.rows, USPA44.cols)
+    _save(folder / "taxels.npz", fit_taxels(sequences), lambda draft: load_estimator(draft, grid))
+    _save(folder / "demo.npz", demo_recording(), load_recording)
     sys.stdout.write(f"{len(frozen)} frames of {len(frozen.surface)} taps, sha256 {frozen.sha256()}\n")
+
+
+def _save(path: Path, arrays: Mapping[str, NDArray[Any]], load: Callable[[Path], object]) -> None:
+    write_in_place(path, lambda draft: np.savez_compressed(draft, allow_pickle=False, **arrays), load)
 
 
 if __name__ == "__main__":

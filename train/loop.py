@@ -27,6 +27,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
 from edge.progress import Progress
+from firmware_bridge.in_place import write_in_place
 from train.ahead import drawn_ahead
 from train.data.batch import Batch
 from train.errors import TrainError
@@ -336,7 +337,11 @@ class _Keeper:
 
     def keep(self, step: int, elapsed_s: float, course: Course) -> None:
         state = {name: part.state_dict() for name, part in self._parts.items()}
-        draft = self._path.with_name(self._path.name + ".draft")
-        torch.save(state | {"recipe": self._hash, "step": step, "elapsed_s": elapsed_s, "course": course}, draft)
-        draft.replace(self._path)
+        state |= {"recipe": self._hash, "step": step, "elapsed_s": elapsed_s, "course": course}
+        write_in_place(
+            self._path,
+            lambda draft: torch.save(state, draft),
+            lambda draft: torch.load(draft, map_location="cpu", weights_only=True),
+            keep_before=False,
+        )
         self._kept_s = time.monotonic()

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.metrics import contact_iou, psnr_db, ssim
+from firmware_bridge.in_place import write_in_place
 from train.batches import Draw, WindowBatches, network_input
 from train.calibration import calibrate, interval_coverage
 from train.data.batch import Batch
@@ -125,11 +126,11 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
     }
     if rank == 0:
         # The report last: what it says is true of the weights beside it.
-        draft = path.with_suffix(".draft")
-        torch.save(net.state_dict(), draft)
-        draft.replace(path)
-        draft.write_text(json.dumps(report, indent=1) + "\n")
-        draft.replace(path.with_suffix(".json"))
+        weights, text = net.state_dict(), json.dumps(report, indent=1) + "\n"
+        write_in_place(
+            path, lambda draft: torch.save(weights, draft), lambda draft: torch.load(draft, weights_only=True)
+        )
+        write_in_place(path.with_suffix(".json"), lambda draft: draft.write_text(text), lambda draft: draft.read_text())
         resume_path.unlink(missing_ok=True)
     wait_for_all()
     return report

@@ -17,7 +17,7 @@ import onnxruntime
 from edge.bench.subjects import random_feeds
 from edge.errors import ModelError
 from edge.onnx_file import read_model
-from edge.session import LOAD_ERRORS, LOG_FATAL_ONLY
+from edge.session import ORT_ERRORS, session_options
 
 Shape = Sequence[int]
 
@@ -74,10 +74,8 @@ def macs_of(path: Path) -> Macs:
     Raises:
         ModelError: it cannot be run.
     """
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = LOG_FATAL_ONLY
+    options = session_options()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    options.intra_op_num_threads = 1
     options.enable_profiling = True
     # Weights that a kernel has packed its own way are missing from its inputs.
     options.add_session_config_entry("session.disable_prepacking", "1")
@@ -88,7 +86,7 @@ def macs_of(path: Path) -> Macs:
                 read_model(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
             session.run(None, random_feeds(session, path))
-        except LOAD_ERRORS as error:
+        except ORT_ERRORS as error:
             raise ModelError(f"{path}: cannot be run to count its multiply-accumulates: {error}") from error
         events = json.loads(Path(session.end_profiling()).read_text())
     return counted(events)

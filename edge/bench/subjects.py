@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge.bundle import BUNDLE_DIR, bundled_models
 from edge.classical import fitted_methods
 from edge.errors import ModelError, UsageError
-from edge.session import ModelSession, load_session
+from edge.session import ORT_ERRORS, ModelSession, load_session
 
 FROZEN_FILE: Final = BUNDLE_DIR / "frozen.npz"
 WEIGHTS_KEY: Final = "tactile.weights"
@@ -129,7 +129,10 @@ def _opened_peer(path: Path, threads: int) -> Infer:
 
     def infer(window: NDArray[np.float32]) -> None:
         del window  # a peer's inputs are its own
-        session.run_with_iobinding(binding)
+        try:
+            session.run_with_iobinding(binding)
+        except ORT_ERRORS as error:
+            raise ModelError(f"{path}: cannot be run: {error}") from error
 
     return infer
 

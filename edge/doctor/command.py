@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from edge.commissioned import references, settled
+from edge.commissioned import references, refuse_emulated, settled
 from edge.doctor.examine import examine
 from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.keep import check_writable, keep
@@ -47,9 +47,9 @@ def run(
         SensorFileError: the sensor file cannot be used; or not written, and if that turns out at the end, after what
             was found was told.
     """
-    if options.out is not None:
-        check_writable(options.out)
     known = settled(options.sensor, options.id_map)
+    if options.out is not None:
+        check_writable(options.out, known, presses=not options.no_press, weighs=options.weight_g is not None)
     before = references(options.baseline, known)
     with stop_on_signals() as stop:
         watch = Watch(options.source, known, references=before, rate_hz=options.rate_hz, stop=stop, clock_s=clock_s)
@@ -57,6 +57,7 @@ def run(
         start_s = clock_s()
         lost = None
         with watch.link:
+            refuse_emulated(known, watch.link.kind, options.force)
             try:
                 visit.watch()
             except LinkLostError as error:
@@ -74,7 +75,15 @@ def run(
         kept = unwritten = None
         if options.out is not None and lost is None and not stop.is_set():
             try:
-                kept = keep(options.out, known, watched.facts.port, examined.baselines, mountings, visit.newtons)
+                kept = keep(
+                    options.out,
+                    watch.known,
+                    watched.facts.port,
+                    examined.baselines,
+                    mountings,
+                    visit.newtons,
+                    emulated="emulated" in (watch.link.kind, watch.link.origin),
+                )
             except SensorFileError as error:
                 unwritten = error
         stopped_s = clock_s() - start_s if stop.is_set() else None

@@ -1,33 +1,48 @@
-"""What the doctor found, written into a sensor file."""
+"""What the doctor found, written into a sensor file, unless that would lose what the file holds already."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from errno import EISDIR
 from pathlib import Path
-from tempfile import TemporaryFile
 
+from firmware_bridge import in_place
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.ports import serial_ports
 from firmware_bridge.mounting import Mounting
-from firmware_bridge.sensor_file import SensorEntry, SensorFile
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 
+_AS_WIRED = frozenset({"mounting"})
 
-def check_writable(path: Path) -> None:
-    """Find out whether a file can be written, before a minute is spent on what is to be in it.
+
+def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
+    """Find out whether a file may be written, before minutes are spent on what is to be in it.
+
+    Args:
+        path: of the file.
+        known: what the doctor was started with.
+        presses: presses will be asked for.
+        weighs: a weight will be asked for.
 
     Raises:
-        SensorFileError: it cannot.
+        SensorFileError: it cannot be written, or holds what this visit cannot find.
     """
     try:
-        if path.is_dir():
-            raise IsADirectoryError(EISDIR, "it is a folder")
-        with TemporaryFile(dir=path.parent):
-            pass
+        in_place.check_writable(path)
     except OSError as error:
         why = error.strerror or error
         raise SensorFileError(f"{path}: cannot be written: {why}: give --out a file in a folder of yours") from error
+    before = _before(path)
+    at_best = {
+        name: replace(
+            entry,
+            counts_per_newton=entry.counts_per_newton if weighs else None,
+            assumed=entry.assumed if presses else entry.assumed | _AS_WIRED,
+            emulated=frozenset(),
+        )
+        for name, entry in before.sensors.items()
+    }
+    _refuse_loss(path, before, replace(before, sensors=at_best | dict(known.sensors)))
 
 
 def keep(
@@ -37,6 +52,8 @@ def keep(
     baselines: Mapping[str, Baseline],
     found: Mapping[str, Mounting],
     counts_per_newton: Mapping[str, float],
+    *,
+    emulated: bool = False,
 ) -> SensorFile:
     """Write what was known and what was found into a sensor file; returns what was written.
 
@@ -47,13 +64,16 @@ def keep(
         baselines: of the free pads as they were read, by sensor.
         found: what is to be corrected of the mounting, by sensor.
         counts_per_newton: of the sensors that were weighed.
+        emulated: all of it was found of emulated sensors.
 
     Raises:
-        SensorFileError: the file cannot be written.
+        SensorFileError: the file cannot be written, or holds what was not found this time.
     """
     entries = dict(known.sensors)
     for name in sorted({*baselines, *found, *counts_per_newton}):
-        entry = entries.get(name, SensorEntry())
+        entry = entries.get(name, SensorEntry(assumed=_AS_WIRED))
+        parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
+        renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
         turned = found.get(name, Mounting())
         baseline = baselines.get(name, entry.baseline)
         if baseline is not None and turned.moves_taxels:
@@ -61,12 +81,57 @@ def keep(
             baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
         per_newton = counts_per_newton.get(name, entry.counts_per_newton)
         pad = None if entry.pad is None else entry.pad.turned(turned)
-        entries[name] = SensorEntry(entry.mounting.then(turned), per_newton, baseline, pad)
+        entries[name] = SensorEntry(
+            entry.mounting.then(turned),
+            per_newton,
+            baseline,
+            pad,
+            assumed=entry.assumed - renewed,
+            emulated=entry.emulated | renewed if emulated else entry.emulated - renewed,
+        )
     # A sensor of a named source is one of several, each with an adapter of its own.
     serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
     written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
+    _refuse_loss(path, _before(path), written)
     save_sensor_file(path, written)
     return written
+
+
+def _before(path: Path) -> SensorFile:
+    """What the file holds; nothing where it is none, or one that edge-sr would refuse."""
+    try:
+        return load_sensor_file(path)
+    except SensorFileError:
+        return SensorFile()
+
+
+def _refuse_loss(path: Path, before: SensorFile, written: SensorFile) -> None:
+    lost = [
+        f"{part} of sensor {name}"
+        for name, entry in before.sensors.items()
+        for part in _lost(entry, written.sensors.get(name, SensorEntry(assumed=_AS_WIRED)))
+    ]
+    if before.adapter is not None and written.adapter is None:
+        lost.append("serial number of the adapter")
+    if lost:
+        raise SensorFileError(
+            f"{path}: left as it is, for it holds what would be lost: {', '.join(lost)}: give --sensor {path} as well, "
+            "to keep what is not found again, or another --out"
+        )
+
+
+def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
+    """What one entry holds and the other does not, or only of an emulated sensor."""
+
+    def lost(part: str, held: bool, holds: bool) -> bool:
+        return held and (not holds or part in written.emulated - entry.emulated)
+
+    return [
+        *["order and axes"] * lost("mounting", "mounting" not in entry.assumed, "mounting" not in written.assumed),
+        *["gains"] * (entry.mounting.gains != Mounting().gains == written.mounting.gains),
+        *["counts per newton"] * lost("force", entry.counts_per_newton is not None, bool(written.counts_per_newton)),
+        *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),
+    ]
 
 
 def _serial_number(port: str) -> str | None:

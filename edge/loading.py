@@ -1,0 +1,93 @@
+"""Load a model within a time limit, on a thread that can be left behind.
+
+While onnxruntime loads a graph, and while it runs it first, it cannot be interrupted, and Python handles no signal on
+the thread that asked for it. So that thread only waits, and gives up in time.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from edge.errors import ModelError
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+LOAD_LIMIT_S: Final = 60.0
+"""A thousand times what the bundled models take, and enough for a network fifty times as large on a busy machine."""
+STOP_S: Final = 1.0
+"""Time that a load may still take after a stop was asked for: any usual one is done by then."""
+_POLL_S: Final = 0.1
+_THREAD: Final = "edge: loading a model"
+_IDENTITY: Final = (
+    b"\x08\x08"  # IR version
+    b"\x3a\x37\x0a\x10\x0a\x01a\x12\x01b\x22\x08Identity\x12\x01g"  # a graph of one node, from a to b
+    b"\x5a\x0f\x0a\x01a\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01"
+    b"\x62\x0f\x0a\x01b\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01"
+    b"\x42\x02\x10\x0d"  # operator set
+)
+"""The smallest graph that onnxruntime loads. Source: onnx.proto, ModelProto and what it holds."""
+
+Made = TypeVar("Made")
+
+
+def within_limit(work: Callable[[], Made], path: Path, stop: threading.Event | None = None) -> Made:
+    """Do a part of loading a model on another thread, and return or raise what it returns or raises.
+
+    Work that is given up goes on until it ends or the program does; nothing can end it sooner. See `unfinished`.
+
+    Args:
+        work: what is to be done.
+        path: of the model, for the message.
+        stop: gives up early.
+
+    Raises:
+        ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
+    """
+    made: list[Made] = []
+    failed: list[BaseException] = []
+    done = threading.Event()
+
+    def run() -> None:
+        try:
+            made.append(work())
+        except BaseException as error:  # noqa: BLE001 - raised below, on the thread that waits
+            failed.append(error)
+        done.set()
+
+    threading.Thread(target=run, name=_THREAD, daemon=True).start()
+    until_s, asked_s = time.monotonic() + LOAD_LIMIT_S, None
+    while not done.wait(_POLL_S):
+        now_s = time.monotonic()
+        if asked_s is None and stop is not None and stop.is_set():
+            asked_s = now_s
+        if asked_s is not None and now_s > asked_s + STOP_S:
+            raise ModelError(f"{path}: stopped before it was loaded")
+        if now_s > until_s:
+            raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
+    if failed:
+        raise failed[0]
+    return made[0]
+
+
+def unfinished() -> bool:
+    """Whether a load that was given up still goes on: then a program must end by `os._exit`, or onnxruntime may crash.
+
+    It takes apart at exit what that thread is still using.
+    """
+    return any(thread.name == _THREAD for thread in threading.enumerate())
+
+
+@cache
+def flush_denormals(options_of: "Callable[[], onnxruntime.SessionOptions]") -> None:
+    """Build a session on this thread, so that onnxruntime makes denormals zero on it, which it does once in a process.
+
+    Args:
+        options_of: gives options that ask for it.
+    """
+    import onnxruntime  # here, so that the command line may ask for `unfinished` without it
+
+    onnxruntime.InferenceSession(_IDENTITY, options_of(), providers=["CPUExecutionProvider"])

@@ -1,0 +1,169 @@
+"""The doctor's sensor file: never less than it held, and marked where it was not found of a real sensor."""
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+from doctor_samples import healthy_counts
+from edge_samples import BASELINE, FakeLink
+from test_doctor_command import doctor, recording
+
+from edge import cli
+from edge.api import open_source
+from edge.commissioned import refuse_emulated
+from edge.doctor import keep
+from edge.doctor.keep import check_writable
+from edge.source import Source
+from firmware_bridge.baseline import Baseline
+from firmware_bridge.errors import SensorFileError
+from firmware_bridge.mounting import Mounting
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.slcan_emulator import Emulator
+
+GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
+WHOLE = SensorEntry(Mounting(swap_xy=True, gains=GAINS), 1180.0, BASELINE)
+NONE: dict = {}
+
+
+@pytest.fixture
+def good(tmp_path):
+    save_sensor_file(tmp_path / "good.toml", SensorFile(adapter="D30BL366", sensors={"4": WHOLE}))
+    return tmp_path / "good.toml"
+
+
+class TestLoss:
+    def test_a_visit_that_found_no_baseline_leaves_a_good_file(self, monkeypatch, good):
+        content = good.read_text()
+        with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
+            monkeypatch.setattr("edge.doctor.watch.SILENCE_S", 0.5)
+            asked = ["doctor", "--source", f"slcan:{emulator.port}", "--out", str(good), "--drift-s", "5"]
+            with monkeypatch.context() as streams:
+                err = io.StringIO()
+                streams.setattr(sys, "stderr", err)
+                code = cli.main([*asked, "--weight-g", "200"])
+        assert code == 2 and good.read_text() == content and load_sensor_file(good).sensors["4"].baseline is not None
+        assert "good.toml: left as it is, for it holds what would be lost: order and axes of sensor 4" in err.getvalue()
+
+    def test_nothing_found_and_nothing_known_writes_nothing(self, tmp_path):
+        with pytest.raises(SensorFileError, match=r"s\.toml: not written, for no sensor is known"):
+            keep.keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("held", "lost"),
+        [
+            (SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"})), "baseline of sensor 4"),
+            (SensorEntry(counts_per_newton=1180.0, assumed=frozenset({"mounting"})), "counts per newton of sensor 4"),
+            (SensorEntry(Mounting(swap_xy=True)), "order and axes of sensor 4"),
+            (SensorEntry(Mounting(gains=GAINS), assumed=frozenset({"mounting"})), "gains of sensor 4"),
+        ],
+    )
+    def test_each_part_is_named_and_kept_where_the_file_is_given_as_well(self, tmp_path, held, lost):
+        path = tmp_path / "s.toml"
+        save_sensor_file(path, SensorFile(sensors={"4": held}))
+        found = {"6": Baseline.of("6", BASELINE.counts, 1.79e9, 100, "start-up")}
+        with pytest.raises(SensorFileError, match=f"would be lost: {lost}: give --sensor .*s.toml as well"):
+            keep.keep(path, SensorFile(), None, found, NONE, NONE)
+        keep.keep(path, load_sensor_file(path), None, found, NONE, NONE)
+        assert load_sensor_file(path).sensors.keys() == {"4", "6"}
+        assert keep._lost(held, load_sensor_file(path).sensors["4"]) == []
+        assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
+
+    def test_the_adapters_number_is_a_part(self, tmp_path):
+        path = tmp_path / "s.toml"
+        save_sensor_file(path, SensorFile(adapter="D30BL366", sensors={"4": SensorEntry()}))
+        with pytest.raises(SensorFileError, match="would be lost: serial number of the adapter"):
+            keep.keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE)
+
+    def test_what_cannot_be_found_is_told_before_the_visit(self, good):
+        check_writable(good, SensorFile(adapter="D30BL366"), presses=True, weighs=True)
+        check_writable(good, load_sensor_file(good), presses=False, weighs=False)
+        with pytest.raises(SensorFileError, match="would be lost: counts per newton of sensor 4"):
+            check_writable(good, SensorFile(), presses=True, weighs=False)
+        with pytest.raises(SensorFileError, match="would be lost: order and axes of sensor 4"):
+            check_writable(good, SensorFile(), presses=False, weighs=True)
+
+    def test_what_was_found_of_a_device_is_not_replaced_by_what_is_emulated(self, tmp_path):
+        path = tmp_path / "s.toml"
+        save_sensor_file(
+            path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"}))})
+        )
+        with pytest.raises(SensorFileError, match="would be lost: baseline of sensor 4"):
+            keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE, emulated=True)
+        keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
+
+    def test_what_is_no_sensor_file_may_be_replaced(self, tmp_path):
+        path = tmp_path / "s.toml"
+        path.write_text("damaged")
+        keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
+        assert load_sensor_file(path).baselines and path.with_name("s.toml.bak").read_text() == "damaged"
+
+
+class TestMarks:
+    def test_an_emulated_visit_without_presses_says_both(self, monkeypatch, tmp_path):
+        with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
+            done = doctor(monkeypatch, emulator.port, "--json", "--no-press", "--out", tmp_path / "s.toml")
+        assert json.loads(done.out)["sensor_file"] is not None, done.out
+        entry = load_sensor_file(tmp_path / "s.toml").sensors["4"]
+        assert entry.assumed == {"mounting"} and entry.emulated == {"baseline"}
+        text = (tmp_path / "s.toml").read_text()
+        assert 'assumed = ["mounting"]  # as wired; nobody has looked' in text
+        assert 'emulated = ["baseline"]  # found of an emulated sensor: not for a device' in text
+
+    def test_a_later_visit_takes_back_what_it_finds(self, tmp_path):
+        path = tmp_path / "s.toml"
+        first = keep.keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE, emulated=True)
+        assert first.sensors["4"].emulated == {"mounting", "baseline"} and not first.sensors["4"].assumed
+        second = keep.keep(path, load_sensor_file(path), None, {"4": BASELINE}, NONE, NONE)
+        assert second.sensors["4"].emulated == {"mounting"}
+        third = keep.keep(path, load_sensor_file(path), None, NONE, {"4": Mounting()}, NONE)
+        assert not third.sensors["4"].emulated and load_sensor_file(path).sensors["4"].emulated == frozenset()
+
+    def test_marks_that_cannot_be_are_refused(self, tmp_path):
+        path = tmp_path / "s.toml"
+        path.write_text('format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.4]\nassumed = ["gains"]\n')
+        with pytest.raises(
+            SensorFileError, match=r"'sensors.4.assumed': .*, expected a list of mounting, force, baseline"
+        ):
+            load_sensor_file(path)
+
+
+EMULATED = SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, emulated=frozenset({"baseline"}))})
+
+
+class TestUse:
+    def test_a_device_refuses_it_unless_forced(self):
+        with (
+            pytest.raises(
+                SensorFileError, match=r"has baseline of an emulated sensor 4, and this is a device: .*--force"
+            ),
+            Source(FakeLink([], kind="device"), sensor_file=EMULATED),
+        ):
+            pass
+        with Source(FakeLink([], kind="device"), sensor_file=EMULATED, force=True):
+            pass
+        for kind in ("emulated", "replay"):
+            with Source(FakeLink([], kind=kind), sensor_file=EMULATED):
+                pass
+        refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
+
+    def test_every_command_that_reads_a_sensor_takes_the_force(self, tmp_path, monkeypatch):
+        save_sensor_file(tmp_path / "s.toml", EMULATED)
+        monkeypatch.setattr("edge.api.link_to", lambda *_, **__: FakeLink([], kind="device"))
+        with pytest.raises(SensorFileError), open_source(sensor=tmp_path / "s.toml"):
+            pass
+        with open_source(sensor=tmp_path / "s.toml", force=True):
+            pass
+
+    @pytest.mark.parametrize("command", [["doctor", "--drift-s", "0.1"], ["baseline", "--out", "zero.json"], []])
+    def test_on_the_command_line_it_is_2_and_one_line(self, tmp_path, monkeypatch, capsys, command):
+        monkeypatch.chdir(tmp_path)
+        save_sensor_file(tmp_path / "s.toml", EMULATED)
+        for module in ("edge.api", "edge.doctor.watch"):
+            monkeypatch.setattr(f"{module}.link_to", lambda *_, **__: FakeLink([], kind="device"))
+        code = cli.main([*command, "--sensor", "s.toml"])
+        lines = [line for line in capsys.readouterr().err.splitlines() if "emulated sensor 4" in line]
+        assert code == 2 and len(lines) == 1

@@ -1,0 +1,83 @@
+"""Files are whole or not there, and the one before is kept."""
+
+import json
+from pathlib import Path
+
+import pytest
+from edge_samples import BASELINE
+
+from firmware_bridge.baseline import load_baselines, save_baselines
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.in_place import check_writable, write_in_place
+
+
+def listing(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def written(path: Path, text: str, **settings) -> None:
+    write_in_place(path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), **settings)
+
+
+def test_a_new_file_has_its_name_and_nothing_lies_beside_it(tmp_path):
+    written(tmp_path / "a.json", "1")
+    assert (tmp_path / "a.json").read_text() == "1" and listing(tmp_path) == ["a.json"]
+
+
+def test_the_one_before_is_kept(tmp_path):
+    for text in "123":
+        written(tmp_path / "a.json", text)
+    assert (tmp_path / "a.json").read_text() == "3" and (tmp_path / "a.json.bak").read_text() == "2"
+    written(tmp_path / "a.json", "4", keep_before=False)
+    assert (tmp_path / "a.json.bak").read_text() == "2" and listing(tmp_path) == ["a.json", "a.json.bak"]
+
+
+def test_a_draft_has_the_name_of_the_file(tmp_path):
+    names = []
+    write_in_place(
+        tmp_path / "a.npz", lambda draft: (names.append(draft.name), draft.touch()), lambda draft: names.append(draft)
+    )
+    assert names[0] == "a.npz" == names[1].name and names[1].parent.parent == tmp_path
+
+
+def broken(draft: Path) -> None:
+    raise RecordingError("cannot be read back")
+
+
+def full(draft: Path) -> None:
+    draft.write_text("half")
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("write", "load", "error"),
+    [
+        (full, Path.read_text, OSError),
+        (Path.touch, broken, RecordingError),
+        (lambda draft: None, Path.read_text, OSError),
+    ],
+)
+def test_what_cannot_be_written_or_read_back_leaves_what_was_there(tmp_path, write, load, error):
+    written(tmp_path / "a.json", "good")
+    with pytest.raises(error):
+        write_in_place(tmp_path / "a.json", write, load)
+    assert (tmp_path / "a.json").read_text() == "good" and listing(tmp_path) == ["a.json"]
+
+
+def test_what_is_no_plain_file_is_not_replaced(tmp_path):
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "folder", Path("/dev/null"), tmp_path / "none" / "a.json"):
+        with pytest.raises(OSError, match=r"directory|plain file|No such file"):
+            check_writable(path)
+        with pytest.raises(OSError, match=r"directory|plain file|No such file"):
+            written(path, "1")
+    assert Path("/dev/null").is_char_device() and listing(tmp_path / "folder") == []
+
+
+def test_baselines_that_would_not_load_again_do_not_replace_those_that_do(tmp_path, monkeypatch):
+    path = tmp_path / "zero.json"
+    save_baselines(path, [BASELINE])
+    monkeypatch.setattr("firmware_bridge.baseline.MOST_FILE_BYTES", len(path.read_bytes()) + 10)
+    with pytest.raises(RecordingError, match="cannot be read: larger than"):
+        save_baselines(path, [BASELINE, type(BASELINE).of("6", BASELINE.counts, 1.7e9, 100, "file")])
+    assert list(load_baselines(path)) == ["4"] and len(json.loads(path.read_text())["baselines"]) == 1

@@ -1,0 +1,189 @@
+"""Limits of a model: its operators, its format, the time that it takes to load, and what becomes of one that fails."""
+
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from edge_samples import ROOT, ended, make_contract, write_model
+from onnx import helper, numpy_helper
+
+from edge import cli, session
+from edge.bundle import bundled_models
+from edge.errors import ModelError
+from edge.onnx_file import OPERATORS, check_plain
+from edge.session import ModelSession, load_session
+
+
+def of_nodes(*nodes: onnx.NodeProto, numbers: dict[str, np.ndarray] | None = None) -> onnx.ModelProto:
+    """A model of a batch of one from "window" to "pattern", with its contract."""
+    contract = make_contract(interval_factor=None, confidence={})
+    ends = [
+        helper.make_tensor_value_info("window", 1, list(contract.window_shape)),
+        helper.make_tensor_value_info("pattern", 1, [1, *contract.pattern_shape]),
+    ]
+    weights = [numpy_helper.from_array(array, name) for name, array in (numbers or {}).items()]
+    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    helper.set_model_props(model, contract.to_metadata())
+    return model
+
+
+def one_node(operator: str, domain: str = "") -> bytes:
+    return of_nodes(helper.make_node(operator, ["window"], ["pattern"], domain=domain)).SerializeToString()
+
+
+class TestOperators:
+    @pytest.mark.parametrize("operator", ["Loop", "If", "Scan", "LSTM", "RandomNormal", "SequenceMap", "Range", "relu"])
+    def test_one_that_is_not_listed_is_refused_before_onnxruntime_sees_it(self, tmp_path, monkeypatch, operator):
+        path = tmp_path / "m.onnx"
+        path.write_bytes(one_node(operator))
+        monkeypatch.setattr("onnxruntime.InferenceSession", lambda *_, **__: pytest.fail("it was asked"))
+        with pytest.raises(
+            ModelError, match=r"m\.onnx: has operator '.*', expected only those that docs/formats.md lists"
+        ):
+            ModelSession(path)
+
+    def test_of_a_node_with_two_operators_both_count(self):
+        two = onnx.NodeProto(op_type="Loop").SerializeToString() + onnx.NodeProto(op_type="Relu").SerializeToString()
+        node = b"\x0a" + bytes([len(two)]) + two
+        with pytest.raises(ModelError, match="operator 'Loop'"):
+            check_plain(b"\x3a" + bytes([len(node)]) + node)
+
+    @pytest.mark.parametrize("domain", ["com.microsoft", "ai.onnx.ml", "pkg.mine", "ai.onnx.preview.training"])
+    def test_one_of_another_domain_is_refused(self, domain):
+        check_plain(one_node("Relu", "ai.onnx"))
+        with pytest.raises(ModelError, match=f"domain '{domain}', expected ONNX's own alone"):
+            check_plain(one_node("Relu", domain))
+
+    def test_all_that_are_listed_are_in_the_docs_and_onnx_has_them(self):
+        page = (ROOT / "docs" / "formats.md").read_text()
+        listed = re.search(r"Allowed operators: (.*?)\.\n", page, re.DOTALL)
+        assert listed is not None and set(re.findall(r"\w+", listed[1])) == OPERATORS
+        assert all(onnx.defs.has(name) for name in OPERATORS)
+
+    def test_bundled_models_have_no_other(self):
+        used = {node.op_type for path in bundled_models() for node in onnx.load(path).graph.node}
+        assert used and used <= OPERATORS
+
+
+class TestFormat:
+    def test_onnxruntimes_own_format_is_not_loaded_though_the_check_were_passed(self, tmp_path, monkeypatch):
+        options = session.session_options()
+        options.optimized_model_filepath = str(tmp_path / "m.ort")
+        options.add_session_config_entry("session.save_model_format", "ORT")
+        onnxruntime.InferenceSession(write_model(tmp_path / "m.onnx"), options, providers=["CPUExecutionProvider"])
+        content = (tmp_path / "m.ort").read_bytes()
+        assert content[4:8] == b"ORTM"
+        monkeypatch.setattr(session, "read_model", lambda path: content)
+        with pytest.raises(ModelError, match="not a model that onnxruntime can load"):
+            load_session(tmp_path / "m.onnx")
+
+    def test_an_onnx_file_that_looks_like_it_is_loaded_as_the_onnx_file_that_was_checked(self, tmp_path):
+        path = write_model(tmp_path / "m.onnx")
+        model = onnx.load(path)
+        model.producer_name = "ORTM"
+        path.write_bytes(model.SerializeToString())
+        assert path.read_bytes()[4:8] == b"ORTM"
+        assert ModelSession(path).name == "m"
+
+
+HUGE = 1 << 60
+
+
+def failing_when_pressed() -> onnx.ModelProto:
+    """A model that gives zeros for a free pad, and asks for more memory than there is for any other."""
+    return of_nodes(
+        helper.make_node("ReduceMax", ["window"], ["most"], keepdims=0),
+        helper.make_node("Greater", ["most", "none"], ["pressed"]),
+        helper.make_node("Cast", ["pressed"], ["one"], to=onnx.TensorProto.INT64),
+        helper.make_node("Mul", ["one", "huge"], ["length"]),
+        helper.make_node("ConstantOfShape", ["length"], ["many"]),
+        helper.make_node("ReduceSum", ["many"], ["sum"], keepdims=0),
+        helper.make_node("Add", ["sum", "zeros"], ["pattern"]),
+        numbers={
+            "none": np.array(0.01, np.float32),
+            "huge": np.array([HUGE]),
+            "zeros": np.zeros((1, 40, 40), np.float32),
+        },
+    )
+
+
+class TestFailing:
+    def test_a_run_that_fails_is_a_model_error(self, tmp_path):
+        path = tmp_path / "m.onnx"
+        path.write_bytes(failing_when_pressed().SerializeToString())
+        model = ModelSession(path)
+        taps = model.contract.taps
+        assert not model.run(np.zeros((taps, 3, 4, 4), np.float32)).any()
+        with pytest.raises(ModelError, match=r"m\.onnx: cannot be run: .*ConstantOfShape") as raised:
+            model.run(np.ones((taps, 3, 4, 4), np.float32))
+        assert "\n" not in str(raised.value) and len(str(raised.value)) < 500
+
+    def test_edge_sr_ends_with_4_and_one_line(self, tmp_path, capsys):
+        path = tmp_path / "m.onnx"
+        path.write_bytes(failing_when_pressed().SerializeToString())
+        code = cli.main(["--source", "demo", "--model", str(path), "--sink", f"jsonl:{tmp_path / 'out.jsonl'}"])
+        lines = [line for line in capsys.readouterr().err.splitlines() if "cannot be run" in line]
+        assert code == 4 and len(lines) == 1 and lines[0].startswith(f"edge-sr: {path}: cannot be run: ")
+
+
+def hours_of_work() -> onnx.ModelProto:
+    """A model that onnxruntime works on for hours while it loads: products of constants, which it makes beforehand."""
+    chain = [helper.make_node("MatMul", [f"c{index}", "c0"], [f"c{index + 1}"]) for index in range(50_000)]
+    return of_nodes(
+        helper.make_node("ConstantOfShape", ["shape"], ["c0"]),
+        *chain,
+        helper.make_node("Slice", [f"c{len(chain)}", "start", "end"], ["part"]),
+        helper.make_node("Add", ["part", "zeros"], ["sum"]),
+        helper.make_node("ReduceMax", ["window"], ["most"], keepdims=0),
+        helper.make_node("Add", ["sum", "most"], ["pattern"]),
+        numbers={
+            "shape": np.array([1500, 1500]),
+            "start": np.array([0, 0]),
+            "end": np.array([40, 40]),
+            "zeros": np.zeros((1, 40, 40), np.float32),
+        },
+    )
+
+
+PROGRAM = """
+import sys
+from edge import cli, loading, session
+loading.LOAD_LIMIT_S = {limit_s}
+within_limit = session.within_limit
+def announced(*arguments):
+    print("loading", flush=True)
+    return within_limit(*arguments)
+session.within_limit = announced
+sys.exit(cli.main(["--source", "demo", "--model", sys.argv[1]]))
+"""
+
+
+class TestEndlessLoad:
+    def begin(self, tmp_path, limit_s: float) -> subprocess.Popen:
+        path = tmp_path / "slow.onnx"
+        path.write_bytes(hours_of_work().SerializeToString())
+        program = [sys.executable, "-c", PROGRAM.format(limit_s=limit_s), path]
+        return subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def test_it_ends_at_the_limit_with_4_and_one_line(self, tmp_path):
+        with ended(self.begin(tmp_path, limit_s=1.5)) as process:
+            _, err = process.communicate()
+        assert process.returncode == 4
+        assert err.splitlines() == [
+            f"edge-sr: {tmp_path / 'slow.onnx'}: not loaded within 1.5 s: export a smaller graph"
+        ]
+
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+    def test_it_hears_a_signal_meanwhile(self, tmp_path, number):
+        with ended(self.begin(tmp_path, limit_s=600)) as process:
+            assert process.stdout is not None and process.stdout.readline() == "loading\n"
+            process.send_signal(number)
+            _, err = process.communicate()
+        assert process.returncode == 4
+        assert err.splitlines() == [f"edge-sr: {tmp_path / 'slow.onnx'}: stopped before it was loaded"]
