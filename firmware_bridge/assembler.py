@@ -200,7 +200,8 @@ class _Sensor:
         else:  # by its own times our being late splits nothing
             gap_ns = device.own_ns - self._device.own_ns
         paused = gap_ns > wire.pause_ns
-        if wire.gaps_ns is not None:
+        # Our own being late would look like pauses; but while the order is to be learnt there is nothing else.
+        if wire.gaps_ns is not None and (device is not None or not wire.order):
             wire.follow_gap(gap_ns)
         closed: list[Scan] = []
         place = wire.places[taxel]
@@ -236,9 +237,12 @@ class _Sensor:
             self.confirmed = self.confirmed or bool(self.wire.order)
         elif known and not (half or by_pause):
             self.wire.doubt()
-            known = not self.confirmed
+            if self.confirmed:
+                self._counts["resynchronised"] += come
+                return []
         if not known or not self.wire.order:
-            self._counts["resynchronised"] += come
+            joined = bool(self.wire.order)
+            self._counts["resynchronised" if self.confirmed or joined else "unconfirmed"] += come
             return []
         self.confirmed, self._half_before = self.confirmed or (half and self._half_before), half
         if not self.confirmed:

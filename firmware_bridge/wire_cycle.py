@@ -89,8 +89,8 @@ class WireCycle:
         """Tell pauses by the gaps between readings, as long as the period is not known by cycles."""
         if self.gaps_ns is not None and 0 <= gap_ns <= LONGEST_PAUSE_NS:
             self.gaps_ns.append(gap_ns)
-            share = 2 if self.order else 8
-            self.pause_ns = min(max(sum(self.gaps_ns) // share, SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
+            cycle_ns = sum(self.gaps_ns) * self._length // len(self.gaps_ns)
+            self.pause_ns = min(max(cycle_ns // (2 if self.order else 8), SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
 
     def doubt(self) -> None:
         """Take a sign that the order is another."""
