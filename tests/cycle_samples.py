@@ -165,18 +165,15 @@ class Worth:
     """What the scans of a stream are worth.
 
     Attributes:
-        cycles: that were sent whole.
         scans: given.
         whole: of these, with sixteen new readings.
         mixed: of these, of more than one cycle.
         mixed_torn: of the others.
-        longest_without: cycles in a row, sent after the first scan, of which there is no whole scan.
         waits_ms: from the last frame of a cycle, as it was read, to its scan.
         counters: of the reader.
         numbers: of whole scans, by sensor, the cycle of each.
     """
 
-    cycles: int = 0
     scans: int = 0
     whole: int = 0
     mixed: int = 0

@@ -492,3 +492,21 @@ def test_python_can_reads_it(public_port):
         assert (message.arbitration_id, bytes(message.data), message.timestamp) == (0x114, b"\1\2", 5.0)
         bus.send(can.Message(arbitration_id=0x201, data=b"\7\0", is_extended_id=False))
         assert public_port.adapter.sent == [CanFrame(0x201, b"\7\0")]
+
+
+def test_a_short_packet_ends_a_transfer():
+    port, link = opened()
+    frames = frames_of(3)
+    with link:
+        fetched, cut = port.adapter.fetch, iter(range(48))
+
+        def fetch_cut_short(timeout_s):
+            data = fetched(timeout_s)
+            return data if data is None or next(cut) != 20 else data[:13]
+
+        port.adapter.fetch = fetch_cut_short
+        for number, frame in enumerate(frames):
+            port.adapter.hear(frame, stamp_us=10_000 * (number // 16) + 130 * (number % 16))
+        scans = read_scans(link, 3)
+        assert [int(scan.fresh.sum()) for scan in scans] == [16, 15, 16]
+        assert link.counters()["skipped_bytes"] == 13 and link.counters()["bus_off"] == 0
