@@ -1,29 +1,28 @@
 """Taxel readings to scans. No I/O, no clock.
 
-The wire has no end-of-scan marker. A scan closes when every taxel has come, or when a taxel comes
-again (then the scan is torn), or when too much time has passed for its readings to belong together.
+The wire has no end-of-scan marker. A scan closes when every taxel has come, or the last one of the sensor's cycle, or
+when what comes is of another cycle: after a pause, or where the order of the taxels has wrapped round (`wire_cycle`).
+Then it is torn. What cannot be put into a cycle is left out and counted (`resynchronised`): the rest of the cycle into
+which the link was opened, and fragments of fewer than half of the taxels that no pause set apart.
 
-What this cannot see: where a cycle of the controller begins. Who joins in mid-cycle, or loses the
-first frame of one, gets complete scans that each hold taxels of two neighbouring cycles, until the
-next torn scan puts the cut elsewhere; and where many frames are lost at once, one scan may join two
-cycles that lie further apart. And nothing closes while no reading comes: half a scan at the end of
-a stream is never given out.
+What this cannot see: of a sensor that is read in bursts without time stamps no pause is seen. There the order alone
+tells, and where sixteen frames were lost in a row, or a multiple, one scan may join two cycles. And nothing closes
+while no reading comes: half a scan at the end of a stream is never given out.
 """
 
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_bridge.device_clock import DeviceTime
 from firmware_bridge.geometry import SensorGeometry
 from firmware_bridge.scan import ABSENT, Scan, ScanSeries
-from firmware_bridge.xela import Cycle, Reading
+from firmware_bridge.wire_cycle import SHORTEST_PAUSE_NS, WireCycle
+from firmware_bridge.xela import Cycle, ModelMap, Reading
 
 LONGEST_SCAN_NS: Final = 1_000_000_000
 """The slowest sensor on record renews a taxel four times a second; older readings are another scan's."""
-LONGEST_PAUSE_NS: Final = 60_000_000
-"""Between two readings of one scan: that sensor's come 17 ms apart, and an FTDI chip keeps them for 16. After a longer
-one, as where the bus was off for a moment, what comes is of another press."""
 
 _COUNTED: Final[tuple[str, ...]] = (
     "scans",
@@ -34,20 +33,22 @@ _COUNTED: Final[tuple[str, ...]] = (
     "duplicates",
     "unconfirmed",
     "abandoned",
+    "resynchronised",
 )
 
 
 class ScanAssembler:
     """Sorts readings into the scans of their sensors.
 
-    A sensor exists from its first scan with at least half of the taxels on: one flipped bit in an
-    id must not invent a finger. (Half, because that is what the wrong model map shows.)
+    A sensor exists from its first whole scan on, or from its second in a row with half of the taxels or more: bits that
+    flip in ids must not invent a finger. (Half, because that is what the wrong model map shows.)
 
     Memory: one open scan per sensor name; a ModelMap has at most 16 names.
     """
 
-    def __init__(self, geometry: SensorGeometry) -> None:
-        self._geometry = geometry
+    def __init__(self, model: ModelMap) -> None:
+        self._model = model
+        self._geometry = model.geometry
         self._readings = 0
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
@@ -64,16 +65,19 @@ class ScanAssembler:
         self._newest_ns = time_ns
         sensor = self._sensors.get(reading.sensor)
         if sensor is None:
-            sensor = self._sensors[reading.sensor] = _Sensor(reading.sensor, self._geometry)
+            order = [taxel for _, taxel in self._model.wire_order(reading.sensor)]
+            sensor = self._sensors[reading.sensor] = _Sensor(reading.sensor, self._geometry, order)
         return sensor.feed(reading, time_ns, device)
 
-    def takes(self, cycle: Cycle) -> bool:
-        """Whether a cycle may be fed as one; otherwise it must be, reading by reading."""
+    def longest_cycle_ns(self, cycle: Cycle) -> int:
+        """From first reading to last, in [ns], a cycle may be fed as one; 0: not at all, but reading by reading."""
         sensor = self._sensors.get(cycle.sensor)
-        return sensor is not None and sensor.between_cycles(cycle.taxels[0])
+        if sensor is None or not sensor.awaits(cycle):
+            return 0
+        return sensor.wire.pause_ns if sensor.wire.gaps_ns is None else SHORTEST_PAUSE_NS
 
     def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None = None) -> Scan:
-        """The scan of a cycle that came as one, which `takes` has said may be.
+        """The scan of a cycle that came as one, which `longest_cycle_ns` has said may be.
 
         Args:
             cycle: its sensor, and the order of its taxels.
@@ -95,15 +99,19 @@ class ScanAssembler:
 
         A sensor that a flipped bit invented, or that fell silent in mid-scan, closes none.
         """
-        open_ones = (sensor for sensor in self._sensors.values() if sensor.closes_before_long(self._newest_ns))
+        sensors = self._sensors.values()
+        open_ones = [sensor for sensor in sensors if sensor.closes_before_long(self._newest_ns)]
+        # While the order of the only sensor is still to be learnt, too: its pauses are not to be slept through.
+        open_ones = open_ones or [sensor for sensor in sensors if not sensor.wire.order]
         return min((sensor.missing for sensor in open_ones), default=self._geometry.taxel_count)
 
     def counters(self) -> dict[str, int]:
         """Sums over all sensors.
 
-        readings; duplicates: the same frame twice in a row; unconfirmed: readings of sensors that
-        do not exist (yet); abandoned: readings of scans that a broken link left open; scans; torn_wire:
-        taxels missing; torn_source: complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
+        readings; duplicates: the same frame twice in a row; unconfirmed: readings of sensors that do not exist (yet);
+        abandoned: of scans that a broken link left open; resynchronised: left out, since where their cycle begins or
+        ends was not known; scans; torn_wire: taxels missing; torn_source: complete, but only partly renewed; repeated:
+        nothing renewed; missing_taxels.
         """
         totals = dict.fromkeys(_COUNTED, 0)
         for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and find a sensor
@@ -119,12 +127,18 @@ class ScanAssembler:
 class _Sensor:
     """The open scan of one sensor and its counters."""
 
-    def __init__(self, name: str, geometry: SensorGeometry) -> None:
+    def __init__(self, name: str, geometry: SensorGeometry, order: list[int]) -> None:
         self.confirmed = False
+        self.wire = WireCycle(order)
         self._geometry = geometry
         self._series = ScanSeries(name, geometry)
         self._last: Reading | None = None
+        self._last_cycle: tuple[Cycle, NDArray[np.int32]] | None = None
         self._taxels: dict[int, Reading] = {}
+        self._place = -1
+        self._last_place = geometry.taxel_count - 1
+        self._begins_known = False
+        self._half_before = False
         self._opened_ns = 0
         self._newest_ns = 0
         self._device: DeviceTime | None = None
@@ -135,8 +149,9 @@ class _Sensor:
 
     def begin_anew(self) -> None:
         self._counts["abandoned"] += len(self._taxels)
-        self._taxels = {}
-        self._last = None
+        self._taxels, self._place, self._begins_known = {}, -1, False
+        self._last = self._last_cycle = self._device = None
+        self.wire.begin_anew()
 
     def closes_before_long(self, now_ns: int) -> bool:
         """It exists, and the scan that may be open is not one that it left unfinished."""
@@ -144,59 +159,102 @@ class _Sensor:
 
     @property
     def missing(self) -> int:
-        """Readings until the open scan is whole."""
-        return self._geometry.taxel_count - len(self._taxels)
+        """Readings until the open scan closes; one where that is not known, so that no pause is slept through."""
+        return self._last_place - self._place if self.wire.order else 1
 
-    def between_cycles(self, next_taxel: int) -> bool:
-        """No scan is open, and this taxel was not the last one, so that it cannot be a duplicate."""
-        return not self._taxels and (self._last is None or self._last.taxel != next_taxel)
+    def awaits(self, cycle: Cycle) -> bool:
+        """No scan is open, and the taxels of this one come in the sensor's order."""
+        if self._taxels:
+            return False
+        if cycle is not self.wire.awaited:
+            if cycle.taxels != self.wire.order:
+                return False
+            self.wire.awaited = cycle
+        return True
 
     def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None) -> Scan:
         counts = cycle.counts(packed)
-        last = cycle.taxels[-1]
-        self._last = Reading(cycle.sensor, last, *counts[:, last].tolist())
-        self.confirmed = True
+        self._last_cycle = cycle, counts
+        self.confirmed = self._begins_known = True
+        self.wire.doubts = 0
+        self._newest_ns, self._device = time_ns, device
         counts = counts.reshape(self._geometry.scan_shape)
-        return self._count(
-            self._series.close_whole(counts, time_ns, None if device is None else device.host_ns), missing=0
-        )
+        if device is None:
+            self.wire.count(time_ns)
+            return self._count(self._series.close_whole(counts, time_ns), missing=0)
+        self.wire.count(device.own_ns)
+        return self._count(self._series.close_whole(counts, time_ns, device.host_ns), missing=0)
 
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
-        # Twice the same frame in a row is the link's doing. Closing on it would move the cut
-        # between scans for ever, and skipping it loses nothing.
+        if self._last_cycle is not None:
+            self._recall(*self._last_cycle)
+        # Twice the same frame in a row is the link's doing. Closing on it would tear a scan, and skipping it loses
+        # nothing.
         if reading == self._last:
             self._counts["duplicates"] += 1
             return []
         self._last = reading
+        wire, taxel = self.wire, reading.taxel
+        if device is None or self._device is None:
+            gap_ns = time_ns - self._newest_ns
+        else:  # by its own times our being late splits nothing
+            gap_ns = device.own_ns - self._device.own_ns
+        paused = gap_ns > wire.pause_ns
+        # Our own being late would look like pauses; but while the order is to be learnt there is nothing else.
+        if wire.gaps_ns is not None and (device is not None or not wire.order):
+            wire.follow_gap(gap_ns)
         closed: list[Scan] = []
-        if self._taxels and (reading.taxel in self._taxels or self._is_over(time_ns, device)):
-            closed += self._close()
+        place = wire.places[taxel]
+        if (paused or place != self._place + 1) and self._taxels:
+            came, stamped = taxel in self._taxels, device is not None
+            if not wire.goes_on(self._place, place, came=came, paused=paused, stamped=stamped):
+                closed = self._close(by_pause=paused)
+                place = wire.places[taxel]
         if not self._taxels:
             self._opened_ns = time_ns
-        self._taxels[reading.taxel] = reading
+            # At the first place of the order, behind another cycle's last, or, while there is no order, behind a pause.
+            self._begins_known = self._begins_known or place == 0 if wire.order else paused
+        self._taxels[taxel] = reading
+        if place > self._place:
+            self._place = place
         self._newest_ns, self._device = time_ns, device
-        if len(self._taxels) == self._geometry.taxel_count:
-            closed += self._close()
+        if place == self._last_place or len(self._taxels) > self._last_place:
+            closed += self._close(by_pause=False)
         return closed
 
-    def _is_over(self, time_ns: int, device: DeviceTime | None) -> bool:
-        """What comes now cannot be of the open scan. Where the device tells times, our own being late splits none."""
-        if device is not None and self._device is not None:
-            return device.own_ns - self._device.own_ns > LONGEST_PAUSE_NS
-        return time_ns - self._newest_ns > LONGEST_PAUSE_NS
+    def _recall(self, cycle: Cycle, counts: NDArray[np.int32]) -> None:
+        """Make a reading of the last one of a cycle that was fed as one."""
+        last = cycle.taxels[-1]
+        self._last, self._last_cycle = Reading(cycle.sensor, last, *counts.reshape(3, -1)[:, last].tolist()), None
 
-    def _close(self) -> list[Scan]:
-        taxels, self._taxels = self._taxels, {}
-        missing = self._geometry.taxel_count - len(taxels)
-        self.confirmed = self.confirmed or len(taxels) >= missing
-        if not self.confirmed:
-            self._counts["unconfirmed"] += len(taxels)
+    def _close(self, *, by_pause: bool) -> list[Scan]:
+        taxels, self._taxels, self._place = self._taxels, {}, -1
+        known, self._begins_known = self._begins_known, True
+        count, come = self._geometry.taxel_count, len(taxels)
+        half = 2 * come >= count
+        if come == count and known:
+            self.wire.close_whole(tuple(taxels))
+            self.confirmed = self.confirmed or bool(self.wire.order)
+        elif known and not (half or by_pause):
+            self.wire.doubt()
+            if self.confirmed:
+                self._counts["resynchronised"] += come
+                return []
+        if not known or not self.wire.order:
+            joined = bool(self.wire.order)
+            self._counts["resynchronised" if self.confirmed or joined else "unconfirmed"] += come
             return []
-        axes_last = np.full((self._geometry.taxel_count, 3), ABSENT, dtype=np.int32)
+        self.confirmed, self._half_before = self.confirmed or (half and self._half_before), half
+        if not self.confirmed:
+            self._counts["unconfirmed"] += come
+            return []
+        if half:
+            self.wire.count(self._newest_ns if self._device is None else self._device.own_ns)
+        axes_last = np.full((count, 3), ABSENT, dtype=np.int32)
         axes_last[list(taxels)] = np.array([(reading.x, reading.y, reading.z) for reading in taxels.values()])
         counts = np.ascontiguousarray(axes_last.T).reshape(self._geometry.scan_shape)
         device_ns = None if self._device is None else self._device.host_ns
-        return [self._count(self._series.close(counts, self._newest_ns, device_ns), missing)]
+        return [self._count(self._series.close(counts, self._newest_ns, device_ns), missing=count - come)]
 
     def _count(self, scan: Scan, missing: int) -> Scan:
         self._counts["scans"] += 1

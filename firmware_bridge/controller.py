@@ -4,6 +4,7 @@ import heapq
 import math
 import random
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -81,11 +82,20 @@ def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate
 
 
 def bus_timeline(
-    controllers: Sequence[Controller], *, jitter_s: float, seed: int, loop: bool, frame_s: float = FRAME_S
+    controllers: Sequence[Controller],
+    *,
+    jitter_s: float,
+    seed: int,
+    loop: bool,
+    frame_s: float = FRAME_S,
+    first_frame: int = 0,
 ) -> Iterator[tuple[float, CanFrame]]:
-    """All frames on the bus in their order, `frame_s` [s] long each, with their time in [s] from the first scan."""
+    """All frames on the bus in their order, `frame_s` [s] long each, with their time in [s] from the first scan.
+
+    `first_frame` of them were over before anybody listened, so that who joins need not do so where a cycle begins.
+    """
     lanes = [_lane(controller, jitter_s, seed, loop, frame_s) for controller in controllers]
-    return heapq.merge(*lanes, key=lambda timed: timed[0])
+    return islice(heapq.merge(*lanes, key=lambda timed: timed[0]), first_frame, None)
 
 
 def _lane(

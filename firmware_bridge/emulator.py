@@ -44,6 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jitter-ms", type=float, default=1.0, help="of scans, up to so much (default: 1)")
     parser.add_argument("--latency-ms", type=float, default=1.0, help="of the adapter (default: 1)")
     parser.add_argument("--frame-us", type=float, default=1e6 * FRAME_S, help="of the bus, a frame (default: 130)")
+    parser.add_argument("--first-frame", type=int, default=0, metavar="N", help="of the bus when the channel is opened")
     parser.add_argument("--seed", type=int, default=0, help="of jitter and unused bytes (default: 0)")
     parser.add_argument("--stamps", metavar="FILE", help="of each scan controller and time of its last frame, ns")
     parser.add_argument("--link", type=Path, metavar="PATH", help="keep a link to the terminal, whatever its name")
@@ -83,6 +84,7 @@ def _serve(options: argparse.Namespace) -> None:
             jitter_s=options.jitter_ms / 1000,
             latency_s=options.latency_ms / 1000,
             frame_s=options.frame_us / 1e6,
+            first_frame=options.first_frame,
             ignores_line_speed=options.ignore_line_speed,
             seed=options.seed,
             on_scan=lambda controller, time_ns: stamps.write(f"{controller} {time_ns}\n") if stamps else None,

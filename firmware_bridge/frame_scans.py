@@ -12,7 +12,7 @@ class FrameScans:
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         self._model = model
-        self._assembler = ScanAssembler(model.geometry)
+        self._assembler = ScanAssembler(model)
         self._foreign = 0
 
     def feed(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:

@@ -5,9 +5,9 @@ The adapter sends host frames, little-endian, usually one in a USB transfer:
     u32 echo_id | u32 can_id | u8 dlc | u8 channel | u8 flags | u8 reserved | 8 bytes of data [| u32 time stamp in us]
 
 echo_id is all ones where the frame came from the bus, else the number of one that we sent and that went out. can_id
-holds three flags (extended, remote, error). Nothing marks where a frame begins and nothing proves that it is whole, so
-a header is believed only if every field is one that an adapter could send; where it is not, bytes are skipped until it
-is. The limit: if the end of a frame is lost, what follows fills it up to a frame that was never sent.
+holds three flags (extended, remote, error). A transfer begins with a frame, and a packet that is not full ends it: what
+is not whole by then never will be. Within a transfer nothing marks where a frame begins, so a header is believed only if
+every field is one that an adapter could send; where it is not, bytes are skipped until it is.
 
 Source: Linux drivers/net/can/usb/gs_usb.c; candleLight_fw include/gs_usb.h.
 """
@@ -179,8 +179,14 @@ class GsUsbDecoder:
         self._channels = channels
         self._frame_bytes = FRAME_BYTES + STAMP_BYTES * stamped
         self._pending = b""
+        self._in_step = True
         self._counts = dict.fromkeys(("frames", "error_frames", "echoes", "other_channels", "fd_frames"), 0)
         self._skipped_bytes = 0
+
+    def end_transfer(self) -> None:
+        """Give up a frame that is not whole: the next transfer begins with another."""
+        self._skipped_bytes += len(self._pending)
+        self._pending, self._in_step = b"", True
 
     def feed(self, data: bytes) -> list[HostFrame]:
         """Frames from channel 0 whose last byte lies in `data`; echoes and what we cannot want are left out."""
@@ -190,13 +196,17 @@ class GsUsbDecoder:
         taken: list[HostFrame] = []
         while end - position >= HEADER_BYTES:
             echo_id, raw_id, dlc, channel, flags, _ = _header.unpack_from(buffer, position)
-            if not self._plausible(echo_id, raw_id, dlc, channel, flags):
+            # Where a frame must begin, one of a channel that was not announced is one as well.
+            known = channel < self._channels or self._in_step
+            if not known or not self._plausible(echo_id, raw_id, dlc, flags):
                 self._skipped_bytes += 1
+                self._in_step = False
                 position += 1
                 continue
             size = self._frame_bytes + (_FD_MORE_BYTES if flags & FD_FLAG else 0)
             if end - position < size:
                 break
+            self._in_step = True
             if echo_id != RECEIVED:
                 self._counts["echoes"] += 1
             elif channel != 0:
@@ -213,12 +223,11 @@ class GsUsbDecoder:
         """Frames, those of each sort that is not given, and bytes that belong to none."""
         return self._counts | {"skipped_bytes": self._skipped_bytes}
 
-    def _plausible(self, echo_id: int, raw_id: int, dlc: int, channel: int, flags: int) -> bool:
+    def _plausible(self, echo_id: int, raw_id: int, dlc: int, flags: int) -> bool:
         return (
             (echo_id == RECEIVED or echo_id < ECHO_IDS)
             and (raw_id & (EXTENDED | ERROR) != 0 or raw_id & _HIGHEST_EXTENDED <= _HIGHEST_STANDARD)
             and dlc <= 15
-            and channel < self._channels
             and flags <= _FLAGS
         )
 

@@ -48,6 +48,10 @@ class GsUsbScans:
             scans += self._scans.feed(host_frame.frame, time_ns, device)
         return scans
 
+    def end_transfer(self) -> None:
+        """Give up a frame that is not whole: the next transfer begins with another."""
+        self._decoder.end_transfer()
+
     def trouble(self, time_ns: int) -> str | None:
         """What the adapter reports at `time_ns` [ns] of monotonic time that the user must know of."""
         return self._errors.trouble(time_ns)

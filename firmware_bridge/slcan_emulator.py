@@ -48,6 +48,7 @@ class Emulator:
         jitter_s: float = 0.001,
         latency_s: float = 0.001,
         frame_s: float = FRAME_S,
+        first_frame: int = 0,
         ignores_line_speed: bool = False,
         seed: int = 0,
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
@@ -67,6 +68,7 @@ class Emulator:
             jitter_s: a scan comes up to so much early or late, in [s].
             latency_s: the adapter hands on what it has once in this time, in [s].
             frame_s: what a frame takes on the bus, in [s]; a real one carries no more than 480 scans a second.
+            first_frame: frames that are over when the channel is first opened; by default it is where a cycle begins.
             ignores_line_speed: as USB-CDC adapters do.
             seed: of jitter and unused bytes.
             on_scan: told the controller and the monotonic time in [ns] when the last frame of a scan is handed on.
@@ -80,12 +82,16 @@ class Emulator:
         for name, value in (("jitter_s", jitter_s), ("latency_s", latency_s), ("frame_s", frame_s)):
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} is {value}, expected 0 or more")
+        if first_frame < 0:
+            raise ValueError(f"first_frame is {first_frame}, expected 0 or more")
         bus = controllers_of(recordings, controllers, rate_hz)
         self.port = ""
         self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
         self.sent_frames = 0
         self.lost_frames = 0
-        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s)
+        self._timeline = bus_timeline(
+            bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, first_frame=first_frame
+        )
         self._latency_s = latency_s
         self._on_scan = on_scan
         self._last_frames = {USPA44_MAP.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from firmware_bridge.assembler import LONGEST_PAUSE_NS, ScanAssembler
+from firmware_bridge.assembler import ScanAssembler
 from firmware_bridge.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, CanFrame, SlcanDecoder
@@ -10,7 +10,7 @@ from firmware_bridge.slcan_status import AdapterStatus
 from firmware_bridge.xela import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
 
 _MOST_ORDERS: Final = 1024
-_LONGEST_PAUSE_MS: Final = LONGEST_PAUSE_NS // 1_000_000
+_MS_NS: Final = 1_000_000
 
 
 class SlcanScans:
@@ -23,7 +23,7 @@ class SlcanScans:
         self._device = DeviceTime(0, 0)
         self._cycles: dict[bytes, Cycle | None] = {}
         self._decoder = SlcanDecoder()
-        self._assembler = ScanAssembler(model.geometry)
+        self._assembler = ScanAssembler(model)
         self._foreign = 0
 
     @property
@@ -100,13 +100,14 @@ class SlcanScans:
             self._cycles[can_ids] = self._model.cycle([h << 4 | b >> 4 for h, b in zip(high, low, strict=True)])
         cycle = self._cycles[can_ids]
         # Before its last stamp is looked at: a clock that is told of the first ones after it seems to be set back.
-        if cycle is None or not self._assembler.takes(cycle):
+        longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle)
+        if cycle is None or not longest_ns:
             return None
         if frame_bytes == PACKED_BYTES:
             return self._assembler.feed_cycle(cycle, packed, time_ns)
         last_ms = _stamp_ms(packed, len(packed))
         # Read late and in one piece, half a cycle from before a pause and half from behind look like a whole one.
-        if (last_ms - _stamp_ms(packed, frame_bytes)) % (LAST_TIMESTAMP_MS + 1) > _LONGEST_PAUSE_MS:
+        if (last_ms - _stamp_ms(packed, frame_bytes)) % (LAST_TIMESTAMP_MS + 1) * _MS_NS > longest_ns:
             return None
         return self._assembler.feed_cycle(cycle, packed, time_ns, self._device_time(last_ms, time_ns))
 

@@ -194,7 +194,6 @@ def test_what_is_left_out_is_counted():
         {"echo_id": 0xFFFFFFFE},
         {"more_id": 0x800},
         {"dlc": 16},
-        {"channel": 1},
         {"flags": 0x10},
     ],
 )
@@ -212,6 +211,33 @@ def test_frames_are_found_again_behind_a_wreck(lost):
     decoder = GsUsbDecoder(stamped=True)
     stream = b"".join(host_frame(frame, stamp_us=0x01020304) + bytes(8) for frame in SCAN)
     assert [one.frame for one in decoder.feed(stream[lost:])] == SCAN[1:]
+
+
+@pytest.mark.parametrize("kept_bytes", range(1, 24))
+def test_a_transfer_that_was_cut_short_takes_nothing_from_the_next(kept_bytes):
+    """What is missing of its frame was filled with the next once: readings, and a bus-off, that nobody sent."""
+    scans = GsUsbScans()
+    scans.start(stamped=True, channels=1)
+    got = []
+    for number in range(3):
+        for place, frame in enumerate(SCAN):
+            data = host_frame(frame, stamp_us=10_000 * number + 130 * place)
+            got += scans.feed(data[:kept_bytes] if (number, place) == (1, 5) else data, 1_000_000 * number)
+            scans.end_transfer()
+    assert [int(scan.fresh.sum()) for scan in got] == [16, 15, 16]
+    counted = scans.counters()
+    assert (counted["skipped_bytes"], counted["frames"], counted["bus_off"]) == (kept_bytes, 47, 0)
+
+
+def test_frames_of_a_channel_that_was_not_announced_swallow_no_other():
+    decoder = GsUsbDecoder(stamped=True)
+    taken = []
+    for frame in SCAN:
+        for channel in (3, 0):
+            taken += decoder.feed(host_frame(frame, stamp_us=1, channel=channel))
+            decoder.end_transfer()
+    assert [one.frame for one in taken] == SCAN
+    assert decoder.counters()["other_channels"] == 16 and decoder.counters()["skipped_bytes"] == 0
 
 
 # Errors, as Linux's error.h has them.

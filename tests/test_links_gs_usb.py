@@ -37,12 +37,12 @@ def opened(port=None, **settings):
 
 def feed_slowly(adapter, frames):
     """A bus that waits while the adapter's queue is nearly full, so that nothing is lost on a slow machine."""
-    for frame in frames:
+    for number, frame in enumerate(frames):
         while adapter.waiting_frames > QUEUE_FRAMES // 2:
             if not adapter.plugged:
                 return
             threading.Event().wait(0.0005)
-        adapter.hear(frame)
+        adapter.hear(frame, stamp_us=130 * number)  # of a bus that has no pauses, whatever this machine does
 
 
 def test_the_same_scans_as_over_slcan():
@@ -52,7 +52,7 @@ def test_the_same_scans_as_over_slcan():
     expected = SlcanScans().feed(b"".join(map(encode_frame, frames)), 0)
     port, link = opened()
     with link:
-        bus = threading.Thread(target=feed_slowly, args=(port.adapter, frames))
+        bus = threading.Thread(target=feed_slowly, args=(port.adapter, frames), daemon=True)
         bus.start()
         scans = read_scans(link, len(expected))
         bus.join()
@@ -72,7 +72,7 @@ def test_thousands_of_frames_come_without_loss():
     port, link = opened()
     frames = frames_of(400)
     with link:
-        bus = threading.Thread(target=feed_slowly, args=(port.adapter, frames))
+        bus = threading.Thread(target=feed_slowly, args=(port.adapter, frames), daemon=True)
         bus.start()
         scans = read_scans(link, 400)
         bus.join()
@@ -83,9 +83,9 @@ def test_thousands_of_frames_come_without_loss():
 def test_a_scan_comes_with_its_last_frame(packet_bytes):
     port, link = opened(GsUsbPort(packet_bytes=packet_bytes))
     with link:
-        port.adapter.hear(*frames_of(1)[:15])
+        port.adapter.hear(*frames_of(1)[:15], stamp_us=1000)
         assert link.read(0.0) == [] == link.read(0.01)
-        port.adapter.hear(frames_of(1)[15])
+        port.adapter.hear(frames_of(1)[15], stamp_us=2000)
         (scan,) = link.read(10.0)
         assert scan.complete
 
@@ -300,14 +300,15 @@ def test_it_comes_back_by_itself():
 
 def test_half_a_scan_is_forgotten_with_the_link():
     port, link = opened()
-    frames = frames_of(2)
+    frames = frames_of(3)
     with link:
         port.adapter.hear(*frames[:8])
         assert [link.read(0.0) for _ in range(8)] == [[]] * 8
     with link:
-        port.adapter.hear(*frames[24:], *frames[16:24])
+        port.adapter.hear(*frames[24:])
         (scan,) = link.read(10.0)
-        assert (scan.counts == make_counts(2)[1]).all()
+        assert (scan.counts == make_counts(3)[2]).all()
+        assert link.counters()["abandoned"] == link.counters()["resynchronised"] == 8
 
 
 def test_triggers_wake_older_controllers():
@@ -491,3 +492,21 @@ def test_python_can_reads_it(public_port):
         assert (message.arbitration_id, bytes(message.data), message.timestamp) == (0x114, b"\1\2", 5.0)
         bus.send(can.Message(arbitration_id=0x201, data=b"\7\0", is_extended_id=False))
         assert public_port.adapter.sent == [CanFrame(0x201, b"\7\0")]
+
+
+def test_a_short_packet_ends_a_transfer():
+    port, link = opened()
+    frames = frames_of(3)
+    with link:
+        fetched, cut = port.adapter.fetch, iter(range(48))
+
+        def fetch_cut_short(timeout_s):
+            data = fetched(timeout_s)
+            return data if data is None or next(cut) != 20 else data[:13]
+
+        port.adapter.fetch = fetch_cut_short
+        for number, frame in enumerate(frames):
+            port.adapter.hear(frame, stamp_us=10_000 * (number // 16) + 130 * (number % 16))
+        scans = read_scans(link, 3)
+        assert [int(scan.fresh.sum()) for scan in scans] == [16, 15, 16]
+        assert link.counters()["skipped_bytes"] == 13 and link.counters()["bus_off"] == 0

@@ -21,7 +21,7 @@ from edge.taxels import (
     STUCK_SCANS,
     TaxelWatch,
 )
-from firmware_bridge.assembler import LONGEST_PAUSE_NS
+from firmware_bridge.wire_cycle import LONGEST_PAUSE_NS
 from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording

@@ -48,7 +48,8 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     counted = {**found.last_counters, **counted_at_the_end(said)}
     left_out = counted.get("unwritten", 0)
     readings = truth["frames"] - truth["foreign"]
-    explained = counted["duplicates"] + counted["unconfirmed"] + counted.get("abandoned", 0)
+    explained = counted["duplicates"] + counted["unconfirmed"]
+    explained += counted.get("abandoned", 0) + counted.get("resynchronised", 0)
     return [
         Account("frames", truth["frames"], counted["frames"]),
         Account("foreign frames", truth["foreign"], counted["foreign"]),

@@ -116,6 +116,8 @@ class GsUsbLink(Link):
             data = self._fetch(self._device, max(1, math.ceil(left_ns / 1e6)))
             now_ns = self._clock_ns()
             scans = self._scans.feed(data, now_ns)
+            if data and len(data) < len(self._packet):
+                self._scans.end_transfer()
             self.trouble = self._scans.trouble(now_ns)
             left_ns = end_ns - now_ns
             if scans or left_ns <= 0:
