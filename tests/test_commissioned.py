@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeModel, make_scan, write_model
+from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
 from test_cli import assert_refused, records, run, write_recording
 
-from edge.api import Stream, open_runtime, open_source
+from edge.api import Stream, open_recording, open_runtime, open_source
 from edge.commissioned import references, settled
+from edge.doctor.keep import keep
 from edge.doctor.options import doctor_parser
 from edge.errors import UsageError
 from edge.runtime import Runtime
@@ -18,7 +19,8 @@ from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.links.ports import Port
 from firmware_bridge.links.source import open_sources
 from firmware_bridge.mounting import AS_MAPPED, Mounting
-from firmware_bridge.sensor_file import SensorEntry, SensorFile
+from firmware_bridge.pad import Pad
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.xela import USPA44_MAP
 
@@ -59,6 +61,31 @@ def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, mon
     result = first(pressed, file)
     assert result.baseline.id == BASELINE.id and result.zeroed[2].min() == pytest.approx(-1800, abs=5)
     assert result.force_n == pytest.approx(result.force_counts / 1180)
+
+
+PAD = Pad(thickness_mm=5.0, gains=tuple(np.linspace(0.5, 2, 48).tolist()))
+
+
+def test_a_pad_goes_from_the_file_into_every_runtime(pressed, tmp_path):
+    path = tmp_path / "pad.toml"
+    save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, pad=PAD)}))
+    recording = pressed.removeprefix("replay:")
+    for opened in (lambda: open_source(pressed, sensor=path), lambda: open_recording(recording, sensor=path)):
+        for settings, expected in (
+            ({}, PAD),
+            ({"pad": Pad(thickness_mm=4.0)}, Pad(thickness_mm=4.0)),
+            ({"pad": {}}, None),
+        ):
+            model = FakeModel(make_pad_contract())
+            with opened() as source:
+                assert next(iter(Stream(source, open_runtime(model, source, **settings)))).state == "contact"
+            np.testing.assert_array_equal(model.pads[0], model.contract.pad_row(expected))
+
+
+def test_the_doctor_keeps_the_pad_in_the_places_that_it_found(tmp_path):
+    keep(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(pad=PAD)}), None, {}, {"4": TURNED}, {})
+    kept = load_sensor_file(tmp_path / "s.toml").sensors["4"]
+    assert kept.mounting == TURNED and kept.pad == PAD.turned(TURNED) != PAD
 
 
 def test_a_baseline_of_another_order_is_refused(file, pressed, tmp_path):

@@ -243,8 +243,10 @@ class TestRuntime:
         contract = make_pad_contract(batch=ANY_BATCH, interval_factor=1.6)
         path = write_model(tmp_path / "pad.onnx", contract)
         pads = {"4": PAD, "6": OTHER}
+        runtime = self.runtime(ModelSession(path), pad=pads)
         scans = [make_scan(0, sensor=name, press_counts=press, noise=9) for name, press in (("4", 20_000), ("6", 9000))]
-        together = self.runtime(ModelSession(path), pad=pads).push_together([(scan, True) for scan in scans])
+        together = runtime.push_together([(scan, True) for scan in scans])
+        runtime.push_together([(make_scan(1, sensor=name, press_counts=5000), True) for name in ("4", "6")])
         for scan, result in zip(scans, together, strict=True):
             alone = self.runtime(ModelSession(path), pad=pads).push(scan)
             for name in ("pattern", "deviation", "traction"):

@@ -11,14 +11,16 @@ import struct
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from queue import Empty, Queue
 
 import numpy as np
 import pytest
-from edge_samples import ROOT
-from view_samples import wait_for
+from edge_samples import ROOT, make_pad_contract
+from view_samples import Press, live_page, wait_for
 from websockets.sync.client import connect
 
 from edge import view as edge_view
@@ -27,6 +29,7 @@ from edge.draw import colours
 from edge.packed import unpack
 from edge.progress import Progress
 from edge.view.server import MOST_VIEWERS
+from edge.wrench import Wrench
 from firmware_bridge.baseline import BaselineEstimator, save_baselines
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
@@ -648,6 +651,44 @@ def test_two_sensors_a_dead_taxel_and_a_cable_that_is_out(demo, folder, open_pag
             word(page, "no scan for", sensor)
             playwright.expect(part(page, "field", sensor)).to_have_attribute("data-live", "no")
         logged(page, "link lost")
+
+
+# Alpha of what is drawn over a pattern, at a share of its width and height.
+OVER = """(canvas, [x, y]) =>
+  canvas.getContext("2d").getImageData(Math.round(x * canvas.width), Math.round(y * canvas.height), 1, 1).data[3]"""
+
+
+def test_force_and_torque_are_told_and_drawn_where_the_model_gives_them(open_page, tmp_path):
+    contract = make_pad_contract(interval_factor=1.6)
+    wrench = Wrench((0.3, 0.0, 0.4), (-0.94, 0.94, -1.25), (-2.35, -2.35))
+    with live_page(tmp_path, contract=contract) as shown:
+        made, numbers = replace(Press(contract=contract).next(), wrench=wrench), count(1)
+
+        def again():
+            """The same contact; pressed for so long by one taxel alone, a sensor would not believe it."""
+            number = next(numbers)
+            return replace(made, scan=replace(made.scan, number=number, time_ns=number * PERIOD_NS))
+
+        shown.press.next = again
+        with shown.playing():
+            page = open_page(shown.view.url)
+            live(page)
+            for name, text in {
+                "wrench_force": r"0\.30, 0\.00, 0\.40\sN",
+                "wrench_torque": r"\u22120\.9, 0\.9\sN\smm",
+                "wrench_twist": r"\u22121\.[23]\sN\smm",
+                "centre_of_pressure_mm": r"\u22122\.[34], \u22122\.[34]\smm",
+                "wrench_origin": "nominal",
+            }.items():
+                playwright.expect(number(page, name)).to_have_text(re.compile(f"^{text}$"))
+            centre = 0.5 - 2.35 / 18.8
+            over = part(page, "over")
+            assert over.evaluate(OVER, [centre + 0.1, centre]), "the arrow of the shear, .24 of the width to the right"
+            assert not over.evaluate(OVER, [centre - 0.1, centre]) and not over.evaluate(OVER, [centre + 0.3, centre])
+    with live_page(tmp_path) as shown, shown.playing():
+        page = open_page(shown.view.url)
+        live(page)
+        assert number(page, "wrench_force").count() == 0
 
 
 def test_the_pictures_of_the_pages_can_still_be_taken(browser, tmp_path, monkeypatch, capsys):
