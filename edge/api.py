@@ -34,6 +34,7 @@ from edge.errors import (
 )
 from edge.estimate import load_estimator
 from edge.event import Event
+from edge.loading import unfinished_load
 from edge.pump import pump
 from edge.result import Result
 from edge.runtime import Model, Runtime
@@ -126,6 +127,7 @@ __all__ = [
     "pump",
     "save_baselines",
     "take_baselines",
+    "unfinished_load",
 ]
 
 

@@ -25,9 +25,9 @@ from edge.api import (
     open_source,
     save_baselines,
     take_baselines,
+    unfinished_load,
 )
 from edge.arguments import EXIT_USAGE
-from edge.loading import unfinished
 from edge.options import (
     baseline_parser,
     devices_parser,
@@ -47,7 +47,7 @@ EXIT_SINK: Final = 5
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     code = _main(sys.argv[1:] if arguments is None else arguments)
-    if unfinished():
+    if unfinished_load():
         sys.stderr.flush()
         os._exit(code)
     return code

@@ -37,7 +37,7 @@ Made = TypeVar("Made")
 def within_limit(work: Callable[[], Made], path: Path, stop: threading.Event | None = None) -> Made:
     """Do a part of loading a model on another thread, and return or raise what it returns or raises.
 
-    Work that is given up goes on until it ends or the program does; nothing can end it sooner. See `unfinished`.
+    Work that is given up goes on until it ends or the program does; nothing can end it sooner. See `unfinished_load`.
 
     Args:
         work: what is to be done.
@@ -73,7 +73,7 @@ def within_limit(work: Callable[[], Made], path: Path, stop: threading.Event | N
     return made[0]
 
 
-def unfinished() -> bool:
+def unfinished_load() -> bool:
     """Whether a load that was given up still goes on: then a program must end by `os._exit`, or onnxruntime may crash.
 
     It takes apart at exit what that thread is still using.
@@ -88,6 +88,6 @@ def flush_denormals(options_of: "Callable[[], onnxruntime.SessionOptions]") -> N
     Args:
         options_of: gives options that ask for it.
     """
-    import onnxruntime  # here, so that the command line may ask for `unfinished` without it
+    import onnxruntime  # here, so that the command line may ask for `unfinished_load` without it
 
     onnxruntime.InferenceSession(_IDENTITY, options_of(), providers=["CPUExecutionProvider"])

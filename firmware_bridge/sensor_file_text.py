@@ -26,7 +26,7 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
     """
     path = Path(path)
     if not sensor_file.sensors:
-        raise SensorFileError(f"{path}: not written, for no sensor is known: see that one is heard")
+        raise SensorFileError(f"{path}: not written, for nothing was found that it could hold: see what is wrong first")
     for name, entry in sensor_file.sensors.items():
         if entry.baseline is not None and np.isnan(entry.baseline.counts).any():
             raise SensorFileError(

@@ -48,7 +48,7 @@ class TestLoss:
         assert "good.toml: left as it is, for it holds what would be lost: order and axes of sensor 4" in err.getvalue()
 
     def test_nothing_found_and_nothing_known_writes_nothing(self, tmp_path):
-        with pytest.raises(SensorFileError, match=r"s\.toml: not written, for no sensor is known"):
+        with pytest.raises(SensorFileError, match=r"s\.toml: not written, for nothing was found"):
             keep.keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
         assert list(tmp_path.iterdir()) == []
 

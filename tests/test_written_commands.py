@@ -136,7 +136,7 @@ def world(emulated, tmp_path, monkeypatch):
     for name in ("left", "right"):
         write_recording(tmp_path / f"{name}.csv", healthy_counts(150))
     save_baselines("zero.json", [BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")])
-    save_sensor_file("sensor.toml", SensorFile(sensors={"4": SensorEntry()}))
+    save_sensor_file("sensor.toml", SensorFile(sensors={"4": SensorEntry(assumed=frozenset({"mounting"}))}))
     (tmp_path / "mine").mkdir()
     shutil.copy(find_model("stsr"), "mine/stsr.onnx")
 
