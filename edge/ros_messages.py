@@ -88,8 +88,8 @@ def force_and_torque(result: Result) -> tuple[Vector, Vector] | None:
     if result.force_n is None:
         return None
     vendor = result.scan.vendor_force_n
-    known = vendor is not None and vendor[2] == result.force_n
-    return (vendor if known else (math.nan, math.nan, result.force_n)), (math.nan,) * 3
+    force_n = vendor if vendor is not None and vendor[2] == result.force_n else (math.nan, math.nan, result.force_n)
+    return force_n, (math.nan, math.nan, math.nan)
 
 
 def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:

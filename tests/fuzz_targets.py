@@ -39,6 +39,7 @@ from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.gs_usb_scans import GsUsbScans
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import GAINS, Pad
 from firmware_bridge.recording import CSV_HEADER, HIGHEST_COUNT, load_recording
 from firmware_bridge.scan import ABSENT, Scan
 from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
@@ -197,11 +198,13 @@ def sensor_toml(data: bytes) -> None:
             assert entry.counts_per_newton is None or 0 < float(entry.counts_per_newton) < np.inf
             assert entry.baseline is None or entry.baseline.age_s(2e9) > -1e12
         save_sensor_file(FOLDER / "again.toml", told)
-        assert load_sensor_file(FOLDER / "again.toml").mountings == told.mountings
+        again = load_sensor_file(FOLDER / "again.toml")
+        assert (again.mountings, again.pads) == (told.mountings, told.pads)
 
 
 def sensor_toml_seeds() -> list[bytes]:
-    entry = SensorEntry(baseline=Baseline.of("4", REST, 1000.0, 100, "file"), counts_per_newton=1200.5)
+    pad = Pad(thickness_mm=4.5, intervals={"poisson": (0.4, 0.49)}, gains=(1.0,) * GAINS)
+    entry = SensorEntry(baseline=Baseline.of("4", REST, 1000.0, 100, "file"), counts_per_newton=1200.5, pad=pad)
     made = []
     for sensor_file in (SensorFile(adapter="D30", sensors={"4": entry}), SensorFile(sensors={"a": SensorEntry()})):
         save_sensor_file(FOLDER / "sensor.toml", sensor_file)
