@@ -65,15 +65,10 @@ def test_keys_of_baseline_and_sensor_files(tmp_path):
     document = json.loads((tmp_path / "zero.json").read_text())
     assert set(document) == {"format", "version", "baselines"}
     assert set(document["baselines"][0]) == told("Baseline file")
-<<<<<<< HEAD
     constants = {name: low or high for name, (low, high) in PAD_RANGES.items()}
     pad = Pad(**constants, intervals={"thickness_mm": (4, 5)}, gains=(1.0,) * GAINS)
-    sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad)}
-=======
-    sensors = {
-        "4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, frozenset({"mounting"}), frozenset({"force"}))
-    }
->>>>>>> wt-c
+    marks = {"assumed": frozenset({"mounting"}), "emulated": frozenset({"force"})}
+    sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad, **marks)}
     save_sensor_file(tmp_path / "sensor.toml", SensorFile(adapter="D30BL366", sensors=sensors))
     document = tomllib.loads((tmp_path / "sensor.toml").read_text())
     entry = document.pop("sensors")["4"]
