@@ -19,6 +19,7 @@ from edge.source import Source
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.mounting import Mounting
+from firmware_bridge.pad import Pad
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.slcan_emulator import Emulator
@@ -58,6 +59,10 @@ class TestLoss:
             (SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"})), "baseline of sensor 4"),
             (SensorEntry(counts_per_newton=1180.0, assumed=frozenset({"mounting"})), "counts per newton of sensor 4"),
             (SensorEntry(Mounting(swap_xy=True)), "order and axes of sensor 4"),
+            (
+                SensorEntry(pad=Pad(thickness_mm=4.2), assumed=frozenset({"mounting"})),
+                "what is known of the pad of sensor 4",
+            ),
             (SensorEntry(Mounting(gains=GAINS), assumed=frozenset({"mounting"})), "gains of sensor 4"),
         ],
     )

@@ -130,6 +130,7 @@ def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
         *["order and axes"] * lost("mounting", "mounting" not in entry.assumed, "mounting" not in written.assumed),
         *["gains"] * (entry.mounting.gains != Mounting().gains == written.mounting.gains),
         *["counts per newton"] * lost("force", entry.counts_per_newton is not None, bool(written.counts_per_newton)),
+        *["what is known of the pad"] * (entry.pad is not None and written.pad is None),
         *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),
     ]
 
