@@ -114,8 +114,8 @@ class ModelSession:
 
         Raises:
             WindowError: wrong shape or type, or not finite.
-            ModelError: the model cannot be run on it, or gave a pattern or a traction that is not finite, or a deviation
-                that is not finite and above zero.
+            ModelError: the model cannot be run on it, or gave a pattern or a traction that is not finite, or a
+                deviation that is not finite and above zero.
         """
         pattern = self.run_together([window], None if pad is None else [pad])[0]
         if self._deviation is not None:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.metrics import psnr_db

@@ -126,7 +126,11 @@ def differences(
     for name, true, mine in zip(names, expected, got, strict=True):
         if not np.isfinite(mine).all():
             raise ParityError(f"the {name} is not finite")
-        same_unit = [maps for other, maps in zip(names, expected, strict=True) if (other == TRACTION_NAME) == (name == TRACTION_NAME)]
+        same_unit = [
+            maps
+            for other, maps in zip(names, expected, strict=True)
+            if (other == TRACTION_NAME) == (name == TRACTION_NAME)
+        ]
         size = np.max([_largest(maps) for maps in same_unit], axis=0)
         unit = {OUTPUT_NAME: full_scale, TRACTION_NAME: FULL_TRACTION_KPA}.get(name, 0.0)
         apart = _largest(mine - true)

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from edge.bundle import bundled_models
-from edge.contract import Contract
+from edge.contract import DEVIATION_NAME, Contract
+from export.errors import ParityError
 from export.graph import outputs
-from export.parity import GraphRun, extreme_windows
+from export.parity import GraphRun, differences, extreme_windows
 from export.reference import contract_in, in_float, network_of
 from export.stability.case import Case, timed
 from train.networks.blocks import PatternNet
@@ -40,14 +41,15 @@ def of_graph(name: str, model: onnx.ModelProto, net: PatternNet, contract: Contr
     for severity, window in extreme_windows(contract).items():
         given, run_ms = timed(lambda window=window: run(window))
         true = [maps.numpy() for maps in outputs(double, torch.from_numpy(_felt(window)).double())]
-        size = max(float(np.abs(maps).max()) for maps in true)
-        apart = max(float(np.abs(mine - maps).max()) for mine, maps in zip(given, true, strict=True))
         most = FLOAT if contract.arithmetic == "float32" else _most(severity)
-        sound = all(np.isfinite(maps).all() for maps in given) and bool((given[-1] > 0).all() or len(given) == 1)
-        value = apart / max(size, contract.output_full_scale) if sound else float("nan")
-        yield Case(
-            PART, name, severity, "to torch in float64, all finite", value, most, run_ms, note=f"largest {size:.2g} mm"
-        )
+        try:
+            found = differences(run.outputs, true, given, contract.output_full_scale)
+            sure = all((maps > 0).all() for maps, of in zip(given, run.outputs, strict=True) if of == DEVIATION_NAME)
+            value = max(one.relative for one in found) if sure else float("nan")
+        except ParityError:  # a value is not finite
+            value = float("nan")
+        note = f"largest {np.abs(true[0]).max():.2g} mm"
+        yield Case(PART, name, severity, "to torch in float64, all finite", value, most, run_ms, note=note)
 
 
 def _most(severity: str) -> float:

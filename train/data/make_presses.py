@@ -21,7 +21,7 @@ import joblib
 
 from edge.progress import Progress
 from train.data.presses import PressSet, join_presses, load_presses
-from train.data.world import World, solve_pad
+from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
 
@@ -31,6 +31,12 @@ _AT_ONCE: Final = 16
 
 def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
     """Solve what a world asks for, and write it; called again after a kill, go on.
+
+    Args:
+        world: what is asked for.
+        path: of the npz.
+        jobs: processes, -1 for one on each core.
+        compressed: a smaller file, slower to write.
 
     Raises:
         DatasetError: what lies at `path` or beside it was made otherwise, or cannot be written.
@@ -43,7 +49,10 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
             raise DatasetError(f"{path} is there and was made otherwise: delete it, or write to another file")
         return there
     folder = path.with_name(path.name + ".parts")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
     missing = [number for number in range(world.chunks) if not _part(folder, number).exists()]
     with Progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
         pool = joblib.Parallel(n_jobs=jobs)
@@ -57,6 +66,8 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
     if any(part.config != facts for part in parts):
         raise DatasetError(f"{folder} holds parts that were made otherwise: delete it")
+    if not any(len(part) for part in parts):
+        raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
     made = replace(join_presses(parts), config=facts)
     made.save(path, compressed=compressed)
     shutil.rmtree(folder)
@@ -70,6 +81,8 @@ def _part(folder: Path, number: int) -> Path:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
     options = _parser().parse_args(arguments)
+    if options.jobs == 0:
+        _parser().error("--jobs is 0, expected a number of processes, or -1 for one on each core")
     os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker:UserWarning"
     started_s = time.monotonic()
     try:

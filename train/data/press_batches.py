@@ -97,7 +97,7 @@ class PressBatches:
 
 
 def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[np.float32]:
-    """Windows (n, K, 3, rows, cols) in whole zeroed counts, each read at the end of its presses; absent taps stay zero."""
+    """Windows (n, K, 3, rows, cols) in whole zeroed counts, each read at the end of its presses; absent taps stay 0."""
     readings = read_windows(presses.counts[:, :, None], 1.0, nuisances, seed, angle_deg=presses.angle_deg)
     absent = ~presses.counts.any(axis=(2, 3, 4))
     readings[absent] = 0

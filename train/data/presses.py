@@ -122,8 +122,8 @@ def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
         if str(about["schema"]) != SCHEMA or int(about["version"]) > VERSION:
             raise DatasetError(
-                f"{path} is {str(about['schema'])[:60]!r} of version {about['version']}, expected {SCHEMA!r} of at most "
-                f"{VERSION}: make it with 'python -m train.data.make_presses'"
+                f"{path} is {str(about['schema'])[:60]!r} of version {about['version']}, expected {SCHEMA!r} of "
+                f"at most {VERSION}: make it with 'python -m train.data.make_presses'"
             )
         facts: Any = json.loads(str(about["facts"]))
         arrays = dict(read_npz(path, _AXES, most_bytes))
@@ -144,7 +144,7 @@ def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
 
 
 def join_presses(parts: Sequence[PressSet]) -> PressSet:
-    """Sequences one after the other, of as many taps as the longest has; pads keep apart.
+    """Put sequences one after the other, of as many taps as the longest has; pads keep apart.
 
     Raises:
         DatasetError: there are none.
@@ -155,7 +155,7 @@ def join_presses(parts: Sequence[PressSet]) -> PressSet:
     first, pads = 0, []
     for part in parts:
         pads.append(part.pad + first)
-        first = int(pads[-1].max()) + 1
+        first = int(pads[-1].max(initial=first - 1)) + 1
     padded = [part.with_taps(taps) for part in parts]
     arrays = {name: np.concatenate([getattr(part, name) for part in padded]) for name in _AXES}
     arrays["pad"] = np.concatenate(pads)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from math import ceil
+from math import ceil, inf
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,7 @@ from train.generation import one_thread
 from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
+from train.poses import MAX_TAPS
 from train.surfaces import surface_mesh
 
 INDENTATION_MM: Final = (0.03, 0.5)
@@ -53,11 +54,19 @@ class World:
         for name in ("count", "taps", "per_pad"):
             if getattr(self, name) < 1:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected 1 or more")
-        unknown = [name for name in self.families if name not in SHARES and not name.startswith("mesh:")]
-        if unknown or not self.families:
-            raise DatasetError(f"no family {unknown}: expected some of {', '.join(SHARES)}, or mesh:PATH")
+        if self.taps > MAX_TAPS:
+            raise DatasetError(f"taps is {self.taps}, expected 1 to {MAX_TAPS}")
+        if not 0 <= self.spread <= 1:
+            raise DatasetError(f"spread is {self.spread}, expected 0 to 1")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
+        unknown = [name for name in self.families if name not in SHARES and not name.startswith("mesh:")]
+        if unknown or not self.families:
+            named = ", ".join(map(repr, unknown)) if unknown else "named"
+            raise DatasetError(f"no family {named}: expected some of {', '.join(SHARES)}, or a mesh")
+        for name, share in self.families.items():
+            if not 0 < share < inf:
+                raise DatasetError(f"frequency of {name} is {share}, expected more than 0")
         for name in self.families:
             if name.startswith("mesh:"):
                 surface_mesh(name)  # before any work: the likeliest to fail

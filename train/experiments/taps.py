@@ -38,7 +38,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     told_apart = sum(low > 0 or high < 0 for curve in gains.values() for _, low, high in curve)
     report = Report("taps", folder, quick=bench.quick)
     report.say(
-        "Compact networks on the same targets, all from one base network of seven taps, trained with fewer, too. "
+        "Compact networks on the same targets, all trained on from one of a single tap for as long. "
         f"Of {2 * MAX_TAPS - 1} ways with other taps or another network, {told_apart} can be told apart from STSR "
         "(95 % interval of the difference, by tap)."
     )

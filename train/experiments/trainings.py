@@ -6,7 +6,7 @@ from typing import Any, Final
 from edge.frozen import FrozenSet
 from train.dataset import Sequences, join
 from train.experiments.workbench import Workbench
-from train.fit import BASE, BUNDLED, given_taps
+from train.fit import given_taps
 from train.generation import Generation, random_figures
 from train.loop import Recipe
 from train.networks.blocks import PatternNet
@@ -28,7 +28,10 @@ SEED_BATCH: Final = 16
 _SEED_RATE: Final = 5e-4
 _SEED_DECAY: Final = 1e-2
 _ENDLESS: Final = 1_000_000
-_STAGE_STEPS: Final = 1000
+BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
+"""The compact STSR on whole taps of the paper's protocol, nothing known of the pad; the bundled ones learn presses."""
+_STAGE_STEPS: Final = 2000
+_STAGE_RATE: Final = 1e-3
 _SCALE_STEPS: Final = 2500
 _ANGLE_STEPS: Final = 1500
 
@@ -48,35 +51,34 @@ def by_angle(bench: Workbench, angle_step_deg: float) -> Sequences:
 
 
 def compact(name: str) -> Training:
-    """A compact network trained on from the base: stsr, mtsr2, ... mtsr7; the bundled ones are those of train.fit."""
-    for training in BUNDLED:
-        if training.name == name:
-            return training
+    """A compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
+    if name == "stsr":
+        return BASE
     taps = int(name.removeprefix("mtsr"))
-    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=5e-4, given=given_taps(taps))
-    return Training(name, f"compact-{name}", recipe, start=BASE.name, seed=1 + taps)
+    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE, given=given_taps(taps))
+    return Training(f"taps-{name}", f"compact-{name}", recipe, start=BASE.name, seed=1 + taps)
 
 
 def at_scale(scale: int) -> Training:
     """The compact STSR at another scale: the base's trunk, and pixels of its own."""
     if scale == BASE.scale:
-        return compact("stsr")
+        return BASE
     recipe = Recipe(steps=_SCALE_STEPS, learning_rate=1e-3)
-    return Training(f"stsr-x{scale}", "compact-stsr", recipe, scale=scale, start=BASE.name)
+    return Training(f"taps-stsr-x{scale}", "compact-stsr", recipe, scale=scale, start=BASE.name)
 
 
 def at_angle(angle_step_deg: float) -> Training:
     """The compact MTSR-2 for taps that are turned by an angle, from the STSR, which knows none."""
     recipe = Recipe(steps=_ANGLE_STEPS, learning_rate=1e-3, given=given_taps(2))
-    return Training(f"mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start="stsr", seed=3)
+    return Training(f"taps-mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start=BASE.name, seed=3)
 
 
 def alike(name: str) -> Training:
     """A compact network trained on from the base for as long as every other of these."""
-    training = compact(name)
-    if training.recipe.steps == _STAGE_STEPS:
-        return training
-    return replace(training, name=f"{name}-alike", recipe=replace(training.recipe, steps=_STAGE_STEPS))
+    if name != "stsr":
+        return compact(name)
+    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE)
+    return replace(BASE, name=f"{BASE.name}-alike", recipe=recipe, start=BASE.name)
 
 
 def seed_size(network: str) -> Training:
@@ -170,5 +172,5 @@ def trained(
 
 
 _STARTS: Final = {
-    start.name: start for start in (BASE, compact("stsr"), seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)
+    start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)
 }

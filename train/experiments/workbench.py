@@ -33,7 +33,7 @@ _TIMED_MS: Final = 2000.0
 _QUICK_STEPS: Final = 1
 _QUICK_SEQUENCES: Final = 36
 _QUICK_SURFACES: Final = 2
-_QUICK_OPTIONS: Final = {"channels": 8, "blocks": 1}
+_QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
 
 
 @dataclass

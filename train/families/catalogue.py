@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from train.depth import Relief, footprints
 from train.families import faces, rounds, solids
 from train.families.shape import Height, Lie, log_uniform
-from train.physics.gripped import BARE, SAMPLES, Cover, GrippedPad
+from train.physics.covers import BARE, Cover
+from train.physics.gripped import SAMPLES, GrippedPad
 from train.poses import ANGLE_STEP_DEG, as_poses, random_targets, turned_back
 from train.surfaces import SURFACES, surface_mesh
 

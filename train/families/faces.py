@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from train.families.shape import Height, log_uniform, where
+from train.families.shape import Height, Lengths, log_uniform, where
 
 SLOPE = float(np.tan(np.radians(3.0)))
 """Largest tilt of a face against the pad: three degrees."""
@@ -18,7 +18,7 @@ def block(rng: np.random.Generator) -> Height:
     wide, long = log_uniform(rng, 3, 40) / 2, log_uniform(rng, 3, 40) / 2
     corner = rng.uniform(0, 0.5) * min(wide, long)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         over_x, over_y = np.maximum(abs(x) - wide + corner, 0), np.maximum(abs(y) - long + corner, 0)
         return where(over_x**2 + over_y**2 <= corner**2 + 1e-9, 0.0)
 
@@ -29,7 +29,7 @@ def edge(rng: np.random.Generator) -> Height:
     """A half plane; half of the edges are rounded."""
     radius = float(rng.choice([0.0, log_uniform(rng, 0.3, 5.0)]))
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         over = np.maximum(x + radius, 0)
         if not radius:
             return where(x <= 0, 0.0)
@@ -42,7 +42,7 @@ def corner(rng: np.random.Generator) -> Height:
     """A corner of 50 to 150 degrees, convex or cut out."""
     half, cut = np.radians(rng.uniform(50, 150)) / 2, rng.random() < 0.3
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         inside = abs(y) * np.cos(half) <= -x * np.sin(half)
         return where(~inside if cut else inside, 0.0)
 
@@ -54,7 +54,7 @@ def slot(rng: np.random.Generator) -> Height:
     width, depth = log_uniform(rng, 1, 8), log_uniform(rng, 0.1, 5)
     second = rng.uniform(4, 12) if rng.random() < 0.4 else 1e3
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         inside = (abs(x) < width / 2) | (abs(x - second) < width / 2)
         return np.where(inside, np.float32(-depth), np.float32(0))
 

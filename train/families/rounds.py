@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from train.families.shape import Height, log_uniform, where
+from train.families.shape import Height, Lengths, log_uniform, where
 
 
 def dome(rng: np.random.Generator) -> Height:
@@ -28,7 +28,7 @@ def ridge(rng: np.random.Generator) -> Height:
     left, right = (np.tan(np.radians(log_uniform(rng, 2, 45))) for _ in range(2))
     blunt, end = log_uniform(rng, 0.1, 2), rng.uniform(0, 9) if rng.random() < 0.3 else 1e3
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         slope = np.where(x > 0, right, left)
         return where(y < end, -slope * (np.sqrt(x * x + blunt**2) - blunt))
 
@@ -39,7 +39,7 @@ def wire(rng: np.random.Generator) -> Height:
     """A straight or bent wire of .3 to 2 mm radius on a plate."""
     radius, bend = log_uniform(rng, 0.3, 2), rng.uniform(-0.06, 0.06) * (rng.random() < 0.5)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         across = (x - bend * y * y) / np.sqrt(1 + (2 * bend * y) ** 2)
         round_ = np.sqrt(np.maximum(radius**2 - across**2, 0)) + radius
         return np.where(abs(across) < radius, round_, 0).astype(np.float32) - 2 * radius
@@ -62,7 +62,7 @@ def relief(rng: np.random.Generator) -> Height:
     size = rng.normal(0, rms * np.sqrt(2 / waves), waves)
     q_x, q_y = q * np.cos(turn), q * np.sin(turn)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         # The waves are separable in sines and cosines, which takes a fifth of the time of a sum over the grid.
         total = np.zeros(x.shape, dtype=np.float32)
         for wave in zip(q_x, q_y, phase, size, strict=True):
@@ -79,7 +79,7 @@ def grating(rng: np.random.Generator) -> Height:
     period, duty, depth = log_uniform(rng, 2.5, 14), rng.uniform(0.3, 0.7), log_uniform(rng, 0.1, 2)
     phase, wavy = rng.uniform(0, 1), rng.random() < 0.4
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         place = x / period + phase
         if wavy:
             return (depth / 2 * np.cos(2 * np.pi * place)).astype(np.float32)
@@ -88,7 +88,7 @@ def grating(rng: np.random.Generator) -> Height:
     return height
 
 
-def _fall(distance, radius: float):
+def _fall(distance: Lengths, radius: float) -> Lengths:
     """How far a circle lies below its top at a distance from it; a straight wall below its equator."""
     square = radius**2 - distance**2
     return where(square > 0, np.sqrt(np.maximum(square, 0)) - radius)

@@ -7,7 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Height = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
+Lengths = NDArray[np.float32]
+"""Lengths at places on a grid, in [mm]."""
+Height = Callable[[Lengths, Lengths], Lengths]
 """Height in [mm] at x and y in [mm], NOWHERE_MM off the shape; higher parts meet the pad first."""
 
 NOWHERE_MM: Final = -1e3
@@ -32,8 +34,8 @@ class Lie:
     slope_x: float = 0.0
     slope_y: float = 0.0
 
-    def seen(self, height: Height, x_mm: NDArray[np.float32], y_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Heights in [mm] of a shape that lies so, at places on the pad in [mm]."""
+    def seen(self, height: Height, x_mm: Lengths, y_mm: Lengths) -> Lengths:
+        """Return the heights of a shape that lies so, at places on the pad."""
         turn = np.radians(self.angle_deg)
         cosine, sine = np.float32(np.cos(turn)), np.float32(np.sin(turn))
         right, down = x_mm - np.float32(self.x_mm), y_mm - np.float32(self.y_mm)
@@ -43,12 +45,12 @@ class Lie:
         return raised.astype(np.float32, copy=False)
 
 
-def where(inside: NDArray[np.bool_], height: NDArray[np.float32] | float) -> NDArray[np.float32]:
+def where(inside: NDArray[np.bool_], height: NDArray[np.floating] | float) -> Lengths:
     """Heights where a shape is, NOWHERE_MM elsewhere."""
     return np.where(inside, height, np.float32(NOWHERE_MM)).astype(np.float32, copy=False)
 
 
-def raised(inside: NDArray[np.bool_], height_mm: float) -> NDArray[np.float32]:
+def raised(inside: NDArray[np.bool_], height_mm: float) -> Lengths:
     """A figure raised by `height_mm` from a plate at height 0."""
     return np.where(inside, np.float32(height_mm), np.float32(0))
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from train.families.shape import Height, log_uniform, raised, where
+from train.families.shape import Height, Lengths, log_uniform, raised, where
 
 
 def solid(rng: np.random.Generator) -> Height:
@@ -16,7 +16,7 @@ def _coin(rng: np.random.Generator) -> Height:
     radius, rim = rng.uniform(6, 13), rng.uniform(0.6, 1.8)
     sunk, bust = rng.uniform(0.05, 0.2), rng.uniform(2, 5)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         away = np.hypot(x, y)
         face = np.where((away > radius - rim) | (np.hypot(x / 0.8, y) < bust), 0, -sunk)
         return where(away < radius, face)
@@ -33,7 +33,7 @@ def _washer(rng: np.random.Generator) -> Height:
 def _nut(rng: np.random.Generator) -> Height:
     flats, hole = rng.uniform(3, 7), rng.uniform(0.4, 0.6)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         away = np.hypot(x, y)
         return raised((_polygon_distance(x, y, 6) < flats) & (away > hole * flats), 2.0)
 
@@ -44,7 +44,7 @@ def _screw(rng: np.random.Generator) -> Height:
     radius, width, crossed = rng.uniform(3, 7), rng.uniform(0.8, 1.6), rng.random() < 0.5
     bulge = log_uniform(rng, 8, 100)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         away = np.hypot(x, y)
         cut = (abs(x) < width / 2) & ((abs(y) < 0.7 * radius) | (not crossed))
         if crossed:
@@ -58,7 +58,7 @@ def _button(rng: np.random.Generator) -> Height:
     radius, hole, apart = rng.uniform(4, 9), rng.uniform(0.6, 1.1), rng.uniform(1.2, 2.0)
     holes, rim = int(rng.choice([2, 4])), rng.uniform(0.1, 0.4)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         away = np.hypot(x, y)
         pierced = np.hypot(abs(x) - apart, y if holes == 2 else abs(y) - apart) < hole
         return where((away < radius) & ~pierced, np.where(away > 0.75 * radius, 0.0, -rim))
@@ -71,7 +71,7 @@ def _key(rng: np.random.Generator) -> Height:
     teeth = rng.uniform(0.2, 0.9, 9) * half
     groove = rng.uniform(0.5, 1.2)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         tooth = teeth[np.clip((y / 2.5 + 4).astype(int), 0, 8)]
         inside = (x > -half) & (x < tooth) & (abs(y) < length)
         return where(inside, np.where(abs(x + 0.4 * half) < groove / 2, -0.4, 0.0))
@@ -82,7 +82,7 @@ def _key(rng: np.random.Generator) -> Height:
 def _cap(rng: np.random.Generator) -> Height:
     radius, teeth, deep = rng.uniform(8, 16), int(rng.integers(30, 90)), rng.uniform(0.2, 0.6)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         turn = np.arcsin(np.clip(x / radius, -1, 1))
         ribbed = radius * np.cos(turn) - radius + deep / 2 * np.cos(teeth * turn)
         return where((abs(x) < 0.9 * radius) & (abs(y) < 7), ribbed)
@@ -94,7 +94,7 @@ def _studs(rng: np.random.Generator) -> Height:
     pitch = rng.uniform(4, 9)
     radius = pitch * rng.uniform(0.2, 0.36)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         place_x, place_y = x - pitch * np.round(x / pitch), y - pitch * np.round(y / pitch)
         return raised(np.hypot(place_x, place_y) < radius, 1.6)
 
@@ -104,7 +104,7 @@ def _studs(rng: np.random.Generator) -> Height:
 def _thread(rng: np.random.Generator) -> Height:
     radius, pitch = rng.uniform(3, 12), rng.uniform(0.8, 3)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         lead = y / pitch + np.arcsin(np.clip(x / radius, -1, 1)) / (2 * np.pi)
         groove = 0.6 * pitch * abs(lead - np.floor(lead) - 0.5)
         return where(abs(x) < radius, np.sqrt(np.maximum(radius**2 - x * x, 0)) - radius - groove)
@@ -115,7 +115,7 @@ def _thread(rng: np.random.Generator) -> Height:
 def _gear(rng: np.random.Generator) -> Height:
     radius, teeth, hole = rng.uniform(5, 11), int(rng.integers(8, 24)), rng.uniform(0.15, 0.4)
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         away = np.hypot(x, y)
         outer = radius * (1 + 0.1 * np.sign(np.cos(teeth * np.arctan2(y, x))))
         return raised((away < outer) & (away > hole * radius), 2.0)
@@ -126,7 +126,7 @@ def _gear(rng: np.random.Generator) -> Height:
 def _pen(rng: np.random.Generator) -> Height:
     radius, sides, clip = rng.uniform(3, 6), int(rng.choice([0, 6])), rng.random() < 0.4
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         body = np.sqrt(np.maximum(radius**2 - x * x, 0)) - radius
         if sides:  # a pencil lies on one of its flats
             body = -np.maximum(abs(x) - 0.5 * radius, 0) * np.sqrt(3)
@@ -140,14 +140,14 @@ def _plug(rng: np.random.Generator) -> Height:
     apart, wide, long = rng.uniform(2.5, 8), rng.uniform(0.8, 1.8), rng.uniform(2, 7)
     pins = int(rng.choice([2, 3]))
 
-    def height(x, y):
+    def height(x: Lengths, y: Lengths) -> Lengths:
         inside = (abs(abs(x) - apart) < wide) & (abs(y) < long / 2)
         return raised(inside | ((np.hypot(x, y - apart) < wide) & (pins == 3)), 3.0)
 
     return height
 
 
-def _polygon_distance(x, y, sides: int):
+def _polygon_distance(x: Lengths, y: Lengths, sides: int) -> Lengths:
     """Distance from the centre to the side of a regular polygon through each place."""
     sector = 2 * np.pi / sides
     turn = np.arctan2(y, x)

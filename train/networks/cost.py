@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from train.networks.blocks import PatternNet
+from train.networks.symmetric import SymmetricConv2d
 
 _TAXEL_AXES: Final = 3
 
@@ -25,11 +26,12 @@ def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
     """
     counted: list[int] = []
 
-    def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
+    def count(layer: nn.Conv2d | nn.Linear | SymmetricConv2d, _: object, output: torch.Tensor) -> None:
         # Every output value is the sum of as many products as one row of the weights has numbers.
-        counted.append(output[0].numel() * layer.get_parameter("weight")[0].numel())
+        counted.append(output[0].numel() * layer.weight[0].numel())
 
-    hooks = [layer.register_forward_hook(count) for layer in net.modules() if isinstance(layer, (nn.Conv2d, nn.Linear))]
+    summing = [layer for layer in net.modules() if isinstance(layer, (nn.Conv2d, nn.Linear, SymmetricConv2d))]
+    hooks = [layer.register_forward_hook(count) for layer in summing]
     like, training = next(net.parameters()), net.training
     try:
         with torch.inference_mode():

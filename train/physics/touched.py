@@ -1,0 +1,91 @@
+"""Where the pad is touched and how far it is pressed in, finer than the cells on which pressure is solved."""
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.contact import REACH, ContactSolver
+from train.physics.covers import BARE, Cover
+
+_WALL_MM: Final = 0.1
+"""A part of a cell this far below its highest part carries nothing while that one is pressed."""
+_STEEP: Final = 2.0
+"""A shape this many indentations down falls away steeply: its edge lies between the cells as its pressure says."""
+
+
+def carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Depth of each cell's carrying part, and its share of the cell, both (n, cells, cells).
+
+    Args:
+        depth_mm: (n, m, m) with m a multiple of `cells`, below the highest part, in [mm].
+        cells: along a side.
+    """
+    samples = depth_mm.shape[1] // cells
+    parts = depth_mm.reshape(len(depth_mm), cells, samples, cells, samples)
+    carries = parts < parts.min(axis=(2, 4), keepdims=True) + _WALL_MM
+    count = carries.sum(axis=(2, 4))
+    return np.where(carries, parts, 0).sum(axis=(2, 4)) / count, (count / samples**2).astype(np.float32)
+
+
+def which_of(covers: Sequence[Cover]) -> Iterable[tuple[Cover, NDArray[np.int64]]]:
+    """Each cover once, with the numbers of the presses that have it."""
+    for cover in dict.fromkeys(covers):
+        yield cover, np.array([number for number, one in enumerate(covers) if one == cover])
+
+
+def pressed_in(
+    solvers: dict[Cover, ContactSolver],
+    covers: Sequence[Cover],
+    depth_mm: NDArray[np.float32],
+    cells_mm: NDArray[np.float32],
+    pressure_mpa: NDArray[np.float32],
+    on_pad_mpa: NDArray[np.float32],
+    indentation_mm: NDArray[np.float32],
+    pattern_cells: int,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """How far below its highest part the pad is pressed in, and where it is touched, on pixels of half a cell.
+
+    A cell's own deflection under its pressure, less its gap, is positive inside a contact and negative outside; the
+    contact's edge is where it passes through zero between the cells' centres. A rigid shape is followed; under a soft
+    one the pad lies where its own layer gives way to.
+
+    Args:
+        solvers: of every cover here, and of the bare pad.
+        covers: (n,).
+        depth_mm: (n, m, m), of the shape below its highest part, in [mm].
+        cells_mm: (n, size, size), of each cell's carrying part, in [mm].
+        pressure_mpa: (n, size, size), on the shape, in [MPa].
+        on_pad_mpa: (n, size, size), on the pad, in [MPa].
+        indentation_mm: (n,), in [mm].
+        pattern_cells: cells along the pattern's side, in the middle of the pad.
+
+    Returns:
+        Depths in [mm] and the mask, both (n, 2 * pattern_cells, 2 * pattern_cells).
+    """
+    size = cells_mm.shape[1]
+    rim, pixels = size - pattern_cells, 2 * pattern_cells
+    fine_mm = carrying(depth_mm, 2 * size)[0][:, rim : rim + pixels, rim : rim + pixels]
+    indented_mm = indentation_mm[:, None, None]
+    close_mm = np.empty_like(pressure_mpa)
+    for cover, which in which_of(covers):
+        solver = solvers[cover]
+        gap_mm = solver.displacement_mm(pressure_mpa[which]) - (indented_mm[which] - cells_mm[which])
+        close_mm[which] = pressure_mpa[which] * np.float32(solver.cell_compliance_mm_per_mpa) - gap_mm
+    close_mm = np.where(cells_mm > _STEEP * indented_mm, np.minimum(pressure_mpa, 0), close_mm)
+    to_pixels = _between(size, pixels)
+    touching = (to_pixels @ close_mm @ to_pixels.T > 0) & (fine_mm < REACH * indented_mm)
+    # The press bottoms out on the highest part, whichever cells that lies between.
+    touching |= fine_mm <= fine_mm.min(axis=(1, 2), keepdims=True) + 1e-4
+    covered = np.array([cover != BARE for cover in covers])
+    if covered.any():
+        sunk_mm = to_pixels @ solvers[BARE].displacement_mm(on_pad_mpa[covered]) @ to_pixels.T
+        fine_mm[covered] = np.clip(indented_mm[covered] - sunk_mm, 0, indented_mm[covered])
+    return fine_mm, touching
+
+
+def _between(size: int, pixels: int) -> NDArray[np.float32]:
+    """Weights (pixels, size) that interpolate linearly from cells to pixels of half a cell, both centred on the pad."""
+    place = ((np.arange(pixels) - (pixels - 1) / 2) / 2 + (size - 1) / 2)[:, None]
+    return np.maximum(1 - np.abs(place - np.arange(size)), 0).astype(np.float32)
