@@ -7,8 +7,9 @@ from edge.errors import EdgeError
 from edge.judge import judge
 from edge.taps import ON_COUNTS
 from firmware_bridge.recording import load_recording
+from train.data.world import World, solve_pad
 from train.dataset import Sequences
-from train.freeze import SEED, TEST_FORCE_N, demo_recording, fit_classical, fit_taxels, freeze, held_out, main
+from train.freeze import SEED, TEST_FORCE_N, demo_recording, drawn, fit_classical, fit_taxels, freeze, held_out, main
 from train.generation import Generation, solve_all
 from train.nuisances import Nuisances
 from train.simulation import FRAMES, MAX_INDENTATION_MM
@@ -96,20 +97,37 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
 
 def test_files_are_replaced_by_those_that_load_and_stay_as_bak(tmp_path, monkeypatch, frozen):
     bundled = {name: dict(np.load(BUNDLE_DIR / f"{name}.npz")) for name in ("classical", "taxels", "demo")}
-    made = {"load_sequences": None, "join": None, "freeze": frozen, "demo_recording": bundled["demo"]}
+    made = {"load_taps": None, "freeze": frozen, "demo_recording": bundled["demo"]}
     made |= {"fit_classical": bundled["classical"], "fit_taxels": bundled["taxels"]}
     for name, value in made.items():
         monkeypatch.setattr(f"train.freeze.{name}", lambda *_, value=value: value)
     names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "taxels")]
     main([str(tmp_path), "--data", "seen.npz"])
     assert sorted(path.name for path in tmp_path.iterdir()) == names
+    test_set = (tmp_path / "frozen.npz").stat()
+    monkeypatch.setattr("train.freeze.freeze", lambda *_: pytest.fail("models name the frozen set that is there"))
     main([str(tmp_path), "--data", "seen.npz"])
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, *(f"{name}.bak" for name in names)])
+    baks = [f"{name}.bak" for name in names if name != "frozen.npz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, *baks])
+    assert (tmp_path / "frozen.npz").stat() == test_set
     before = (tmp_path / "taxels.npz").read_bytes()
     monkeypatch.setattr("train.freeze.fit_taxels", lambda _: {"covariances": np.zeros(3)})
     with pytest.raises(EdgeError, match="cannot be read"):
         main([str(tmp_path), "--data", "seen.npz"])
     assert (tmp_path / "taxels.npz").read_bytes() == before
+
+
+def test_presses_are_drawn_like_taps_whole_and_each_with_its_own_truth():
+    presses = solve_pad(World(count=12, taps=2, per_pad=12, spread=0.0, seed=3), 0)
+    newest, patterns = drawn(presses, windows=len(presses))
+    assert newest.shape == (len(presses), 3, 4, 4) and patterns.shape == (len(presses), 40, 40)
+    assert len(np.unique(patterns.sum(axis=(1, 2)))) == len(presses)
+    for reading, pattern in zip(newest, patterns, strict=True):
+        (mine,) = np.flatnonzero((presses.patterns == pattern).all(axis=(1, 2)))
+        assert np.corrcoef(reading.ravel(), presses.counts[mine, 0].ravel())[0, 1] > 0.97
+    more, _ = drawn(presses, windows=3 * len(presses))
+    assert len(more) == 3 * len(presses)
+    assert set(fit_classical(presses, windows=20)) == {"bilinear_gain", "bicubic_gain", "linear_map"}
 
 
 def test_taxels_covary_as_their_readings_do(sequences):
