@@ -96,7 +96,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
 
 def test_files_are_replaced_by_those_that_load_and_stay_as_bak(tmp_path, monkeypatch, frozen):
     bundled = {name: dict(np.load(BUNDLE_DIR / f"{name}.npz")) for name in ("classical", "taxels", "demo")}
-    made = {"load_sequences": None, "join": None, "freeze": frozen, "demo_recording": bundled["demo"]}
+    made = {"load_taps": None, "freeze": frozen, "demo_recording": bundled["demo"]}
     made |= {"fit_classical": bundled["classical"], "fit_taxels": bundled["taxels"]}
     for name, value in made.items():
         monkeypatch.setattr(f"train.freeze.{name}", lambda *_, value=value: value)

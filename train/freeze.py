@@ -1,6 +1,6 @@
 """Make what comes with the models: the frozen test set, classical methods, taxels' covariance, a recording.
 
-python -m train.freeze edge/models --data data/train.npz
+python -m train.freeze edge/models --data data/gripped.npz
 """
 
 import argparse
@@ -20,7 +20,10 @@ from firmware_bridge.geometry import USPA44
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION, load_recording
 from train.batches import Draw, WindowBatches
-from train.dataset import Sequences, between_frames, join, load_sequences
+from train.data.files import load_taps
+from train.data.press_batches import read_presses
+from train.data.presses import PressSet
+from train.dataset import Sequences, between_frames
 from train.depth import Pose
 from train.errors import TrainError
 from train.generation import Generation, solve_all
@@ -74,9 +77,9 @@ def freeze(
     )
 
 
-def fit_classical(sequences: Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
+def fit_classical(taps: Sequences | PressSet, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
     """Gains of bilinear and bicubic interpolation, in mm per count, and the linear map (48, pixels)."""
-    newest, patterns = _drawn(sequences, windows)
+    newest, patterns = _drawn(taps, windows)
     matrix = fit_linear_map(newest.reshape(len(newest), -1), patterns.reshape(len(patterns), -1))
     return {
         "bilinear_gain": np.array(fit_gain(bilinear(newest[:, 2], SCALE), patterns)),
@@ -85,16 +88,19 @@ def fit_classical(sequences: Sequences, windows: int = CLASSICAL_WINDOWS) -> dic
     }
 
 
-def fit_taxels(sequences: Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
+def fit_taxels(taps: Sequences | PressSet, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
     """Covariance (48, 48) about zero of taxels' readings, x of all first, in zeroed counts; none of them dead."""
-    newest, _ = _drawn(sequences, windows)
+    newest, _ = _drawn(taps, windows)
     flat = newest.reshape(len(newest), -1).astype(np.float64)
     return {"covariance": (flat.T @ flat / len(flat)).astype(np.float32)}
 
 
-def _drawn(sequences: Sequences, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _drawn(taps: Sequences | PressSet, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Readings (n, 3, rows, cols) of newest taps in zeroed counts, and their patterns (n, H, W) in [mm]."""
-    batches = WindowBatches(sequences.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
+    if isinstance(taps, PressSet):
+        some = taps.with_taps(1).pick(np.random.default_rng(SEED).permutation(len(taps))[:windows])
+        return read_presses(some, Nuisances(), SEED)[:, 0], some.patterns.astype(np.float32)
+    batches = WindowBatches(taps.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
     drawn = [batches.draw(number) for number in tracked(range(windows // 100), "reading", "batch")]
     return np.concatenate([readings[:, 0] for readings, _ in drawn]), np.concatenate([truth for _, truth in drawn])
 
@@ -149,20 +155,20 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="where to write frozen.npz, classical.npz, taxels.npz and demo.npz")
     parser.add_argument(
-        "--data", type=Path, nargs="+", required=True, help="what classical methods and taxels are fitted on"
+        "--data", type=Path, nargs="+", required=True, help="taps that classical methods and taxels are fitted on"
     )
     options = parser.parse_args(arguments)
     folder: Path = options.folder
     try:
-        sequences = join([load_sequences(path) for path in options.data])
+        taps = load_taps(options.data)
     except TrainError as error:
         sys.exit(f"freeze: {error}")
     folder.mkdir(parents=True, exist_ok=True)
     frozen = freeze(held_out("test"), Nuisances(), SEED)
     frozen.save(folder / "frozen.npz")
-    _save(folder / "classical.npz", fit_classical(sequences), lambda draft: fitted_methods(draft, frozen.scale))
+    _save(folder / "classical.npz", fit_classical(taps), lambda draft: fitted_methods(draft, frozen.scale))
     grid = (USPA44.rows, USPA44.cols)
-    _save(folder / "taxels.npz", fit_taxels(sequences), lambda draft: load_estimator(draft, grid))
+    _save(folder / "taxels.npz", fit_taxels(taps), lambda draft: load_estimator(draft, grid))
     _save(folder / "demo.npz", demo_recording(), load_recording)
     sys.stdout.write(f"{len(frozen)} frames of {len(frozen.surface)} taps, sha256 {frozen.sha256()}\n")
 
