@@ -46,7 +46,7 @@ def test_known_gains_leave_what_the_chips_would_read_without(tmp_path):
     presses = a_few()
     frozen = freeze_presses(presses, 3, Nuisances.only("gain_spread"))
     known, unknown = (frozen.windows(2, gains_known=known) for known in (True, False))
-    assert known == pytest.approx(presses.counts, abs=0.7)  # rounded to whole counts before the gain was taken out
+    assert known == pytest.approx(presses.counts, abs=1.2)  # rounded before and after the gain
     assert np.abs(unknown / presses.counts - 1).max() > 0.05
     frozen.presses.save(tmp_path / "frozen.npz")
     assert np.array_equal(load_frozen_presses(tmp_path / "frozen.npz").gains, frozen.gains)
