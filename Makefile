@@ -49,6 +49,12 @@ data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --seed 1000001
 
+data/test.npz: $(VENV)/.dev  ## the same on yet other pads, by which nothing is set
+	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --seed 2000001
+
+train/data/wide-test.npz: | data/test.npz  ## the wide test set, read once by sensors of its own
+	$(BIN)/python -m train.data.frozen_presses data/test.npz $@
+
 $(VENV)/.runtime: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) --editable .

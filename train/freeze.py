@@ -162,7 +162,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="where to write frozen.npz, classical.npz, taxels.npz and demo.npz")
     parser.add_argument(
-        "--data", type=Path, nargs="+", required=True, help="what classical methods and taxels are fitted on"
+        "--data", type=Path, nargs="+", required=True, help="taps that classical methods and taxels are fitted on"
     )
     options = parser.parse_args(arguments)
     folder: Path = options.folder

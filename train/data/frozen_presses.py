@@ -1,5 +1,10 @@
-"""Presses as sensors with gains of their own have read them: a set to evaluate on, never to learn from."""
+"""Presses as sensors with gains of their own have read them: a set to evaluate on, never to learn from.
 
+python -m train.data.frozen_presses data/test.npz train/data/wide-test.npz
+"""
+
+import argparse
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -8,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
+from firmware_bridge.pad import Pad
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
+from train.errors import TrainError
+from train.freeze import SEED
 from train.nuisances import NAMES, Nuisances
-from train.physics.pads import known_numbers
+from train.physics.pads import input_scale, known_numbers
 from train.simulation import MAX_INDENTATION_MM
 
 WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
@@ -43,6 +51,12 @@ class FrozenPresses:
         """The pads as a network takes them, (n, train.physics.pads.KNOWN): all of each with its gains, or nothing."""
         flags = np.full(self.presses.constants.shape, known)
         return known_numbers(self.presses.constants, flags, flags[:, 0])
+
+    def pad(self, index: int, *, gains: bool = False) -> Pad:
+        """The pad of a sequence as a sensor file holds it, with its sensor's gains if asked for."""
+        scaled = self.presses.constants[index].tolist()
+        values = {name: c + spread * v for (name, c, spread), v in zip(input_scale(), scaled, strict=True)}
+        return Pad(**values, gains=tuple(self.gains[index].ravel().tolist()) if gains else None)
 
     def patterns(self) -> NDArray[np.float32]:
         """Truth, (n, H, W) in [mm]."""
@@ -100,3 +114,23 @@ def _gains(seed: int, presses: PressSet, spread: float) -> NDArray[np.float32]:
     shape = (len(presses), *presses.counts.shape[2:])
     draws = np.random.default_rng([seed, 5]).standard_normal(shape, dtype=np.float32)
     return 1 + np.float32(spread) * draws.clip(-2, 2)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m train.data.frozen_presses", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
+    parser.add_argument("out", type=Path, metavar="OUT.npz")
+    options = parser.parse_args(arguments)
+    try:
+        frozen = freeze_presses(load_presses(options.presses), SEED)
+        frozen.presses.save(options.out, compressed=True)
+    except TrainError as error:
+        sys.exit(f"frozen_presses: {error}")
+    sys.stdout.write(f"{options.out}: {len(frozen)} sequences, sha256 {frozen.presses.sha256()}\n")
+
+
+if __name__ == "__main__":
+    main()

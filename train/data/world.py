@@ -98,12 +98,14 @@ def solve_pad(world: World, number: int) -> PressSet:
     tapped = [
         draw_shape(rng, str(name), gripped, world.taps, (error.pose_error_mm, error.pose_error_deg)) for name in family
     ]
-    return _pressed(rng, gripped, family, tapped, number)
+    made = press_shapes(rng, gripped, family, tapped, number)
+    return made.pick((made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2)))
 
 
-def _pressed(
+def press_shapes(
     rng: np.random.Generator, gripped: GrippedPad, family: NDArray[np.str_], tapped: list[Tapped], number: int
 ) -> PressSet:
+    """Press shapes onto a pad of that number, with drawn depths, drags and friction; light presses stay."""
     n, taps = len(tapped), len(tapped[0].heights_mm)
     depth_mm = np.repeat(rng.uniform(*INDENTATION_MM, n), taps)
     depth_mm[np.arange(n * taps) % taps > 0] *= rng.uniform(0.85, 1.15, n * (taps - 1))  # ends of taps differ
@@ -120,8 +122,7 @@ def _pressed(
         [one.cover for one in tapped for _ in range(taps)],
     )
     newest = slice(0, None, taps)
-    felt = (done.force_n[newest, 2] > LEAST_FORCE_N) & done.touching[newest].any(axis=(1, 2))
-    made = PressSet(
+    return PressSet(
         family=family,
         pad=np.full(n, number, dtype=np.int64),
         constants=np.tile(constants(gripped.pad), (n, 1)),
@@ -134,4 +135,3 @@ def _pressed(
         twist_nmm=done.twist_nmm[newest],
         indentation_mm=done.indentation_mm[newest],
     )
-    return made.pick(felt)

@@ -9,11 +9,16 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from edge.bundle import BUNDLE_DIR
+from edge.errors import EdgeError
 from edge.progress import tracked
 from train.errors import TrainError
 from train.experiments.workbench import Workbench
 
 EXPERIMENTS: Final = {
+    "families": "the shipped model on every family of shapes, beside baselines",
+    "pads": "the shipped model on pads that are off the nominal one",
+    "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
     "trained_out": "the paper's networks and compact ones, trained alike for many epochs",
     "table4": "STSR at five scales",
@@ -57,13 +62,19 @@ def main(arguments: list[str] | None = None) -> None:
         action="store_true",
         help="trained_out: judge the networks that are there, trained on any machine, and leave out the others",
     )
+    parser.add_argument(
+        "--models", type=Path, default=BUNDLE_DIR, help="folder of the shipped models (default: the bundled ones)"
+    )
+    parser.add_argument(
+        "--before", type=Path, metavar="FILE", help="pads: a model of an earlier release, to be put beside the shipped"
+    )
     options = parser.parse_args(arguments)
-    bench = Workbench(options.data, options.checkpoints, options.quick, options.found)
+    bench = Workbench(options.data, options.checkpoints, options.quick, options.found, options.models, options.before)
     try:
         for name in tracked(options.names, "experiments", "page"):
             page = importlib.import_module(f"train.experiments.{name.replace('-', '_')}").run(bench, options.reports)
             sys.stdout.write(f"{page}\n")
-    except TrainError as error:
+    except (TrainError, EdgeError) as error:
         sys.exit(f"experiments: {error}")
     except KeyboardInterrupt:
         sys.exit("experiments: stopped; the same command goes on where it was")

@@ -13,8 +13,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from edge.bundle import BUNDLE_DIR
 from edge.frozen import FrozenSet
 from firmware_bridge.geometry import USPA44
+from train.data.frozen_presses import FrozenPresses, load_frozen_presses
+from train.data.make_presses import make_presses
+from train.data.presses import PressSet
+from train.data.world import World
 from train.dataset import Sequences
 from train.errors import CheckpointError
 from train.experiments.report import Row, with_interval
@@ -33,6 +38,8 @@ _TIMED_MS: Final = 2000.0
 _QUICK_STEPS: Final = 1
 _QUICK_SEQUENCES: Final = 36
 _QUICK_SURFACES: Final = 2
+_QUICK_PRESSES: Final = 42
+_QUICK_ONE_IN: Final = 12
 _QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
 
 
@@ -45,12 +52,28 @@ class Workbench:
         checkpoints: trained networks, by name.
         quick: everything tiny, to see that it runs.
         found: networks brought from another machine are judged as they are, and those that are not there left out.
+        models: folder of the shipped models.
+        before: file of a model of an earlier release, to be compared with.
     """
 
     data_folder: Path = Path("data")
     checkpoints: Path = Path("checkpoints")
     quick: bool = False
     found: bool = False
+    models: Path = BUNDLE_DIR
+    before: Path | None = None
+
+    def presses(self, name: str, world: World) -> PressSet:
+        """Presses of that world: read if they are there, else made."""
+        if self.quick:
+            name, world = f"quick-{name}", replace(world, count=_QUICK_PRESSES, taps=1, per_pad=_QUICK_PRESSES // 2)
+        self.data_folder.mkdir(parents=True, exist_ok=True)
+        return make_presses(world, self.data_folder / f"{name}.npz")
+
+    def wide_test(self) -> FrozenPresses:
+        """The wide frozen set."""
+        wide = load_frozen_presses()
+        return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
 
     def data(self, name: str, config: Generation) -> Sequences:
         """A dataset: read if it is there, else made."""

@@ -1,0 +1,84 @@
+"""A shipped model on windows and pads, through the session that the runtime runs it with."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.bundle import DEFAULT_MODEL
+from edge.session import ModelSession
+from firmware_bridge.pad import Pad
+from train.data.frozen_presses import FrozenPresses
+
+NOTHING, FORCE, PAD, ALL = KNOWN = ("nothing", "counts per newton", "pad", "pad and gains")
+"""What may be known of a sensor: nothing, one constant of its pad, all of them, or these and its taxels' gains."""
+SHORT: Final = {NOTHING: "model", FORCE: "model, counts/N known", PAD: "model, pad known", ALL: "model, all known"}
+"""Names in tables."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inferred:
+    """What a model made of n windows.
+
+    Attributes:
+        patterns: (n, H, W) in [mm].
+        traction_kpa: (n, 3, h, w), or None where the model gives none.
+        run_time_us: median of a window, scaling included, on one thread.
+    """
+
+    patterns: NDArray[np.float32]
+    traction_kpa: NDArray[np.float32] | None
+    run_time_us: float
+
+
+def load_shipped(folder: Path, name: str = DEFAULT_MODEL) -> ModelSession:
+    """The model of that name.
+
+    Raises:
+        ModelError: it is not there, or cannot be used.
+    """
+    return ModelSession(folder / f"{name}.onnx")
+
+
+def known_pads(frozen: FrozenPresses, known: str) -> list[Pad | None]:
+    """What is known of each sequence's sensor, one of KNOWN."""
+    if known == NOTHING:
+        return [None] * len(frozen)
+    pads = [frozen.pad(index, gains=known == ALL) for index in range(len(frozen))]
+    return [Pad(counts_per_newton=pad.counts_per_newton) for pad in pads] if known == FORCE else [*pads]
+
+
+def infer(model: ModelSession, windows: NDArray[np.float32], pads: Sequence[Pad | None]) -> Inferred:
+    """Run a model as the runtime does, window by window.
+
+    Args:
+        model: the session.
+        windows: (n, taps, 3, rows, cols) in zeroed counts as they were read, of as many taps as the model takes.
+        pads: what is known of the n sensors.
+    """
+    contract = model.contract
+    patterns, tractions, times_s = [], [], []
+    for window, pad in zip(windows, pads, strict=True):
+        gains = None
+        if contract.takes_gains and pad is not None and pad.gains is not None:
+            gains = np.asarray(pad.gains, dtype=np.float32).reshape(window.shape[1:])
+        row = contract.pad_row(pad)
+        started_s = time.perf_counter()
+        pattern = model.run(contract.scale_window(window, gains), row)
+        times_s.append(time.perf_counter() - started_s)
+        patterns.append(pattern.copy())
+        tractions.append(None if model.traction is None else model.traction.copy())
+    return Inferred(
+        np.stack(patterns),
+        None if any(one is None for one in tractions) else np.stack(tractions),
+        1e6 * float(np.median(times_s)),
+    )
+
+
+def infer_presses(model: ModelSession, frozen: FrozenPresses, known: str) -> Inferred:
+    """Run a model on frozen presses, of whose sensors that much is known."""
+    return infer(model, frozen.windows(model.contract.taps), known_pads(frozen, known))
