@@ -171,6 +171,4 @@ def trained(
     return bench.network(training, data, validation)
 
 
-_STARTS: Final = {
-    start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)
-}
+_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)}
