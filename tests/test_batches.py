@@ -21,17 +21,17 @@ def test_a_batch_follows_from_its_number_alone(data):
     one, other = (WindowBatches(data, Draw(), (0.2, 0.3, 0.5), 8, seed=7) for _ in range(2))
     for number in (4, 0, 5, 4):
         _ = other(number + 1)
-        for a, b in zip(one(number), other(number), strict=True):
-            assert torch.equal(a, b)
-    assert not torch.equal(one(0)[0], one(3)[0])
-    assert not torch.equal(one(0)[0], WindowBatches(data, Draw(), (0.2, 0.3, 0.5), 8, seed=8)(0)[0])
+        mine, same = one(number), other(number)
+        assert torch.equal(mine.window, same.window) and torch.equal(mine.pattern, same.pattern)
+    assert not torch.equal(one(0).window, one(3).window)
+    assert not torch.equal(one(0).window, WindowBatches(data, Draw(), (0.2, 0.3, 0.5), 8, seed=8)(0).window)
 
 
 def test_an_epoch_takes_every_sequence_once(data):
     """Truth tells the sequence: unit patterns of the epoch's batches are those of the data, each once."""
     batches = WindowBatches(data, CLEAN, (1.0,), 8, seed=1)
     for first in (0, 3):
-        drawn = torch.cat([batches(number)[1] for number in range(first, first + 3)]).numpy()
+        drawn = torch.cat([batches(number).pattern for number in range(first, first + 3)]).numpy()
         turned = [np.sort((pattern / pattern.max()).ravel()) for pattern in drawn]
         known = [np.sort((pattern / pattern.max()).ravel()) for pattern in data.unit_patterns[:, 0].astype(np.float32)]
         nearest = [int(np.argmin([np.abs(one - other).max() for other in known])) for one in turned]
@@ -66,7 +66,7 @@ def test_a_share_of_figures_is_between_none_and_all(data, share):
 
 def test_older_taps_are_dropped_as_often_as_asked(data):
     batches = WindowBatches(data, CLEAN, (0.25, 0.0, 0.75), 24, seed=1)
-    given = torch.cat([(batches(n)[0].view(24, 3, 48).abs().amax(dim=2) > 0).sum(dim=1) for n in range(50)])
+    given = torch.cat([(batches(n).window.view(24, 3, 48).abs().amax(dim=2) > 0).sum(dim=1) for n in range(50)])
     counts = np.bincount(given.numpy(), minlength=4) / len(given)
     assert counts[0] == counts[2] == 0 and counts[1] == pytest.approx(0.25, abs=0.05)
 

@@ -32,7 +32,7 @@ REST = np.array([15_900, 16_430, 38_600])[:, None, None] + 11 * np.arange(16).re
 @pytest.fixture(scope="module")
 def net():
     torch.manual_seed(0)
-    return build("compact-stsr", 10, channels=8, blocks=1).eval()
+    return build("compact-stsr", 10, channels=16, blocks=1).eval()
 
 
 @pytest.fixture

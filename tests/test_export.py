@@ -28,13 +28,13 @@ from train.nuisances import Nuisances
 from train.training import Training, fit_network, infer, load_network
 
 COMPACT = Training(
-    "sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options={"channels": 8, "blocks": 1}
+    "sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options={"channels": 16, "blocks": 1}
 )
 
 
-def frozen_at(scale: int) -> FrozenSet:
-    """Six presses of four taps, not those of the training."""
-    return freeze(make_sequences(seed=1), Nuisances.none(), seed=1, scale=scale)
+def frozen_at(scale: int, taps: int = 4) -> FrozenSet:
+    """Six presses, not those of the training."""
+    return freeze(make_sequences(taps=taps, seed=1), Nuisances.none(), seed=1, scale=scale)
 
 
 def at_frames(frozen: FrozenSet, frames) -> FrozenSet:
@@ -158,14 +158,15 @@ def test_a_seed_size_network_of_another_scale_has_one_output_and_is_not_judged(f
     assert session.deviation is None
 
 
-@pytest.mark.parametrize("head", ["leave", "doubt"])
+@pytest.mark.parametrize("head", ["leave", "uncertainty", "traction"])
 def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp_path, monkeypatch, head):
     model = onnx.load(folder / "sure.onnx")
     for weight in model.graph.initializer:
         if weight.name.startswith(head) and weight.name.endswith(".bias"):
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * 1.001, weight.name))
     monkeypatch.setattr(to_onnx, "to_model", lambda net, geometry, batch=1: model)
-    with pytest.raises(ParityError, match=f"differ by .* in the {'pattern' if head == 'leave' else 'deviation'}"):
+    output = {"leave": "pattern", "uncertainty": "deviation", "traction": "traction"}[head]
+    with pytest.raises(ParityError, match=f"differ by .* in the {output}"):
         export(folder / "sure.pt", tmp_path, frozen)
     assert not list(tmp_path.iterdir())
 
@@ -199,7 +200,7 @@ def test_the_runtime_takes_any_batch_and_refuses_another_than_one(folder, frozen
 @pytest.mark.parametrize("kind", ["", "compact-"])
 def test_every_network_of_both_families_is_exported(tmp_path, taps, kind):
     name = f"{kind}mtsr{taps}" if taps > 1 else f"{kind}stsr"
-    options = {"channels": 8, "blocks": 1} if kind else {}
+    options = {"channels": 16, "blocks": 1} if kind else {}
     seven = at_frames(freeze(make_sequences(taps=7, seed=1), Nuisances.none(), seed=1, scale=10), slice(0, 96, 30))
     export(save_untrained(tmp_path / "one.pt", name, 4, **options), tmp_path, seven)
     assert ModelSession(tmp_path / "one.onnx").contract.taps == taps
@@ -207,7 +208,7 @@ def test_every_network_of_both_families_is_exported(tmp_path, taps, kind):
 
 @pytest.mark.parametrize("scale", [4, 6, 8, 10, 20])
 def test_every_scale_is_exported(frozen, tmp_path, scale):
-    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", scale, channels=8, blocks=1)
+    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", scale, channels=16, blocks=1)
     assert f"x{scale}" in export(path, tmp_path, frozen)
     assert ModelSession(tmp_path / "one.onnx").contract.pattern_shape == (4 * scale, 4 * scale)
 
@@ -250,7 +251,7 @@ def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, m
     monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
     monkeypatch.setattr(to_onnx, "held_out", lambda split: make_sequences(count=6, seed=2))
     monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
-    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=8, blocks=1)
+    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=16, blocks=1)
     command = [str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz"), "--fine-tune-steps", "2"]
     with pytest.raises(
         SystemExit, match=r"^export: integers cost too much in one-int8\.onnx .*: use the float32 model"

@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +10,7 @@ import torch
 from edge_samples import ROOT
 
 from train import loop
+from train.data.batch import Batch
 from train.loop import DivergedError, NotResumableError, Recipe, learning_rate_share, train
 from train.networks.blocks import PatternNet
 from train.objectives import RelativeError
@@ -37,7 +39,7 @@ def new_net():
 def batches(number):
     rng = np.random.default_rng(number)
     window = torch.from_numpy(rng.standard_normal((4, 3, 4, 4)).astype(np.float32))
-    return window, window[:, 2] * 0.1 + 1
+    return Batch(window, window[:, 2] * 0.1 + 1)
 
 
 def weights(net):
@@ -58,9 +60,9 @@ def test_the_rate_rises_for_a_tenth_and_falls_to_nothing():
 
 def test_training_lowers_the_loss(tmp_path):
     net, done = trained(tmp_path, replace(RECIPE, steps=200))
-    window, truth = batches(999)
+    batch = batches(999)
     assert done.steps == 200 and done.loss < 0.3
-    assert RelativeError().loss(net, window, truth) < 0.3 * RelativeError().loss(new_net(), window, truth)
+    assert RelativeError().loss(net, batch) < 0.3 * RelativeError().loss(new_net(), batch)
     assert not net.training
 
 
@@ -140,8 +142,8 @@ def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
     before = weights(net)
 
     def poisoned(number):
-        window, truth = batches(number)
-        return window * torch.nan, truth
+        batch = batches(number)
+        return replace(batch, window=batch.window * torch.nan)
 
     with pytest.raises(DivergedError, match="step 0: lower the learning rate"):
         train(net, RelativeError(), poisoned, RECIPE, tmp_path / "net.resume")
@@ -174,7 +176,7 @@ def test_figures_go_to_tensorboard(tmp_path):
 
 
 WORKER = """
-import sys, json, torch
+import os, sys, json, torch
 sys.path.insert(0, "tests")
 from pathlib import Path
 from test_loop import batches, new_net, weights, RECIPE
@@ -186,7 +188,8 @@ def recorded(number):
     return batches(number)
 train(net, RelativeError(), recorded, RECIPE, Path(sys.argv[1]) / "net.resume")
 rank, world = rank_and_world()
-print(json.dumps([rank, world, used, weights(net).tolist()]), file=open(f"{sys.argv[1]}/rank{rank}.json", "w"))
+cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+print(json.dumps([rank, world, used, weights(net).tolist(), cores]), file=open(f"{sys.argv[1]}/rank{rank}.json", "w"))
 leave_group()
 """
 
@@ -205,6 +208,8 @@ def test_two_processes_share_every_batch_and_end_where_one_does(tmp_path):
     assert first[3] == second[3]
     alone, _ = trained(tmp_path)
     assert first[3] == pytest.approx(weights(alone).tolist(), abs=1e-5)
+    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1 and not torch.cuda.is_available():
+        assert first[4] and second[4] and not set(first[4]) & set(second[4]), "two processes on one core wait for it"
 
 
 def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path, monkeypatch):
@@ -213,7 +218,31 @@ def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path, monkeypatch):
         trained(tmp_path)
 
 
-def _environment():
-    import os
+@pytest.mark.parametrize(
+    ("cores", "world", "shares"),
+    [
+        (range(4), 2, [{0, 1}, {2, 3}]),
+        (range(3), 2, [{0}, {1, 2}]),
+        ([5, 7], 2, [{5}, {7}]),
+        ([5], 2, [None, {5}]),
+        (range(4), 1, [None]),
+    ],
+)
+def test_processes_keep_to_their_shares_of_the_cores(monkeypatch, cores, world, shares):
+    for rank, share in enumerate(shares):
+        kept = []
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(cores), raising=False)
+        monkeypatch.setattr(os, "sched_setaffinity", lambda _, mine, kept=kept: kept.append(set(mine)), raising=False)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        loop._keep_apart(rank, world)
+        assert kept == ([] if share is None else [share])
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        loop._keep_apart(rank, world)
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        monkeypatch.delattr(os, "sched_setaffinity")
+        loop._keep_apart(rank, world)
+        assert len(kept) == (share is not None), "a GPU computes, or the system has no such call"
 
+
+def _environment():
     return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from train.networks.compact import CompactNet, HeteroscedasticError, heteroscedastic_loss
+from train.data.batch import Batch
+from train.networks.compact import TRACTION_SCALE, CompactNet, HeteroscedasticError, heteroscedastic_loss
 from train.objectives import relative_error
 
 
@@ -24,41 +25,52 @@ def truth_like(pattern, seed=5):
 
 @pytest.mark.parametrize(("taps", "scale"), [(1, 4), (7, 6), (4, 8), (4, 10), (2, 20)])
 def test_shapes_follow_taps_and_scale(taps, scale):
-    small = CompactNet(taps, scale, 8, 1)
-    for output in small(window(taps=taps)):
-        assert output.shape == (3, 4 * scale, 4 * scale)
+    small = CompactNet(taps, scale, 16, 1)
+    pattern, deviation, traction = small(window(taps=taps))
+    assert pattern.shape == deviation.shape == (3, 4 * scale, 4 * scale)
+    assert traction.shape == (3, 3, 4 * TRACTION_SCALE, 4 * TRACTION_SCALE)
     assert (small.taps, small.scale) == (taps, scale)
 
 
-@pytest.mark.parametrize(("taps", "scale", "said"), [(1, 5, "even"), (1, 0, "even"), (0, 4, "at least 1")])
-def test_taps_and_scales_out_of_range_are_refused(taps, scale, said):
+@pytest.mark.parametrize(
+    ("taps", "scale", "channels", "said"),
+    [(1, 5, 16, "even"), (1, 0, 16, "even"), (0, 4, 16, "at least 1"), (1, 4, 8, "multiple of the 8 symmetries")],
+)
+def test_taps_scales_and_channels_out_of_range_are_refused(taps, scale, channels, said):
     with pytest.raises(ValueError, match=said):
-        CompactNet(taps, scale)
+        CompactNet(taps, scale, channels)
 
 
 def test_absent_taps_are_the_same_as_fewer_taps(net):
     for taps in (1, 2, 3):
         given = window()
         given[:, 3 * taps :] = 0
-        fewer = net.with_fewer_taps(taps).eval()(given[:, : 3 * taps])
-        for output, expected in zip(net(given), fewer, strict=True):
-            assert torch.allclose(output, expected, atol=1e-6)
+        fewer = CompactNet(taps, 10, channels=16, blocks=2, group=net.group).eval()
+        fewer.take_over(net)
+        for output, expected in zip(net(given), fewer(given[:, : 3 * taps]), strict=True):
+            assert torch.allclose(output, expected, atol=1e-6 * float(output.detach().abs().max()) + 1e-6)
 
 
 def test_fewer_taps_have_weights_and_calibration_of_their_own():
     torch.manual_seed(1)
-    net = CompactNet(4, 4, 8, 1)
+    net = CompactNet(4, 4, 16, 1)
     net.deviation_scale.fill_(1.5)
     before = net.enter.weight.clone()
-    fewer = net.with_fewer_taps(2)
+    fewer = CompactNet(2, 4, 16, 1)
+    fewer.take_over(net)
     assert fewer.deviation_scale == 1.5
     with torch.no_grad():
         for value in (*fewer.parameters(), fewer.deviation_scale):
             value.zero_()
     assert (net.enter.weight == before).all()
     assert net.deviation_scale == 1.5
-    with pytest.raises(ValueError, match="expected 1 to 4"):
-        net.with_fewer_taps(5)
+
+
+@pytest.mark.parametrize("other", [{"channels": 32}, {"blocks": 2}, {"known": 13}])
+def test_another_width_or_other_inputs_of_the_pad_are_not_taken_over(other):
+    start = CompactNet(1, 4, **{"channels": 16, "blocks": 1, **other})
+    with pytest.raises(ValueError, match="its width and inputs of the pad are"):
+        CompactNet(2, 4, 16, 1).take_over(start)
 
 
 def test_patterns_are_cut_at_zero_in_use_alone(net):
@@ -67,46 +79,47 @@ def test_patterns_are_cut_at_zero_in_use_alone(net):
     net.eval()
 
 
-def test_a_firm_tap_scales_pattern_and_deviation(net):
+def test_a_firm_tap_scales_pattern_deviation_and_traction(net):
     with torch.inference_mode():
         for firm, firmer in zip(net(20 * window()), net(200 * window()), strict=True):
-            assert torch.allclose(firmer, 10 * firm, rtol=0.05, atol=0.05 * float(firmer.max()))
+            assert torch.allclose(firmer, 10 * firm, rtol=0.05, atol=0.05 * float(firmer.abs().max()))
 
 
 @pytest.mark.parametrize("factor", [0.0, 1e-40, 1e-6, 1e3, 1e6])
 def test_extreme_windows_give_finite_patterns_and_deviations_above_zero(net, factor):
-    pattern, deviation = net(factor * window())
+    pattern, deviation, traction = net(factor * window())
     assert torch.isfinite(pattern).all()
     assert torch.isfinite(deviation).all()
+    assert torch.isfinite(traction).all()
     assert (deviation > 0).all()
 
 
 def test_no_tap_at_all_gives_next_to_nothing(net):
     for nothing, something in zip(net(torch.zeros(1, 12, 4, 4)), net(window()), strict=True):
-        assert nothing.max() < 0.03 * something.max()
+        assert nothing.abs().max() < 0.03 * something.abs().max()
 
 
 def test_the_scale_of_deviations_changes_nothing_else(net):
-    pattern, deviation = net(window())
+    pattern, deviation, traction = net(window())
     net.deviation_scale.fill_(1.7)
-    again, wider = net(window())
+    again, wider, pulled = net(window())
     net.deviation_scale.fill_(1.0)
-    assert torch.equal(pattern, again)
+    assert torch.equal(pattern, again) and torch.equal(traction, pulled)
     assert torch.allclose(wider, 1.7 * deviation)
     assert "deviation_scale" in net.state_dict()
 
 
 def test_the_pattern_learns_as_if_there_were_no_deviation():
     torch.manual_seed(2)
-    net = CompactNet(2, 4, 8, 1).train()
-    pattern, deviation = net(window(taps=2))
+    net = CompactNet(2, 4, 16, 1).train()
+    learns = {name: value for name, value in net.named_parameters() if not name.startswith("traction")}
+    pattern, deviation, _ = net(window(taps=2))
     truth = truth_like(pattern)
-    of_both = torch.autograd.grad(heteroscedastic_loss(pattern, deviation, truth), list(net.parameters()))
-    names = [name for name, _ in net.named_parameters()]
-    pattern, _ = net(window(taps=2))
-    alone = torch.autograd.grad(relative_error(pattern, truth), list(net.parameters()), allow_unused=True)
-    for name, both, one in zip(names, of_both, alone, strict=True):
-        if name.startswith("doubt"):
+    of_both = torch.autograd.grad(heteroscedastic_loss(pattern, deviation, truth), list(learns.values()))
+    pattern, *_ = net(window(taps=2))
+    alone = torch.autograd.grad(relative_error(pattern, truth), list(learns.values()), allow_unused=True)
+    for name, both, one in zip(learns, of_both, alone, strict=True):
+        if name.startswith("uncertainty"):
             assert one is None
             assert both.abs().max() > 0
         else:
@@ -167,7 +180,7 @@ def test_deviations_learn_where_errors_are():
         truth = torch.full((32, 8, 8), 0.2)
         truth[1::2, :, :3] += 0.1 * torch.randn(16, 8, 3, generator=generator)
         optimizer.zero_grad()
-        objective.loss(net, windows, truth).backward()
+        objective.loss(net, Batch(windows, truth)).backward()
         optimizer.step()
     deviation = net.eval()(torch.cat([sure, unsure]))[1]
     assert deviation[1, :, :3].mean() > 3 * deviation[1, :, 4:].mean()
@@ -180,28 +193,59 @@ def test_low_precision_gives_nearly_the_same(net):
         low = net(window())
     for coarse, fine in zip(low, net(window()), strict=True):
         assert coarse.dtype == torch.float32
-        assert torch.allclose(coarse, fine, atol=0.05 * float(fine.detach().max()))
+        assert torch.allclose(coarse, fine, atol=0.05 * float(fine.detach().abs().max()))
 
 
-def test_the_graph_holds_both_outputs(net):
+def test_the_graph_holds_all_outputs(net):
     onnxruntime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
     program = torch.onnx.export(
-        net, (window(1),), dynamo=True, opset_version=18, input_names=["window"], output_names=["p", "d"], verbose=False
+        net,
+        (window(1),),
+        dynamo=True,
+        opset_version=18,
+        input_names=["window"],
+        output_names=["p", "d", "t"],
+        verbose=False,
     )
     assert program is not None
     session = onnxruntime.InferenceSession(program.model_proto.SerializeToString())
-    got = session.run(["p", "d"], {"window": window(1, seed=9).numpy()})
+    got = session.run(["p", "d", "t"], {"window": window(1, seed=9).numpy()})
     for output, expected in zip(got, net(window(1, seed=9)), strict=True):
-        assert np.allclose(output, expected.detach().numpy(), atol=1e-6)
+        true = expected.detach().numpy()
+        assert np.allclose(output, true, atol=1e-6 * max(1, np.abs(true).max()))
 
 
-def test_with_more_taps_the_function_is_the_same_until_it_is_trained():
+@pytest.mark.parametrize("taps", [1, 2])
+def test_with_more_taps_the_function_is_the_same_until_it_is_trained(taps):
     torch.manual_seed(0)
-    net = CompactNet(2, 10, channels=8, blocks=1).eval()
-    larger = net.with_more_taps(4).eval()
-    window = torch.randn(3, 12, 4, 4)
-    for ours, theirs in zip(larger(window), net(window[:, :6]), strict=True):
-        assert torch.allclose(ours, theirs, atol=1e-6)
-    with pytest.raises(ValueError, match="expected 2 or more"):
-        net.with_more_taps(1)
+    net = CompactNet(taps, 10, channels=16, blocks=1, known=3).eval()
+    larger = CompactNet(4, 10, channels=16, blocks=1, known=3).eval()
+    larger.take_over(net)
+    given, pad = torch.randn(3, 12, 4, 4), torch.randn(3, 3)
+    for ours, theirs in zip(larger(given, pad), net(given[:, : 3 * taps], pad), strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-6 * float(theirs.detach().abs().max()) + 1e-6)
+
+
+def test_what_is_known_of_the_pad_changes_the_outputs_and_nothing_known_is_zeros():
+    torch.manual_seed(0)
+    net = CompactNet(1, 4, channels=16, blocks=1, known=3).eval()
+    unknown, zeros = net(window(taps=1)), net(window(taps=1), torch.zeros(3, 3))
+    assert all(torch.equal(one, other) for one, other in zip(unknown, zeros, strict=True))
+    assert not torch.allclose(unknown[0], net(window(taps=1), torch.ones(3, 3))[0])
+
+
+def test_traction_is_learned_where_it_is_known_and_light_pulls_count_as_firm_ones():
+    torch.manual_seed(0)
+    net = CompactNet(1, 4, channels=16, blocks=1)
+    pattern, _, traction = net(window(taps=1))
+    truth, pulled = truth_like(pattern), torch.randn(traction.shape)
+    loss = HeteroscedasticError().loss
+    alone = float(loss(net, Batch(window(taps=1), truth)).detach())
+    share = [
+        float(loss(net, Batch(window(taps=1), truth, traction=(traction.detach() + pulled * size))).detach()) - alone
+        for size in (100.0, 1e4)
+    ]
+    assert 0 < share[0] == pytest.approx(share[1], rel=0.1)
+    right = loss(net, Batch(window(taps=1), truth, traction=traction.detach()))
+    assert float(right.detach()) == pytest.approx(alone, abs=1e-6)

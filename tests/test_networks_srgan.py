@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch import nn
 
+from train.data.batch import Batch
 from train.networks.srgan import Discriminator, SrganObjective, TactileSRGAN
 from train.objectives import relative_error
 
@@ -72,25 +73,25 @@ def test_the_critic_learns_to_tell_and_the_network_feels_it():
 
     before = lead()
     for _ in range(40):
-        objective.loss(net, window, truth)
+        objective.loss(net, Batch(window, truth))
         objective.after_step()
     assert lead() > before + 0.1
 
 
 def test_the_loss_is_the_error_less_a_share_of_the_critics_view():
     truth, window, net = patterns(), torch.zeros(6, 3, 4, 4), Plain()
-    plain = SrganObjective(adversarial_share=0.0).loss(net, window, truth)
+    plain = SrganObjective(adversarial_share=0.0).loss(net, Batch(window, truth))
     assert torch.allclose(plain, relative_error(net(window), truth))
     objective = SrganObjective(adversarial_share=0.5)
     size = truth.square().mean(dim=(1, 2), keepdim=True).sqrt()
     expected = plain - 0.5 * objective.critic(net(window) / size).mean()
-    assert torch.allclose(objective.loss(net, window, truth), expected)
+    assert torch.allclose(objective.loss(net, Batch(window, truth)), expected)
 
 
 def test_network_and_critic_keep_out_of_each_others_weights():
     objective, net = SrganObjective(), Plain()
     critic = copy.deepcopy(objective.critic.state_dict())
-    objective.loss(net, torch.zeros(6, 3, 4, 4), patterns()).backward()
+    objective.loss(net, Batch(torch.zeros(6, 3, 4, 4), patterns())).backward()
     assert net.value.grad is not None
     assert all(p.grad is None for p in objective.critic.parameters())
     gradient = net.value.grad.clone()
@@ -101,7 +102,7 @@ def test_network_and_critic_keep_out_of_each_others_weights():
 
 def test_nothing_is_learnt_twice_from_one_batch():
     objective = SrganObjective()
-    objective.loss(Plain(), torch.zeros(6, 3, 4, 4), patterns())
+    objective.loss(Plain(), Batch(torch.zeros(6, 3, 4, 4), patterns()))
     objective.after_step()
     once = copy.deepcopy(objective.critic.state_dict())
     objective.after_step()
@@ -111,7 +112,7 @@ def test_nothing_is_learnt_twice_from_one_batch():
 def test_a_run_cut_short_goes_on_as_if_it_were_not(tmp_path):
     def train(objective, seeds):
         for seed in seeds:
-            objective.loss(Plain(), torch.zeros(6, 3, 4, 4), patterns(seed=seed))
+            objective.loss(Plain(), Batch(torch.zeros(6, 3, 4, 4), patterns(seed=seed)))
             objective.after_step()
         return objective
 
@@ -136,7 +137,7 @@ def test_the_generator_trains_under_low_precision():
     torch.manual_seed(6)
     net, objective = TactileSRGAN(2).train(), SrganObjective()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        loss = objective.loss(net, torch.randn(2, 3, 4, 4), patterns(2))
+        loss = objective.loss(net, Batch(torch.randn(2, 3, 4, 4), patterns(2)))
     loss.backward()
     objective.after_step()
     assert torch.isfinite(loss)
@@ -145,6 +146,6 @@ def test_the_generator_trains_under_low_precision():
 
 def test_patterns_of_light_and_firm_contacts_look_the_same_to_the_critic():
     objective, truth = SrganObjective(adversarial_share=1.0), patterns()
-    firm = objective.loss(Plain(0.1), torch.zeros(6, 3, 4, 4), truth)
-    light = objective.loss(Plain(0.001), torch.zeros(6, 3, 4, 4), truth / 100)
+    firm = objective.loss(Plain(0.1), Batch(torch.zeros(6, 3, 4, 4), truth))
+    light = objective.loss(Plain(0.001), Batch(torch.zeros(6, 3, 4, 4), truth / 100))
     assert float(firm) == pytest.approx(float(light), rel=1e-4)

@@ -8,15 +8,16 @@ import torch
 from edge.metrics import psnr_db
 from train.calibration import interval_coverage
 from train.errors import CheckpointError
-from train.fit import BASE, BUNDLED, given_taps, main
+from train.fit import BUNDLED, given_taps, main
 from train.freeze import SEED, freeze, held_out
 from train.generation import Generation, solve_all
 from train.loop import Recipe
 from train.networks.compact import CompactNet
 from train.nuisances import Nuisances
+from train.physics.pads import KNOWN
 from train.training import Training, best_contact_level, fit_network, infer, load_network
 
-SMALL = {"channels": 8, "blocks": 1}
+SMALL = {"channels": 16, "blocks": 1}
 TRAINING = Training(
     "small", "compact-mtsr2", Recipe(steps=150, batch=16, learning_rate=5e-3, given=(0.5, 0.5)), options=SMALL
 )
@@ -120,7 +121,7 @@ def test_what_is_no_checkpoint_is_refused_by_name(folder, tmp_path, damage, caps
     path = tmp_path / "net.pt"
     if damage != "no report":
         path.with_suffix(".json").write_text(
-            report.replace('"channels": 8', '"channels": 16') if damage == "other size" else report
+            report.replace('"channels": 16', '"channels": 32') if damage == "other size" else report
         )
     if damage == "hostile":
         torch.save({"weight": Hostile()}, path)
@@ -145,10 +146,12 @@ def test_windows_of_every_number_of_taps_are_drawn(taps):
     assert len(shares) == taps and sum(shares) == pytest.approx(1) and min(shares) > 0
 
 
-def test_the_bundled_networks_start_from_the_base():
-    assert {training.name for training in BUNDLED} == {"stsr", "mtsr2", "mtsr4"}
-    assert {training.start for training in BUNDLED} == {BASE.name}
-    assert all(len(training.recipe.given) <= len(BASE.recipe.given) for training in BUNDLED)
+def test_bundled_networks_start_from_nothing_or_one_before_and_take_what_is_known_of_the_pad():
+    before = [None]
+    for training in BUNDLED:
+        assert training.start in before and training.options == {"known": KNOWN}
+        before.append(training.name)
+    assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2"]
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):

@@ -127,12 +127,12 @@ def rank_and_world() -> tuple[int, int]:
         return 0, 1
     if not distributed.is_initialized():
         distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        _keep_apart(distributed.get_rank(), distributed.get_world_size())
+        _keep_apart(int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"]))  # of this machine
     return distributed.get_rank(), distributed.get_world_size()
 
 
 def _keep_apart(rank: int, world: int) -> None:
-    """Pin one of several processes that train on a processor to its share of the cores that it may run on.
+    """Pin one of several processes of a machine without a GPU to its share of the cores that it may run on.
 
     Left to itself the kernel was seen to keep two on one core for minutes, each with half of it, while the other core
     idled: they wait for each other at every step, so neither is ever busy for long enough to be moved.

@@ -1,6 +1,6 @@
 """A batch to learn from."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,6 +23,14 @@ class Batch:
     traction: Tensor | None = None
 
     def share(self, rank: int, world: int, device: torch.device) -> "Batch":
-        """The part of one of several processes, on its device."""
-        parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Batch(**{name: None if part is None else part[rank::world].to(device) for name, part in parts.items()})
+        """Return the part of one of several processes, on its device."""
+
+        def mine(part: Tensor) -> Tensor:
+            return part[rank::world].to(device)
+
+        return Batch(
+            mine(self.window),
+            mine(self.pattern),
+            None if self.pad is None else mine(self.pad),
+            None if self.traction is None else mine(self.traction),
+        )

@@ -15,7 +15,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import joblib
 
@@ -58,9 +58,8 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
         pool = joblib.Parallel(n_jobs=jobs)
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
-            for number, part in zip(
-                numbers, pool(joblib.delayed(solve_pad)(world, one) for one in numbers), strict=True
-            ):
+            solved = cast(list[PressSet], pool(joblib.delayed(solve_pad)(world, one) for one in numbers))
+            for number, part in zip(numbers, solved, strict=True):
                 replace(part, config=facts).save(_part(folder, number))
                 bar.advance()
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]

@@ -84,7 +84,7 @@ class PressBatches:
         toss = rng.random(len(constants))[:, None]
         coins = rng.random(constants.shape) < 0.5
         known = np.where(toss < _NOTHING, False, (toss < _NOTHING + _ALL) | coins)
-        measured = constants + _SURE * rng.standard_normal(constants.shape).astype(np.float32)
+        measured = constants + np.float32(_SURE) * rng.standard_normal(constants.shape).astype(np.float32)
         return known_numbers(measured, known, gains_known)
 
     def _index(self, number: int) -> NDArray[np.int64]:

@@ -111,7 +111,8 @@ def press_shapes(
     depth_mm[np.arange(n * taps) % taps > 0] *= rng.uniform(0.85, 1.15, n * (taps - 1))  # ends of taps differ
     dragged = rng.random(n * taps) > _STILL
     way = rng.uniform(0, 2 * np.pi, n * taps)
-    far = np.exp(rng.uniform(*np.log(_SLIDE_MM), n * taps)) * dragged
+    low, high = np.log(_SLIDE_MM)
+    far = np.exp(rng.uniform(low, high, n * taps)) * dragged
     twist = rng.normal(0, _TWIST_RAD, n * taps) * (dragged & (rng.random(n * taps) < 0.5))
     done = gripped.press(
         np.concatenate([one.heights_mm for one in tapped]),

@@ -97,7 +97,7 @@ def draw_shape(
     parts = [SHAPES[family]] if family != "two" else [SHAPES[name] for name in rng.choice(_PAIRED, 2)]
     heights = [maker(rng) for maker in parts]
     places = [_lie(rng, family, index) for index in range(len(parts))]
-    angle = -ANGLE_STEP_DEG * np.arange(taps)
+    angle = -ANGLE_STEP_DEG * np.arange(taps, dtype=np.float64)
     off = rng.standard_normal((taps, 3)).clip(-2, 2) * (pose_error[0], pose_error[0], pose_error[1])
     x, y = np.broadcast_arrays(*pad.places_mm)
     maps = []

@@ -39,7 +39,8 @@ class Lie:
         turn = np.radians(self.angle_deg)
         cosine, sine = np.float32(np.cos(turn)), np.float32(np.sin(turn))
         right, down = x_mm - np.float32(self.x_mm), y_mm - np.float32(self.y_mm)
-        raised = height(cosine * right + sine * down, cosine * down - sine * right)
+        across, along = cosine * right + sine * down, cosine * down - sine * right
+        raised = height(across.astype(np.float32, copy=False), along.astype(np.float32, copy=False))
         if self.slope_x or self.slope_y:
             raised = raised + np.float32(self.slope_x) * x_mm + np.float32(self.slope_y) * y_mm
         return raised.astype(np.float32, copy=False)

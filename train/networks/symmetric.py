@@ -176,9 +176,7 @@ class SymmetricConv2d(nn.Module):
         """The same as an ordinary convolution, with weights of its own."""
         leave, enter, kernel, _ = self._weight_sign.shape
         plain = nn.Conv2d(enter, leave, kernel, padding=self._padding)
-        with torch.no_grad():
-            plain.weight.copy_(self.weight)
-            plain.bias.copy_(self.bias)
+        plain.load_state_dict({"weight": self.weight, "bias": self.bias})
         return plain
 
 
@@ -222,4 +220,4 @@ def _move(maps: NDArray[np.generic], turns: int, mirrored: bool) -> NDArray[np.g
 def _moved_places(group: Group, side: int) -> NDArray[np.int64]:
     """Where each pixel of a `side` x `side` map comes from, (symmetries, side * side)."""
     places = np.arange(side * side).reshape(side, side)
-    return np.array([_move(places, *element).ravel() for element in _ELEMENTS[group]])
+    return np.array([_move(places, *element).ravel() for element in _ELEMENTS[group]], dtype=np.int64)
