@@ -40,6 +40,8 @@ STDOUT: Final = 1
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
 EXIT_SINK: Final = 5
+EXIT_INTERRUPTED: Final = 130
+"""By Ctrl-C, where nothing was begun yet that ends well; as a shell says it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read stdout has had enough; point it elsewhere, or Python complains at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), STDOUT)
         return 0
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
     except (BridgeError, EdgeError) as error:
         print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
         return _exit_code(error)

@@ -88,7 +88,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             contextlib.ExitStack() as closing,
         ):
             messages = MessageSink(said=None if ladder is None else ladder.choice.why)
-            opener = partial(open_sink, contract=model.contract, source=source)
+            opener = partial(open_sink, contract=model.contract, source=source, stop=stop)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say)
                 commands = view.commands(commands)
