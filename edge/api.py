@@ -275,13 +275,14 @@ def open_recording(
     return recordings.open_recording(path, sensor=sensor, zero=zero, paced=paced, rate_hz=rate_hz)
 
 
-def open_sink(text: str, contract: Contract, source: Source) -> Sink:
+def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.Event | None = None) -> Sink:
     """Where results go, as `edge-sr --sink` names it; close it when the last is written.
 
     Args:
         text: "jsonl:FILE", "npz:FILE.npz", "mcap:FILE.mcap", ...
         contract: of the model that makes the results.
         source: open. Of a sensor, records are left out for readers that are too slow; of a recording none is.
+        stop: set when the run is to end: then nothing waits for a reader of a recording's records, either.
 
     Raises:
         UsageError: no such form; the forms are listed. Or the source is not open.
@@ -295,6 +296,7 @@ def open_sink(text: str, contract: Contract, source: Source) -> Sink:
         unix_offset_ns=source.unix_offset_ns,
         source=source.kind,
         origin=source.origin,
+        stop=stop,
     )
 
 

@@ -43,6 +43,8 @@ from edge.streams import guarded_streams, open_closed_streams
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
 EXIT_SINK: Final = 5
+EXIT_INTERRUPTED: Final = 130
+"""By Ctrl-C, where nothing was begun yet that ends well; as a shell says it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,6 +63,8 @@ def _main(arguments: Sequence[str]) -> int:
         with guarded_streams():
             return _run(arguments) if command is None else command(arguments[1:])
         return 0
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
     except (BridgeError, EdgeError) as error:
         with contextlib.suppress(OSError):  # the terminal may have gone
             print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)

@@ -11,9 +11,11 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final
 
 from edge.commands import RESET, ZERO, Command
+from edge.ending import before_force
 
 KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
 READ_BYTES: Final = 64
@@ -96,7 +98,7 @@ def terminal_keys() -> Iterator[KeyCommands | None]:
         yield None
         return
     keys = KeyCommands(sys.stdin.fileno())
-    with _given_back_on_signals(keys):
+    with _given_back_on_signals(keys), before_force(partial(keys.give_back, for_good=True)):
         keys.take()
         try:
             yield keys

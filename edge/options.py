@@ -71,7 +71,7 @@ examples:
           --sink npz:out.npz
 
 exit codes: 2 usage, 3 device, 4 model,
-5 sink
+5 sink, 6 ended by force
 """
 
 BASELINE_HELP: Final = """\

@@ -90,7 +90,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
         ):
             hint = _silence_hint(options.source)
             messages = MessageSink(said=None if ladder is None else ladder.choice.why, hint=hint)
-            opener = partial(open_sink, contract=model.contract, source=source)
+            opener = partial(open_sink, contract=model.contract, source=source, stop=stop)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say)
                 commands = view.commands(commands)

@@ -6,11 +6,12 @@ import threading
 from collections.abc import Iterator
 
 from edge.commands import ZERO, Command
+from edge.ending import ended_in_time
 
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that the first signal sets; a second signal ends the program at once."""
+    """An event that the first signal sets; what is within has END_S to end then. A second signal ends it at once."""
     stop = threading.Event()
 
     def handle(number: int, frame: object) -> None:
@@ -20,7 +21,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
     names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     before = {getattr(signal, name): signal.signal(getattr(signal, name), handle) for name in names}
     try:
-        yield stop
+        with ended_in_time(before):
+            yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -54,6 +54,8 @@ class TestAccess:
             ("127.0.0.1.evil.example", False),
             ("localhost.evil.example", False),
             ("evil.example@127.0.0.1.x", False),
+            ("evil@127.0.0.1", False),
+            ("evil:word@localhost:8077", False),
             ("192.168.0.5:8077", False),
             ("robot:8077", False),
             ("", False),

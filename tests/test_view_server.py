@@ -12,22 +12,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from view_samples import CONTRACT, TIMEOUT_S, Press, frame, live_page, wait_for
+from view_samples import CONTRACT, HANDSHAKE, LONG_PING, TIMEOUT_S, Press, Swallowing, frame, live_page, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
 from edge.commands import Command
 from edge.errors import SinkError
 from edge.event import Event
 from edge.pump import uncollected
-from edge.view import server
+from edge.view import attended, connections, server
 from edge.view.live import LiveView
 from edge.view.page import PAGE_FILE
 from firmware_bridge.recording import load_recording
 
-HANDSHAKE = (
-    b"GET /ws HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-)
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"
 TOKEN = "correct-horse-battery"
 
@@ -107,6 +104,22 @@ class TestPage:
         with page.stranger(request_) as stranger, suppress(ConnectionResetError):
             assert b" 200 " not in stranger.recv(1000)
         assert get(page)[0] == 200
+
+    @pytest.mark.parametrize("method", ["POST", "PUT", "HEAD", "G", "GETS"])
+    def test_another_method_is_answered_whatever_comes_behind_it(self, page, method):
+        connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=TIMEOUT_S)
+        connection.request(method, "/", body="x" * 5000)
+        response = connection.getresponse()
+        assert response.status == 405 and (method == "HEAD" or response.read() == b"only GET\n")
+        connection.close()
+
+    def test_a_request_byte_by_byte_is_one(self, page):
+        with page.stranger() as stranger:
+            stranger.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for byte in b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n":
+                stranger.sendall(bytes([byte]))
+                time.sleep(0.001)
+            assert stranger.recv(100).startswith(b"HTTP/1.1 200")
 
     def test_who_says_nothing_is_not_waited_for(self, tmp_path, monkeypatch):
         monkeypatch.setattr(server, "OPEN_S", 0.1)
@@ -194,6 +207,17 @@ class TestFrames:
         assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1001, "the run has ended")
         assert not any(thread.name == "live-view" for thread in threading.enumerate())
 
+    def test_who_reads_nothing_and_who_says_nothing_hold_up_no_end(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(server, "OPEN_S", 60.0)
+        with live_page(tmp_path) as page, page.stranger(), page.stranger(HANDSHAKE):
+            wait_for(lambda: viewers(page) == 1)
+            (watching,) = page.view._server._viewers
+            page.view._server._loop.call_soon_threadsafe(watching.transport.write, bytes(50_000_000))
+            closing = threading.Thread(target=page.view._server.close)
+            closing.start()
+            closing.join(20)  # it is over in one second, or in a minute at the earliest
+            assert not closing.is_alive()
+
 
 class TestCommands:
     def test_they_reach_the_loop(self, page):
@@ -272,11 +296,11 @@ class TestMany:
             assert newest["scan"] > 10 and header["scan"] >= 1
 
     def test_who_never_reads_costs_little_and_harms_nobody(self, page, monkeypatch):
-        monkeypatch.setattr(server, "LATE_S", 0.1)
+        monkeypatch.setattr(attended, "LATE_S", 0.1)
         blocked = page.stranger(HANDSHAKE)
         wait_for(lambda: viewers(page) == 1)
-        (attended,) = page.view._server._viewers.items()
-        transport = attended[0].transport
+        (watching,) = page.view._server._viewers
+        transport = watching.transport
         with blocked, page.viewer() as other, page.playing():
             most_bytes = 0
             for _ in range(30):  # the loop goes on for the other
@@ -286,13 +310,43 @@ class TestMany:
         assert most_bytes < 200_000
 
     def test_who_never_reads_is_closed(self, page, monkeypatch):
-        monkeypatch.setattr(server, "GONE_S", 0.2)
+        monkeypatch.setattr(attended, "GONE_S", 0.2)
         with page.stranger(HANDSHAKE):
             wait_for(lambda: viewers(page) == 1)
             wait_for(lambda: viewers(page) == 0)
 
+    def test_the_place_of_a_viewer_whose_network_vanishes_is_free_again(self, page, monkeypatch):
+        monkeypatch.setattr(attended, "GONE_S", 0.5)
+        page.view._server._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # the network takes little
+        with Swallowing(page.port) as network, page.playing():
+            settings = {"compression": None, "close_timeout": 0, "max_queue": 1000}
+            with connect(f"ws://127.0.0.1:{network.port}/ws", **settings) as viewer:
+                frame(viewer, "result")
+                (watching,) = page.view._server._viewers
+                network.swallow()
+                wait_for(lambda: watching.transport.get_write_buffer_size() > 40_000)
+                wait_for(lambda: page.view._server._connections.granted == 0)
+
+    def test_the_place_of_one_that_does_not_take_its_first_frame_is_free_again(self, page, monkeypatch):
+        monkeypatch.setattr(server, "OPEN_S", 0.2)
+        monkeypatch.setattr(server, "hello", lambda run, recording: b"x" * 50_000_000)
+        with page.stranger(HANDSHAKE):
+            wait_for(lambda: page.view._server._connections.granted == 1)
+            wait_for(lambda: page.view._server._connections.granted == 0)
+
+    @pytest.mark.parametrize("frame_", [LONG_PING, b"\x8a\x80mask", b"\x81\x82mask{}"], ids=["ping", "pong", "text"])
+    def test_who_sends_more_than_a_person_asks_for_is_cut_off(self, page, frame_, monkeypatch):
+        monkeypatch.setattr(attended, "GONE_S", 600.0)  # not because it reads nothing
+        with page.viewer() as other, page.stranger(HANDSHAKE) as flood:
+            with pytest.raises(ConnectionError):
+                for _ in range(300_000_000 // 1000 // len(frame_)):
+                    flood.sendall(1000 * frame_)
+            wait_for(lambda: viewers(page) == 1)
+            page.play()
+            assert frame(other, "result")
+
     def test_behind_a_pause_in_reading_comes_the_newest(self, page, monkeypatch):
-        monkeypatch.setattr(server, "LATE_S", 0.05)
+        monkeypatch.setattr(attended, "LATE_S", 0.05)
         with page.viewer(max_queue=2) as viewer, page.playing():
             headers = [frame(viewer, "result")[0]]
             end = page.press.number + 100
@@ -307,28 +361,30 @@ class TestMany:
             assert traced == sorted(set(traced))
 
     def test_more_than_there_is_room_for_are_told(self, page, monkeypatch):
-        monkeypatch.setattr(server, "MOST_VIEWERS", 2)
+        monkeypatch.setattr(connections, "MOST_VIEWERS", 2)
         with page.viewer(), page.viewer():
             wait_for(lambda: viewers(page) == 2)
             assert refused_with(page) == 503
 
     def test_who_was_granted_a_place_has_it_before_anything_is_sent(self, page, monkeypatch):
-        monkeypatch.setattr(server, "MOST_VIEWERS", 2)
+        monkeypatch.setattr(connections, "MOST_VIEWERS", 2)
         monkeypatch.setattr(server, "hello", lambda run, recording: b"x" * 50_000_000)  # nobody reads it to its end
         with page.stranger(HANDSHAKE), page.stranger(HANDSHAKE):
-            wait_for(lambda: len(page.view._server._granted) == 2)
+            wait_for(lambda: page.view._server._connections.granted == 2)
             assert viewers(page) == 0 and refused_with(page) == 503
 
-    def test_who_says_nothing_takes_only_so_many_connections(self, page, monkeypatch):
-        monkeypatch.setattr(server, "MOST_CONNECTIONS", 4)
-        with ExitStack() as strangers:
-            for _ in range(4):
-                strangers.enter_context(page.stranger())
-            wait_for(lambda: len(page.view._server._connected) == 4)
-            with page.stranger() as late, suppress(ConnectionResetError):
-                assert late.recv(1) == b""
-            assert len(page.view._server._connected) == 4
-        wait_for(lambda: not page.view._server._connected)
+    def test_who_says_nothing_makes_room_for_the_next(self, page, monkeypatch):
+        """Idle connections lock nobody out; those of viewers are not theirs to take."""
+        monkeypatch.setattr(connections, "MOST_CONNECTIONS", 4)
+        with page.viewer() as viewer, ExitStack() as strangers:
+            idle = [strangers.enter_context(page.stranger()) for _ in range(10)]
+            assert get(page)[0] == 200
+            for evicted in idle[:6]:
+                assert evicted.recv(1) == b""
+            wait_for(lambda: len(page.view._server._connections) <= 4)
+            with page.viewer() as another:
+                assert frame(another)[0]["kind"] == frame(viewer)[0]["kind"] == "hello"
+        wait_for(lambda: not page.view._server._connections)
         assert get(page)[0] == 200
 
     @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -374,3 +430,36 @@ class TestMany:
             assert (threading.active_count(), descriptors(), viewers(page)) == (*before, 0)
             with page.viewer() as viewer:
                 wait_for(lambda: frame(viewer, "state") and len(gc.get_objects()) - objects < 2000)
+
+    @pytest.mark.parametrize(
+        "said",
+        [
+            b"",
+            b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n",
+            b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n\r\n{}",
+            b"\x16\x03\x01\x02\x00\r\n\r\n",
+            HANDSHAKE.replace(b"localhost", b"stranger"),
+            HANDSHAKE.replace(b"13", b"12"),
+        ],
+        ids=["connect", "get", "post", "garbage", "stranger", "version"],
+    )
+    def test_clients_leave_nothing_behind_where_nobody_watches(self, page, said, monkeypatch):
+        """Without garbage collection, as while the loop runs."""
+        monkeypatch.setattr(server, "TIDY_S", 0.05)
+
+        def come_and_go(count):
+            for _ in range(count):
+                with page.stranger(said) as stranger, suppress(ConnectionError):
+                    while said and stranger.recv(1 << 16):
+                        pass
+
+        def objects():
+            return len(gc.get_objects())
+
+        with uncollected():
+            come_and_go(20)
+            wait_for(lambda: not page.view._server._connections)
+            gc.collect()
+            before = objects()
+            come_and_go(300)
+            wait_for(lambda: objects() - before < 1000)

@@ -3,7 +3,7 @@
 import socket
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
@@ -16,6 +16,11 @@ from edge.view.live import LiveView
 
 CONTRACT = make_contract(interval_factor=1.6)
 TIMEOUT_S = 60.0
+HANDSHAKE = (
+    b"GET /ws HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+LONG_PING = b"\x89\xfd" + bytes(4 + 125)
 
 
 class Press:
@@ -93,6 +98,65 @@ class Page:
         commands = []
         wait_for(lambda: commands.extend(self.asked.poll()) or len(commands) >= count)
         return commands
+
+
+class Swallowing:
+    """A network between a viewer and the page, which may come to swallow all.
+
+    Attributes:
+        port: that leads to the page while it lasts.
+    """
+
+    def __init__(self, port):
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        self._onward = port
+        self._swallows = threading.Event()
+        self._closed = threading.Event()
+        self._threads = [threading.Thread(target=self._lead)]
+        self._threads[0].start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc_info):
+        self._swallows.set()
+        self._closed.set()
+        self._listening.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join()
+        self._listening.close()
+
+    def swallow(self):
+        """Hand on nothing from now on, and let both ends believe that the other is there."""
+        self._swallows.set()
+
+    def _lead(self):
+        near, _ = self._listening.accept()
+        far = socket.socket()
+        # As on a real network: small segments, and a small window.
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        far.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
+        far.connect(("127.0.0.1", self._onward))
+        with near, far:
+            pumps = [threading.Thread(target=self._pump, args=ends) for ends in ((near, far), (far, near))]
+            for pump in pumps:
+                pump.start()
+            for pump in pumps:
+                pump.join()
+            self._closed.wait()
+
+    def _pump(self, taking, giving):
+        taking.settimeout(0.02)
+        with suppress(ConnectionError):
+            while not self._swallows.is_set():
+                with suppress(TimeoutError):
+                    data = taking.recv(4096)
+                    if not data:
+                        giving.shutdown(socket.SHUT_WR)
+                        return
+                    if not self._swallows.is_set():
+                        giving.sendall(data)
 
 
 class NoCommands:

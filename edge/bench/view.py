@@ -76,7 +76,7 @@ def measured(rounds: int, seconds: float) -> dict[str, Blocks]:
             with _running() as program:
                 blocks[WITHOUT].measure(program, seconds)
             bar.advance()
-            port = _free_port()
+            port = free_port()
             with _running("--view", str(port)) as program:
                 for viewers in VIEWERS:
                     with _looking(port, viewers, blocks[_name(viewers)], seconds):
@@ -121,7 +121,8 @@ def _running(*options: str) -> Iterator[Program]:
         yield program
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port that nobody listens at."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         return free.getsockname()[1]
 

@@ -1,5 +1,6 @@
 """Sinks as a user writes them."""
 
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -60,6 +61,7 @@ def open_sink(
     unix_offset_ns: int | None = None,
     source: str | None = None,
     origin: SourceKind | None = None,
+    stop: threading.Event | None = None,
 ) -> Sink:
     """Open the sink that `text` names.
 
@@ -71,6 +73,7 @@ def open_sink(
         unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
         source: kind of what is read, told with events.
         origin: what kind of source the scans come from, where they are of a recording that tells.
+        stop: set when the run is to end: then no slow reader is waited for.
 
     Raises:
         UsageError: no such form; the forms are listed.
@@ -85,7 +88,7 @@ def open_sink(
     if form == "jsonl":
         from edge.sinks.jsonl import JsonLinesSink
 
-        return JsonLinesSink(target, patient=patient, source=source)
+        return JsonLinesSink(target, patient=patient, source=source, stop=stop)
     if form == "npz":
         from edge.sinks.npz import NpzSink
 

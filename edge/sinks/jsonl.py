@@ -3,6 +3,7 @@
 import errno
 import os
 import sys
+import threading
 from collections.abc import Mapping
 from io import BufferedWriter
 from pathlib import Path
@@ -26,25 +27,33 @@ _TRACTION_DECIMALS: Final = 4
 """Of [kPa], a tenth of a pascal."""
 
 
+_ROOM_S: Final = 0.002
+"""Between two looks whether a slow reader has made room; a pipe holds more than is made meanwhile."""
+
+
 class JsonLinesSink(Sink):
     """Writes records into a file, or with "-" to stdout.
 
     Where a robot waits, a reader that is too slow for a pipe must hold up nothing: its records are left out, counted,
-    and told in the first it takes again.
+    and told in the first it takes again. Nor does anything wait for one that does not read once the run is to end.
     """
 
-    def __init__(self, target: str, *, patient: bool = True, source: str | None = None) -> None:
+    def __init__(
+        self, target: str, *, patient: bool = True, source: str | None = None, stop: threading.Event | None = None
+    ) -> None:
         """Open the target; a file that exists is replaced.
 
         Args:
             target: path, or "-".
             patient: wait for a slow reader, rather than leave records out.
             source: kind of what is read, told with every event.
+            stop: set when the run is to end, which ends all patience.
 
         Raises:
             SinkError: it cannot be opened.
         """
         self._target = "stdout" if target == "-" else target
+        self._stop = threading.Event() if stop is None else stop
         self._patient = patient
         self._source = source
         self._unwritten = 0
@@ -54,8 +63,7 @@ class JsonLinesSink(Sink):
             if error.errno == errno.ENXIO:
                 raise SinkError(f"nobody reads {self._target}: start its reader first") from error
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
-        if not patient:
-            widen(self._file.fileno())
+        widen(self._file.fileno())
 
     @property
     def unwritten(self) -> int:
@@ -71,9 +79,10 @@ class JsonLinesSink(Sink):
         self._write(event_line(event, {**counters, "unwritten": self._unwritten}, self._source))
 
     def _write(self, line: bytes) -> None:
-        if not self._patient and not has_room(self._file.fileno(), len(line)):
-            self._unwritten += 1
-            return
+        while not has_room(self._file.fileno(), len(line)):
+            if not self._patient or self._stop.wait(_ROOM_S):
+                self._unwritten += 1
+                return
         try:
             self._file.write(line)
             self._file.flush()

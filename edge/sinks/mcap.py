@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.contract import Contract
+from edge.ending import finishing
 from edge.errors import SinkError
 from edge.event import Event
 from edge.mcap_file import McapFile
@@ -161,13 +162,14 @@ class McapSink(Sink):
 
     def close(self) -> None:
         """Finish the file; one without a message is deleted."""
-        if self._failed:
-            self._file.abandon()
-            return
-        try:
-            self._file.close()
-        except OSError as error:
-            raise self._failure(error) from error
+        with finishing(self._path):
+            if self._failed:
+                self._file.abandon()
+                return
+            try:
+                self._file.close()
+            except OSError as error:
+                raise self._failure(error) from error
         if not self._file.messages:
             self._path.unlink(missing_ok=True)
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import ArrayLike
 
+from edge.ending import finishing
 from edge.errors import SinkError
 from edge.progress import Progress
 from edge.result import Result
@@ -172,7 +173,8 @@ class NpzSink(Sink):
         if self._failed:
             return
         if self._scans:
-            gather(self._path)
+            with finishing(draft_of(self._path)):
+                gather(self._path)
         else:
             shutil.rmtree(parts_dir(self._path), ignore_errors=True)
 
@@ -187,6 +189,11 @@ def parts_dir(path: Path) -> Path:
     return path.with_name(path.name + ".parts")
 
 
+def draft_of(path: Path) -> Path:
+    """Name under which the .npz grows until it is whole."""
+    return path.with_name(path.name + ".draft")
+
+
 def gather(path: Path) -> int:
     """Make the .npz of its rows, delete them, and return the number of scans.
 
@@ -195,7 +202,7 @@ def gather(path: Path) -> int:
     Raises:
         SinkError: there are no rows, or no room, or the file exists.
     """
-    parts, draft = parts_dir(path), path.with_name(path.name + ".draft")
+    parts, draft = parts_dir(path), draft_of(path)
     if path.exists():
         raise SinkError(f"{path} exists, and is not replaced by what {parts} holds: move it away, then {_remedy(path)}")
     try:

@@ -36,7 +36,7 @@ CLOSED: Final = {
     "transport/shared_memory/enabled": False,
 }
 """Nobody is let in, looked for or heard of, unless a configuration says so: zenoh's own defaults would do it all."""
-CLOSE_S: Final = 1.0
+CLOSE_S: Final = 0.5
 _JSON: Final = "application/json"
 _PACKED: Final = "application/octet-stream"
 _REMEDY: Final = "expected zenoh:KEY, zenoh:KEY?connect=tcp/HOST:7447 or zenoh:KEY?config=FILE.json5"
@@ -111,7 +111,7 @@ class ZenohSink(Sink):
     def close(self) -> None:
         """Send what is under way, and end; subscribers to KEY/alive/* are told.
 
-        A subscriber that stands still would hold zenoh up for ten seconds: it is left alone after one.
+        A subscriber that stands still would hold zenoh up for ten seconds: it is left alone after CLOSE_S.
         """
         closing = threading.Thread(target=self._close, name="zenoh-close", daemon=True)
         closing.start()

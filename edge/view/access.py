@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Final, NamedTuple
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from edge.errors import UsageError
 
@@ -21,6 +21,7 @@ PAGE: Final = "/"
 SOCKET: Final = "/ws"
 SHORTEST_TOKEN: Final = 12
 REMEDY: Final = "open the address that edge-sr printed when it started, or name this one with --view-host"
+_HOST: Final = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w.-]+))(?::[0-9]*)?")
 _TOKEN: Final = re.compile(rf"[A-Za-z0-9_-]{{{SHORTEST_TOKEN},200}}")
 
 
@@ -75,12 +76,10 @@ class Access:
         return f"http://{shown}:{port}{PAGE}" + ("" if self.token is None else f"?token={self.token}")
 
     def _is_ours(self, host: str) -> bool:
-        try:
-            name = urlsplit(f"//{host}").hostname
-        except ValueError:
+        matched = _HOST.fullmatch(host)
+        if matched is None:  # also one with a user's name in front of ours
             return False
-        if name is None:
-            return False
+        name = (matched["address"] or matched["name"]).lower()
         if name in ("localhost", self.host.lower()):
             return True
         address = _address(name)

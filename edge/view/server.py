@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import Final
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -27,24 +27,22 @@ from websockets.protocol import State
 from edge.errors import SinkError
 from edge.view.access import SOCKET, Access
 from edge.view.asked import LONGEST_BYTES, Asked
+from edge.view.attended import Attended
+from edge.view.connections import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
 from edge.view.heard import Heard
 from edge.view.page import load_page
-from edge.view.viewer import Viewer
 from firmware_bridge.links.base import SourceKind
 
-MOST_VIEWERS: Final = 16
-MOST_CONNECTIONS: Final = 64
-"""Of viewers, of browsers that fetch the page, and of whoever says nothing for OPEN_S."""
 PERIOD_S: Final = 1 / MAX_FPS
 STATE_S: Final = 1.0
 TIDY_S: Final = 10.0
-PING_S: Final = 0.25
-LATE_S: Final = 0.5
-"""Since a ping that a viewer has not answered: what lies on its way is old, and nothing is put behind it."""
-GONE_S: Final = 10.0
+TIDY_CONNECTIONS: Final = 64
+"""Before so many have left something behind, it is tidied without waiting for TIDY_S."""
 OPEN_S: Final = 5.0
 CLOSE_S: Final = 1.0
+END_S: Final = 0.5
+"""For viewers to hear that the run has ended; nobody waits for one that does not read."""
 COMMAND_PAUSE_S: Final = 0.02
 """Between two commands of a viewer: one that never stops asking must not keep the loop from its work."""
 
@@ -89,13 +87,11 @@ class Server:
         self._socket = _listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None
-        self._connected: set[ServerConnection] = set()
-        self._granted: set[ServerConnection] = set()
-        self._viewers: dict[ServerConnection, _Attended] = {}
+        self._connections = Connections(self._look_round)
+        self._viewers: dict[ServerConnection, Attended] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
         self._ending = False
-        self._requests = 0
         self._source: SourceKind | None = None
 
     def begin(self, run: Run) -> None:
@@ -138,8 +134,8 @@ class Server:
     async def _show(self, run: Run, ready: threading.Event) -> None:
         self._loop = asyncio.get_running_loop()
 
-        class Counted(_Connection):
-            connected = self._connected
+        class Counted(Connection):
+            every = self._connections
 
         async with serve(
             partial(self._attend, run),
@@ -158,7 +154,7 @@ class Server:
             said_s = tidied_s = 0.0
             while not self._ending:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(STATE_S if self._viewers or self._requests else None):
+                    async with asyncio.timeout(STATE_S if self._viewers or self._connections.gone else None):
                         await self._news.wait()
                 self._news.clear()
                 frames = Frames(self._heard, time.monotonic_ns(), self._source)
@@ -168,33 +164,40 @@ class Server:
                 if to_say != said or now_s - said_s >= STATE_S:
                     said, said_s = to_say, now_s
                     broadcast(self._viewers, state(recording, len(self._viewers), silent))
-                if self._requests and now_s - tidied_s >= TIDY_S:
-                    self._requests, tidied_s = 0, now_s
+                gone = self._connections.gone
+                if gone >= TIDY_CONNECTIONS or (gone and now_s - tidied_s >= TIDY_S):
+                    self._connections.gone, tidied_s = 0, now_s
                     _tidy()
                 for attended in self._viewers.values():
                     attended.send(frames, now_s)
             server.close(code=CloseCode.GOING_AWAY, reason="the run has ended")
+            self._loop.call_later(END_S, self._connections.abort)
+
+    def _look_round(self) -> None:
+        """Have the time looked at when a first connection has gone, and tidy at once when many have."""
+        if self._connections.gone in (1, TIDY_CONNECTIONS):
+            self._news.set()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        self._requests += 1
-        if getattr(request, "method", "GET") != "GET":  # older versions of the library take no other
-            return connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "only GET\n")
         headers = request.headers
         refusal = self._access.refusal(request.path, headers.get_all("Host"), headers.get_all("Origin"))
         if refusal is not None:
             return connection.respond(refusal.status, refusal.text + "\n")
         if request.path.partition("?")[0] == SOCKET:
-            self._granted &= self._connected
-            if len(self._granted) < MOST_VIEWERS:
-                self._granted.add(connection)
+            if isinstance(connection, Connection) and self._connections.grant(connection):
                 return None
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} look already: close one\n")
         return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
 
     async def _attend(self, run: Run, connection: ServerConnection) -> None:
-        attended = _Attended(connection)
+        attended = Attended(connection)
         with contextlib.suppress(ConnectionClosed):
-            await connection.send(hello(run, self._recording()))
+            try:
+                async with asyncio.timeout(OPEN_S):
+                    await connection.send(hello(run, self._recording()))
+            except TimeoutError:
+                connection.transport.abort()
+                return
             self._viewers[connection] = attended
             self.watched = True
             pinging = asyncio.create_task(attended.follow())
@@ -214,53 +217,8 @@ class Server:
                 self._news.set()
 
 
-class _Connection(ServerConnection):
-    """One that is counted from before its first byte; of too many the newest is closed at once."""
-
-    connected: ClassVar[set[ServerConnection]]
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        self.connected.add(self)
-        if len(self.connected) > MOST_CONNECTIONS:
-            self.transport.abort()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self.connected.discard(self)
-        super().connection_lost(exc)
-
-
-class _Attended:
-    """One viewer's connection, followed by pings: an answer says that all before it was read."""
-
-    def __init__(self, connection: ServerConnection) -> None:
-        self.viewer = Viewer()
-        self._connection = connection
-        self._asked_s: float | None = None
-
-    def send(self, frames: Frames, now_s: float) -> None:
-        """Send what is due, unless the viewer is behind."""
-        if self._asked_s is None or now_s - self._asked_s < LATE_S:
-            for frame in self.viewer.due(frames):
-                broadcast([self._connection], frame)
-
-    async def follow(self) -> None:
-        """Ask again and again whether the viewer has read everything; close the connection of one that does not."""
-        with contextlib.suppress(ConnectionClosed):
-            while True:
-                self._asked_s = time.monotonic()
-                try:
-                    async with asyncio.timeout(GONE_S):
-                        await (await self._connection.ping())
-                except TimeoutError:
-                    await self._connection.close(CloseCode.POLICY_VIOLATION, f"nothing was read for {GONE_S:.0f} s")
-                    return
-                self._asked_s = None
-                await asyncio.sleep(PING_S)
-
-
 def _tidy() -> None:
-    """Collect what requests leave behind, since nobody else does while the loop runs."""
+    """Collect what connections leave behind, since nobody else does while the loop runs."""
     if not gc.isenabled():
         gc.collect()
 

@@ -1,0 +1,121 @@
+"""The end of a program that a signal asked to end: in time, if need be by force.
+
+Python runs a handler of signals between two steps of its main thread, and so never while a call into a library does
+not return: a model that loops, a pipe that is full, a peer that is gone. The system's own part of a handler runs all
+the same, and wakes a thread here.
+"""
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Final, TypeVar
+
+END_S: Final = 1.5
+"""From the signal to the end by force, within the two seconds that are promised."""
+STALLED_S: Final = 10.0
+"""A disk may do something else for so long while a recording is finished on it."""
+EXIT_FORCED: Final = 6
+_LOOK_S: Final = 0.1
+_STDERR: Final = 2
+_READ_BYTES: Final = 64
+
+_Thing = TypeVar("_Thing")
+_finishing: list[Path] = []
+_before_force: list[Callable[[], object]] = []
+
+
+@contextlib.contextmanager
+def ended_in_time(numbers: Collection[int]) -> Iterator[None]:
+    """End the process by force, with EXIT_FORCED, if this lasts for longer than END_S after one of these signals.
+
+    Files that are being finished have the time they need for as long as they grow. Main thread alone.
+
+    Args:
+        numbers: of signals that Python handles.
+    """
+    waking, woken = socket.socketpair()
+    woken.setblocking(False)
+    before = signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
+    thread = threading.Thread(target=_watch, args=(waking, numbers), name="ending", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        woken.close()  # which ends the thread
+        thread.join()
+        waking.close()
+
+
+@contextlib.contextmanager
+def finishing(path: Path) -> Iterator[None]:
+    """Allow a file as much time as it takes to finish it, though the program was asked to end."""
+    with _kept(_finishing, path):
+        yield
+
+
+@contextlib.contextmanager
+def before_force(act: Callable[[], object]) -> Iterator[None]:
+    """Have something done before the process is ended by force meanwhile; it must be short and never wait."""
+    with _kept(_before_force, act):
+        yield
+
+
+@contextlib.contextmanager
+def _kept(things: list[_Thing], thing: _Thing) -> Iterator[None]:
+    things.append(thing)
+    try:
+        yield
+    finally:
+        things.remove(thing)
+
+
+def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
+    while not set(numbers) & set(heard := waking.recv(_READ_BYTES)):
+        if not heard:
+            return
+    files, left_s = _sizes(), END_S
+    waking.settimeout(_LOOK_S)
+    # Not by the clock: where a machine is so busy that this thread comes late, so does what it waits for.
+    while left_s > 0:
+        with contextlib.suppress(TimeoutError):
+            if not waking.recv(_READ_BYTES):
+                return
+        before, files = files, _sizes()
+        left_s = left_s - _LOOK_S if files == before else STALLED_S if files else END_S
+    _force()
+
+
+def _sizes() -> dict[Path, int]:
+    """Files that are being finished, and how large they are, in bytes."""
+    sizes: dict[Path, int] = {}
+    for path in tuple(_finishing):
+        try:
+            sizes[path] = path.stat().st_size
+        except OSError:  # not begun yet, or under its last name by now
+            sizes[path] = 0
+    return sizes
+
+
+def _force() -> None:
+    for act in tuple(_before_force):
+        act()
+    line = f"edge-sr: not ended {END_S:g} s after the signal, still in {_where()}: ended by force\n"
+    with contextlib.suppress(OSError):
+        if select.select([], [_STDERR], [], 0)[1]:  # a pipe that nobody reads is why we may be here
+            os.write(_STDERR, line.encode(errors="replace"))
+    os._exit(EXIT_FORCED)
+
+
+def _where() -> str:
+    """Name the function that the main thread has not returned from, with its file and line."""
+    frame = sys._current_frames().get(threading.main_thread().ident or 0)
+    if frame is None:
+        return "its end"
+    return f"{frame.f_code.co_qualname} ({'/'.join(Path(frame.f_code.co_filename).parts[-2:])}, line {frame.f_lineno})"

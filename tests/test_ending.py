@@ -1,0 +1,226 @@
+"""A signal ends `edge-sr` in time, whatever its clients, sinks and model are doing: processes, sockets and pipes."""
+
+import os
+import pty
+import re
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import time
+from contextlib import contextmanager, suppress
+
+import pytest
+from bridge_samples import make_counts, write_recording
+from edge_samples import ROOT, write_model
+from view_samples import HANDSHAKE, LONG_PING, Swallowing, wait_for
+from websockets.sync.client import connect
+
+from edge import cli
+from edge.ending import EXIT_FORCED
+from edge.packed import unpack
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+LONG_S = 12.0
+"""Two seconds are promised; a busy machine may take longer, and what is mended here took a minute or for ever."""
+EDGE_SR = (sys.executable, "-m", "edge.cli")
+# The page over a network that takes little at a time, where over loopback the system would take megabytes in; and what
+# ends a viewer that does not read comes much later than the signal.
+NARROW = """
+import socket, sys
+from edge import cli
+from edge.view import attended, server
+
+def listen(host, port, listen=server._listen):
+    listening = listen(host, port)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    return listening
+
+server._listen, attended.GONE_S = listen, 60.0
+sys.exit(cli.main(sys.argv[1:]))
+"""
+WATCHED = (sys.executable, "-c", NARROW, "--source", "demo:loop", "--view", "0")
+SIGNALS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+# A graph that goes round for ever, which onnxruntime runs without coming back to Python.
+ENDLESS = """
+import onnxruntime, numpy as np, sys
+from onnx import TensorProto as Type, helper
+from edge.signals import stop_on_signals
+from edge.keys import terminal_keys
+
+def value(name, kind, shape):
+    return helper.make_tensor_value_info(name, kind, shape)
+
+body = helper.make_graph(
+    [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Identity", ["x"], ["z"])],
+    "body",
+    [value("i", Type.INT64, []), value("on", Type.BOOL, []), value("x", Type.FLOAT, [1])],
+    [value("still", Type.BOOL, []), value("z", Type.FLOAT, [1])],
+)
+loop = helper.make_node("Loop", ["", "always", "x"], ["y"], body=body)
+always = helper.make_tensor("always", Type.BOOL, [], [True])
+graph = helper.make_graph([loop], "endless", [value("x", Type.FLOAT, [1])], [value("y", Type.FLOAT, [1])], [always])
+model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+with stop_on_signals(), terminal_keys():
+    print("runs", flush=True)
+    session.run(None, {"x": np.ones(1, dtype=np.float32)})
+"""
+FINISHING = """
+import os, pathlib, signal, sys, time
+from edge import ending
+from edge.signals import stop_on_signals
+path, grows = pathlib.Path(sys.argv[1]), sys.argv[2] == "grows"
+ending.END_S, ending.STALLED_S = 0.3, 0.6
+with stop_on_signals() as stop:
+    os.kill(os.getpid(), signal.SIGTERM)
+    stop.wait()
+    with ending.finishing(path), path.open("wb", buffering=0) as file:
+        for _ in range(20):
+            time.sleep(0.1)
+            if grows:
+                file.write(b"x")
+"""
+
+
+@contextmanager
+def running(*command, **settings):
+    """A process that hears signals as from a terminal."""
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | settings
+    with subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def hear_interrupts():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def page_port(process):
+    for line in process.stderr:
+        if line.startswith(b"live page: "):
+            return int(line.strip().rpartition(b":")[2].strip(b"/"))
+    raise AssertionError("no page")
+
+
+def end(process, number):
+    """Ask it to end; returns its exit code and its last words."""
+    process.send_signal(number)
+    words = process.communicate(timeout=LONG_S)[1]
+    return process.returncode, words.decode()
+
+
+@SIGNALS
+def test_a_viewer_whose_network_vanishes_holds_up_no_end(number):
+    settings = {"compression": None, "close_timeout": 0, "max_queue": 1000}
+    with (
+        running(*WATCHED) as process,
+        Swallowing(page_port(process)) as network,
+        connect(f"ws://127.0.0.1:{network.port}/ws", **settings) as viewer,
+    ):
+        while unpack(viewer.recv(60))[0].get("state") != "contact":
+            pass
+        network.swallow()
+        time.sleep(2)
+        code, words = end(process, number)
+    assert code == 0 and "EMULATED demo:" in words
+
+
+def test_a_local_viewer_that_pings_and_does_not_read_holds_up_no_end():
+    with running(*WATCHED) as process, socket.create_connection(("127.0.0.1", page_port(process))) as viewer:
+        viewer.sendall(HANDSHAKE)
+        stop = threading.Event()
+
+        def ping():
+            with suppress(OSError):
+                while not stop.is_set():
+                    viewer.sendall(100 * LONG_PING)
+
+        pinging = threading.Thread(target=ping)
+        pinging.start()
+        time.sleep(3)  # by then all buffers between us are full
+        try:
+            code, words = end(process, signal.SIGTERM)
+        finally:
+            stop.set()
+            process.kill()
+            pinging.join()
+    assert code == 0 and "EMULATED demo:" in words
+
+
+def test_a_full_pipe_that_nobody_reads_holds_up_no_end(tmp_path):
+    recording = write_recording(tmp_path / "long.csv", make_counts(3000), 100.0)
+    options = ("--model", str(write_model(tmp_path / "tiny.onnx")), "--sink", "jsonl:-")
+    with running(*EDGE_SR, "replay", str(recording), *options, bufsize=0) as process:
+        assert process.stdout.read(1) == b"{"
+        time.sleep(2)  # it is waiting for us
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(LONG_S) == 0
+        words = process.stderr.read().decode()
+    assert "records left out for slow readers: 1" in words and "Traceback" not in words
+
+
+@SIGNALS
+def test_a_model_that_never_returns_is_ended_by_force_and_named(number):
+    with running(sys.executable, "-c", ENDLESS) as process:
+        assert process.stdout.readline() == b"runs\n"
+        time.sleep(0.5)
+        code, words = end(process, number)
+    assert code == EXIT_FORCED == 6
+    assert re.fullmatch(
+        r"edge-sr: not ended 1\.5 s after the signal, still in Session\.run \(.*, line \d+\): ended by force\n", words
+    )
+
+
+def test_the_terminal_is_given_back_before_force():
+    leader, follower = pty.openpty()
+
+    def own_terminal():
+        hear_interrupts()
+        os.setsid()
+        os.close(os.open(os.ttyname(follower), os.O_RDWR))  # the first that a session opens is its own
+
+    def echoes():
+        return bool(termios.tcgetattr(leader)[3] & termios.ECHO)
+
+    command = [sys.executable, "-c", ENDLESS]
+    with subprocess.Popen(command, env=ENVIRONMENT, stdin=follower, preexec_fn=own_terminal) as process:
+        try:
+            wait_for(lambda: not echoes())
+            os.write(leader, b"\x03")
+            assert process.wait(LONG_S) == EXIT_FORCED
+        finally:
+            process.kill()
+    assert echoes()
+    os.close(leader)
+    os.close(follower)
+
+
+@pytest.mark.parametrize(("how", "code"), [("grows", 0), ("stands", EXIT_FORCED)])
+def test_a_file_that_is_being_finished_has_time_for_as_long_as_it_grows(tmp_path, how, code):
+    done = subprocess.run([sys.executable, "-c", FINISHING, tmp_path / "file", how], env=ENVIRONMENT, timeout=60)
+    assert done.returncode == code
+
+
+def test_ctrl_c_before_anything_has_begun_is_no_traceback(monkeypatch, capsys):
+    def interrupt(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(cli.COMMANDS, "models", interrupt)
+    assert cli.main(["models"]) == 130
+    assert capsys.readouterr().err == ""
+
+
+def test_nothing_is_left_of_the_watch_where_it_ends_in_time():
+    from edge.signals import stop_on_signals
+
+    with stop_on_signals() as stop:
+        assert any(thread.name == "ending" for thread in threading.enumerate())
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.wait(60)
+    assert not any(thread.name == "ending" for thread in threading.enumerate())
+    assert signal.set_wakeup_fd(-1) == -1
