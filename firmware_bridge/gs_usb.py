@@ -6,8 +6,8 @@ The adapter sends host frames, little-endian, usually one in a USB transfer:
 
 echo_id is all ones where the frame came from the bus, else the number of one that we sent and that went out. can_id
 holds three flags (extended, remote, error). A transfer begins with a frame, and a packet that is not full ends it: what
-is not whole by then never will be. Within a transfer nothing marks where a frame begins, so a header is believed only if
-every field is one that an adapter could send; where it is not, bytes are skipped until it is.
+is not whole by then never will be. Within a transfer nothing marks where a frame begins, so a header is believed only
+if every field is one that an adapter could send; where it is not, bytes are skipped until it is.
 
 Source: Linux drivers/net/can/usb/gs_usb.c; candleLight_fw include/gs_usb.h.
 """

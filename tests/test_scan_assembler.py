@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from firmware_bridge.assembler import LONGEST_SCAN_NS, ScanAssembler, _Sensor
 from firmware_bridge.device_clock import DeviceClock, DeviceTime
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ABSENT, Scan
 from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
