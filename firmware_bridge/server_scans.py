@@ -39,7 +39,7 @@ STALE_NS: Final = 150_000_000
 """A reading older by this than usual of its server when it arrives is counted; more than what a clock may be set back
 unseen."""
 USUAL_AGE_SCANS: Final = 50
-"""The least age of so many, when they were sent, is usual: a server was seen whose every reading is .3 s old by then."""
+"""The least age of so many, when sent, is usual: a server was seen whose every reading is .3 s old by then."""
 MANY_STALE: Final = 50
 """More stale scans than others by so many are told of, until the others have made up for it."""
 LONGEST_AGE_S: Final = 60.0

@@ -48,8 +48,8 @@ def main() -> None:
     lines = [
         "# Scans of one cycle",
         "",
-        "Written by `python tests/cycles.py --out reports/cycles.md`. Every reading is the number of its cycle, so a scan",
-        "of two is seen at once. Of each cell: whole scans with readings of two cycles, of all whole scans; torn scans.",
+        "Written by `python tests/cycles.py --out reports/cycles.md`. Every reading is the number of its cycle, so a",
+        "scan of two is seen at once. In each cell: whole scans with readings of two cycles, of all whole scans; torn ones.",
         "",
         "| | " + " | ".join(reader.name for reader in READERS) + " |",
         "|---" * (1 + len(READERS)) + "|",
