@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cycle_samples import READERS, Reader, Worth, bus, doubling, losing, pausing, read, swapping
 
-CYCLES = 3000
+CYCLES = 1000
 
 
 def cases(reader: Reader) -> Iterator[tuple[str, list[Worth]]]:
@@ -49,7 +49,8 @@ def main() -> None:
         "# Scans of one cycle",
         "",
         "Written by `python tests/cycles.py --out reports/cycles.md`. Every reading is the number of its cycle, so a",
-        "scan of two is seen at once. In each cell: whole scans with readings of two cycles, of all whole scans; torn ones.",
+        "scan of two is seen at once. In each cell: whole scans with readings of two cycles, of all whole scans; and",
+        "torn ones.",
         "",
         "| | " + " | ".join(reader.name for reader in READERS) + " |",
         "|---" * (1 + len(READERS)) + "|",

@@ -142,7 +142,7 @@ def test_other_layouts_are_cut_alike(model):
 @pytest.mark.parametrize("old_canable", [True, False], ids=["plain", "stamped"])
 @pytest.mark.parametrize("first_frame", [0, 5, 11, 15])
 def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_canable):
-    """Over the real serial path, whose reader waits for as many bytes as a cycle has and so may sleep through a pause."""
+    """Over the real serial path, whose reader waits for as many bytes as a cycle has, and could sleep through one."""
     lost = Injector(parse_stretches("dead=4.5@.15+.01,dead=4.3@.25+.01"), Truth())
     recording = numbered(60, first=FIRST)
     with (
@@ -154,4 +154,4 @@ def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_
     of_cycles = [set(scan.counts[2][scan.fresh].tolist()) for scan in scans]
     assert all(len(numbers) == 1 for numbers in of_cycles)
     assert counters["resynchronised"] >= (16 - first_frame) % 16
-    assert lost.truth.fates["dead"] == 2 and len(scans) > 40
+    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > 40
