@@ -380,7 +380,11 @@ class Runtime:
 
 def _age_note(scan: Scan) -> str | None:
     """What to tell of readings that lay about before they came."""
-    if scan.device_ns is None or scan.time_ns - scan.device_ns <= OLD_NS:
+    if scan.device_ns is None:
+        if scan.unread_ns <= OLD_NS:
+            return None
+        return f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it came: nobody read meanwhile"
+    if scan.time_ns - scan.device_ns <= OLD_NS:
         return None
     return f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it came"
 

@@ -1,6 +1,8 @@
 """Sensors that fall silent while others go on, and scans that left no trace. No I/O, no clock."""
 
+import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
 
 from edge.event import Event
@@ -10,6 +12,22 @@ SILENT_NS: Final = 500_000_000
 """Twice the period of the slowest sensor on record."""
 GAP_PERIODS: Final = 1.5
 """Between two scans; jitter, and the 16 ms for which some adapters hold scans back, make less of 10 ms."""
+
+SETTLING_SCANS: Final = 5
+"""At their pace behind a gap, before what is missing in it is counted: of these the one that was least late tells."""
+PACED_SCANS: Final = 32
+"""Without a gap, from which on their mean period is better known than the median of the newest: by that, 1 % off, a
+stall of a second would seem to have swallowed a scan."""
+
+
+@dataclass(slots=True)
+class _Gap:
+    """Of a sensor: the scan before it, the period, and by how many periods a scan behind it is least too late."""
+
+    before: Scan
+    period_ns: float
+    least: float = math.inf
+    settled: int = 0
 
 
 class Silence:
@@ -34,7 +52,9 @@ class Silence:
         self._expected = set(expected)
         self._first_ns: int | None = None
         self._last: dict[str, Scan] = {}
-        self._before_gap: dict[str, Scan] = {}
+        self._gaps: dict[str, _Gap] = {}
+        self._paced_from: dict[str, Scan] = {}
+        self._periods_ns: dict[str, float] = {}
         self._silent: set[str] = set()
         self._since_ns: dict[str, int] = {}
 
@@ -48,6 +68,7 @@ class Silence:
         if before is None:
             self._expected.discard(scan.sensor)
             self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
+            self._paced_from[scan.sensor] = scan
             return None
         if period_ns:
             self._follow_gap(before, scan, period_ns)
@@ -60,13 +81,28 @@ class Silence:
     def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
         """Count what is missing behind a gap, once scans come at their pace again: what was late comes in a burst."""
         gap_ns = _on_bus_ns(scan) - _on_bus_ns(before)
-        start = self._before_gap.get(scan.sensor)
-        if start is not None and period_ns / 2 <= gap_ns <= GAP_PERIODS * period_ns:
-            periods = round((_on_bus_ns(scan) - _on_bus_ns(start)) / period_ns)
-            self.missed += max(periods - (scan.number - start.number), 0)
-            del self._before_gap[scan.sensor]
-        elif start is None and gap_ns > GAP_PERIODS * period_ns:
-            self._before_gap[scan.sensor] = before
+        gap = self._gaps.get(scan.sensor)
+        if gap_ns > GAP_PERIODS * period_ns:
+            if gap is None:
+                self._gaps[scan.sensor] = _Gap(before, self._mean_period_ns(before, period_ns))
+            else:
+                gap.least, gap.settled = math.inf, 0
+        elif gap is not None and gap_ns >= period_ns / 2:
+            periods = (_on_bus_ns(scan) - _on_bus_ns(gap.before)) / gap.period_ns
+            gap.least = min(gap.least, periods - (scan.number - gap.before.number))
+            gap.settled += 1
+            if gap.settled == SETTLING_SCANS:
+                self.missed += max(round(gap.least), 0)
+                del self._gaps[scan.sensor]
+                self._paced_from[scan.sensor] = scan
+
+    def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
+        """Over all scans since the last gap, or before it, where there were enough."""
+        first = self._paced_from[scan.sensor]
+        scans = scan.number - first.number
+        if scans >= PACED_SCANS:
+            self._periods_ns[scan.sensor] = (_on_bus_ns(scan) - _on_bus_ns(first)) / scans
+        return self._periods_ns.get(scan.sensor, period_ns)
 
     def look(self) -> list[Event]:
         """Sensors found silent since the last call, while another was heard; of all of them, the link tells."""

@@ -20,6 +20,8 @@ STUCK_SCANS: Final = 20
 """A living taxel sends the same three counts twice in a quarter of the scans in which a quarter of the taxels are new:
 so torn are real grips at their source, and no run in them is longer than 3. Were scans independent, twenty in a row
 came once in decades at 100 Hz; with noise of two counts alone, where it is one scan in 350, never."""
+FROZEN_SENSOR_SCANS: Final = 10
+"""Bit for bit alike, all taxels at once: with noise of two counts 48 equal values do not come twice."""
 FROZEN_SCANS: Final = 300
 """Without a new count, whatever the others do: most are stuck at once, or one old scan is sent for ever. A
 server was seen that sends 507 scans a second of a sensor that renews a taxel four times: that makes 127."""
@@ -77,6 +79,7 @@ class TaxelWatch:
         self._well = np.zeros(grid_shape, dtype=np.int64)
         self._size = np.zeros((3, *grid_shape), dtype=np.float32)
         self._old = np.zeros(grid_shape, dtype=np.int64)
+        self._repeats = 0
         self._baseline: Baseline | None = None
         self._sound = False
         self._reasons: dict[int, str] = {}
@@ -178,6 +181,9 @@ class TaxelWatch:
         silent_long = self.silent_long
         id_map = 2 * np.count_nonzero(silent_long) == silent_long.size
         remedies = {"saturated": _OVERLOADED, "unzeroed": ": zero again"}
+        if self._repeats >= FROZEN_SENSOR_SCANS:
+            notes.append(f"no pattern, the sensor is frozen: its last {self._repeats} scans are alike bit for bit")
+            kinds.pop("stuck", None)
         for reason, taxels in kinds.items():
             remedy = remedies.get(reason, ": it may be broken")
             if reason == "silent":
@@ -223,12 +229,14 @@ class TaxelWatch:
         self._still[scan.renewed] = 0
         self._old += scan.fresh
         self._old[scan.renewed] = 0
+        self._repeats = self._repeats + 1 if scan.repeated else 0
         size = self._follow_far(zeroed)
 
         fault = np.zeros_like(self._code)
         fault[self._unzeroed] = UNZEROED
         fault[self._far >= FAR_SCANS] = FAR
-        fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS)] = STUCK
+        frozen = self._repeats >= FROZEN_SENSOR_SCANS
+        fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS) | frozen] = STUCK
         held_ns = scan.time_ns - np.maximum(self._read_ns, self._whole_ns)
         gone = (self._age > HOLD_SCANS) | (self._heard & (self._age > 0) & (held_ns > HOLD_NS))
         fault[gone] = SILENT

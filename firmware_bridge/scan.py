@@ -51,6 +51,8 @@ class Scan:
         device_ns: when its newest reading was on the bus or in the sensor's own hands, by the device's time stamps
             mapped to monotonic time, in [ns]; None where it gives none. What `time_ns` is later is delay.
         vendor: what the vendor's software says of the same moment; None of a link that reads the sensor itself.
+        unread_ns: it may have lain there for so long before it was read, in [ns], since nobody looked meanwhile; 0
+            where somebody did.
     """
 
     sensor: str
@@ -61,6 +63,7 @@ class Scan:
     renewed: NDArray[np.bool_]
     device_ns: int | None = None
     vendor: VendorReading | None = None
+    unread_ns: int = 0
 
     # On sixteen taxels numpy's all() costs ten times what looking for a byte does, and these are asked of every scan.
 

@@ -14,6 +14,7 @@ counts. A scan closes when all have come that are renewed about as often as most
 - Within a cycle nothing tells which readings belong together; those of slow servers are of two cycles, as on the wire.
 """
 
+from collections import deque
 from typing import Final
 
 import numpy as np
@@ -35,7 +36,10 @@ SLOW_SHARE: Final = 0.5
 SILENT_NS: Final = NS_PER_S
 """A reading older than this when it is sent is one of a sensor that is heard no more, whatever `ups` still says."""
 STALE_NS: Final = 150_000_000
-"""A reading older than this when it arrives is counted; more than what a clock may be set back unseen."""
+"""A reading older by this than usual of its server when it arrives is counted; more than what a clock may be set back
+unseen."""
+USUAL_AGE_SCANS: Final = 50
+"""The least age of so many, when sent, is usual: a server was seen whose every reading is .3 s old by then."""
 MANY_STALE: Final = 50
 """More stale scans than others by so many are told of, until the others have made up for it."""
 LONGEST_AGE_S: Final = 60.0
@@ -64,6 +68,7 @@ class ServerScans:
         self._sensors: dict[str, _ServerSensor] = {}
         self._more_stale = 0
         self._lags = False
+        self._ages_ns: deque[int] = deque(maxlen=USUAL_AGE_SCANS)
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self.begin()
 
@@ -80,7 +85,7 @@ class ServerScans:
         silent = [name for name, sensor in self._sensors.items() if sensor.silent]
         told += [f"nothing comes of sensor {name}: see to its cable and its power" for name in silent]
         if self._lags:
-            late = f"what is read is older than {STALE_NS // 1_000_000} ms"
+            late = f"what is read is older by {STALE_NS // 1_000_000} ms than usual"
             told.append(f"{late}: the server lags, the network does, or this program is too slow")
         return "; ".join(told) or None
 
@@ -119,13 +124,13 @@ class ServerScans:
             sensor = self._sensors.get(name)
             if sensor is None:
                 sensor = self._sensors[name] = _ServerSensor(name, self._geometry)
-            scan = None
+            scan = age_ns = None
             if name in heard:
                 age_ns = _age_ns(heard[name], message)
                 device_ns = None if sent_ns is None or age_ns is None else sent_ns - age_ns
                 scan = sensor.feed(heard[name], arrival_ns, device_ns, old=(age_ns or 0) > SILENT_NS)
             if scan is not None:
-                self._follow_age(scan)
+                self._follow_age(scan, age_ns or 0)
                 scans.append(scan)
             sensor.look(arrival_ns)
         return scans
@@ -134,8 +139,8 @@ class ServerScans:
         """Those of the decoder and of what came of it.
 
         repeated_messages and reordered_messages were dropped; missed_messages: numbers that never came;
-        server_restarts: the count began anew; stale_scans: a reading was older than STALE_NS when it arrived; and as of
-        every link scans, torn_wire, torn_source, repeated and missing_taxels.
+        server_restarts: the count began anew; stale_scans: a reading was older by STALE_NS than usual when it arrived;
+        and as of every link scans, torn_wire, torn_source, repeated and missing_taxels.
         """
         totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
         for sensor in list(self._sensors.values()):
@@ -143,8 +148,10 @@ class ServerScans:
                 totals[name] += count
         return self._decoder.counters() | self._counted | totals
 
-    def _follow_age(self, scan: Scan) -> None:
-        stale = scan.device_ns is not None and scan.time_ns - scan.device_ns > STALE_NS
+    def _follow_age(self, scan: Scan, age_ns: int) -> None:
+        self._ages_ns.append(age_ns)
+        usual_ns = min(self._ages_ns)
+        stale = scan.device_ns is not None and scan.time_ns - scan.device_ns - usual_ns > STALE_NS
         self._counted["stale_scans"] += stale
         self._more_stale = min(max(self._more_stale + (1 if stale else -1), 0), 2 * MANY_STALE)
         self._lags = self._more_stale > (0 if self._lags else MANY_STALE)

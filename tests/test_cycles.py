@@ -1,6 +1,7 @@
 """No scan is of two cycles, whatever is lost, and a sensor's place is found again: readings here name their cycle."""
 
 import pytest
+from bridge_samples import read_until_lost
 from cycle_samples import (
     PLAIN,
     PLAIN_BURSTS,
@@ -11,12 +12,18 @@ from cycle_samples import (
     doubling,
     in_order,
     losing,
+    numbered,
     pausing,
     read,
     swapping,
 )
 
+from firmware_bridge.faults.injector import Injector
+from firmware_bridge.faults.stretches import parse_stretches
+from firmware_bridge.faults.truth import Truth
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.slcan import CanFrame
+from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.xela import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP
 
 LONGEST_WAIT_MS = 1.5
@@ -130,3 +137,21 @@ def test_other_layouts_are_cut_alike(model):
         del frames[75]
         worth = read(frames, PLAIN, model=model)
         assert worth.mixed == 0 and worth.whole >= 18 - (first_frame > 0)
+
+
+@pytest.mark.parametrize("old_canable", [True, False], ids=["plain", "stamped"])
+@pytest.mark.parametrize("first_frame", [0, 5, 11, 15])
+def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_canable):
+    """Over the real serial path, whose reader waits for as many bytes as a cycle has, and could sleep through one."""
+    lost = Injector(parse_stretches("dead=4.5@.15+.01,dead=4.3@.25+.01"), Truth())
+    recording = numbered(60, first=FIRST)
+    with (
+        Emulator([recording], first_frame=first_frame, old_canable=old_canable, faults=lost) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        scans = read_until_lost(link)
+        counters = link.counters()
+    of_cycles = [set(scan.counts[2][scan.fresh].tolist()) for scan in scans]
+    assert all(len(numbers) == 1 for numbers in of_cycles)
+    assert counters["resynchronised"] >= (16 - first_frame) % 16
+    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > 40

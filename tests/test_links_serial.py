@@ -435,3 +435,18 @@ def test_low_latency_where_the_driver_has_it(monkeypatch):
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda port, on: asked.append(on))
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         assert asked == [True] and link.low_latency
+
+
+@pytest.mark.parametrize("old_canable", [True, False])
+def test_what_lay_there_because_nobody_read_is_marked_old(old_canable):
+    """Without stamps readings of seconds ago were as new as any."""
+    playing = Emulator([make_recording(50)], loop=True, old_canable=old_canable)
+    with playing as emulator, SlcanSerialLink(emulator.port) as link:
+        read_scans(link, 20)
+        time.sleep(0.6)
+        (first, *_) = read_scans(link, 1)
+        assert first.unread_ns > 500_000_000
+        assert (first.device_ns is None) == old_canable
+        end_s = time.monotonic() + 20
+        while any(scan.unread_ns for scan in read_scans(link, 1)):
+            assert time.monotonic() < end_s

@@ -480,3 +480,12 @@ def test_zeroing_before_any_sensor_was_heard_is_refused_and_said():
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     runtime.zero()
     assert runtime.push(make_scan(0)).event == "zeroing refused: no sensor was heard yet"
+
+
+def test_what_may_be_old_because_nobody_read_is_said_to_be():
+    runtime = make_runtime()
+    late = dataclasses.replace(make_scan(0), unread_ns=4_980_000_000)
+    note = runtime.push(late).note
+    assert note is not None and "may have been 4.98 s old when it came: nobody read meanwhile" in note
+    known = dataclasses.replace(make_scan(1), unread_ns=4_980_000_000, device_ns=make_scan(1).time_ns - 1000)
+    assert "old" not in (runtime.push(known).note or "")

@@ -13,6 +13,7 @@ from edge.taxels import (
     BACK_SCANS,
     FAR_SCANS,
     FROZEN_SCANS,
+    FROZEN_SENSOR_SCANS,
     HOLD_NS,
     HOLD_SCANS,
     LONE_COUNTS,
@@ -112,11 +113,12 @@ def test_one_that_comes_and_goes_does_not_flicker(reason):
         assert pad.read(BACK_SCANS - 2) + pad.read(2, fault) == [{3: reason}] * BACK_SCANS
 
 
-def test_a_scan_sent_again_and_again_says_nothing_of_a_taxel_until_nothing_else_ever_comes():
+def test_a_sensor_that_sends_one_scan_for_ever_is_frozen_after_ten():
     pad = Pad(noise_counts=0)
-    assert not any(pad.read(FROZEN_SCANS))
+    assert not any(pad.read(FROZEN_SENSOR_SCANS))
     assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
     assert not pad.watch.may_be_estimated
+    assert pad.watch.note(None) == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
 
 
 @pytest.mark.parametrize(

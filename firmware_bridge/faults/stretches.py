@@ -3,7 +3,7 @@
 lost@2+3                from the second second on, for three seconds
 lost=.05@2+3            one frame in twenty
 dead=6.11@2+3           taxel 11 of sensor 6
-dead=6.11@2+.01         one frame of it
+dead=6.11@2+.008        one frame of it, at 100 scans a second
 unplug@8+.5,garbage@9+2
 mixed@5+600             all of them, drawn from the seed, for ten minutes
 """

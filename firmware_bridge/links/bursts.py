@@ -13,14 +13,16 @@ for 2 ms, seldom 5.
 import errno
 import os
 import select
+import sys
 import time
 from collections.abc import Callable
 from typing import Final
 
 try:
+    import fcntl
     import termios
 except ImportError:
-    termios = None
+    fcntl = termios = None
 
 FULL_BYTES: Final = 255
 """The most that VMIN can say; a scan of sixteen taxels has 352."""
@@ -33,7 +35,11 @@ STEP_S: Final = 0.0003
 
 
 class BurstReader:
-    """Reads bytes from the descriptor of a serial port that is in raw mode and does not block."""
+    """Reads bytes from the descriptor of a serial port that is in raw mode and does not block.
+
+    Attributes:
+        empty_s: when no more than the beginning of a scan lay there the last time that was looked.
+    """
 
     def __init__(
         self,
@@ -50,7 +56,7 @@ class BurstReader:
         self._descriptor = descriptor
         self._clock_s = clock_s
         self._sleep = sleep
-        self._newest_s = clock_s()
+        self._newest_s = self.empty_s = clock_s()
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
@@ -83,8 +89,19 @@ class BurstReader:
                     data = self._take(data, wanted_bytes)
             if data:
                 self._newest_s = self._clock_s()
+            else:
+                self.empty_s = self._clock_s()
             if data or left_s <= 0:
                 return data
+
+    def look(self) -> None:
+        """Look whether more waits than the beginning of a scan; if not, keep when that was.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        if _waiting_bytes(self._descriptor) < FULL_BYTES:
+            self.empty_s = self._clock_s()
 
     def _take(self, data: bytes, wanted_bytes: int) -> bytes:
         """`data` and what is there, up to `wanted_bytes`. An error behind bytes is left for the next call to meet."""
@@ -102,3 +119,9 @@ class BurstReader:
                 raise
             data += piece
         return data
+
+
+def _waiting_bytes(descriptor: int) -> int:
+    if fcntl is None or termios is None:
+        return 0
+    return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)

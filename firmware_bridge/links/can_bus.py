@@ -16,6 +16,7 @@ from firmware_bridge.frame_scans import FrameScans
 from firmware_bridge.gs_usb import BITRATE_BIT_S
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.can_networks import can_networks, is_pretended
+from firmware_bridge.links.unread import Unread
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import CanFrame
 from firmware_bridge.xela import USPA44_MAP, ModelMap
@@ -81,6 +82,7 @@ class CanBusLink(Link):
         self._clock_ns = clock_ns
         self._scans = FrameScans(model)
         self._errors = BusErrors()
+        self._unread = Unread()
         self._device_clock = DeviceClock(TICK_NS, None)
         self._counts = dict.fromkeys(("frames", "error_frames", "fd_frames"), 0)
         self._bus: Any = None
@@ -93,6 +95,7 @@ class CanBusLink(Link):
             self._errors.restarted()
         self._scans.begin_anew()
         self._bus = self._open()
+        self._unread.found_empty(self._clock_ns())
         try:
             for frame in self._triggers:
                 message = self._can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
@@ -117,6 +120,7 @@ class CanBusLink(Link):
         end_ns = self._clock_ns() + int(timeout_s * 1e9)
         left_s = timeout_s
         while True:
+            begun_ns = self._clock_ns()
             try:
                 message = self._bus.recv(max(left_s, 0.0))
                 if message is None and self._bus.state is self._can.BusState.ERROR:
@@ -125,7 +129,12 @@ class CanBusLink(Link):
                 self._errors.restarted()  # as a network does that comes up, or an adapter that is plugged in
                 raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
             now_ns = self._clock_ns()
-            scans = [] if message is None else self._take(message, now_ns)
+            if message is None:
+                self._unread.found_empty(now_ns)
+                scans = []
+            else:
+                self._unread.found(begun_ns, now_ns)
+                scans = self._unread.mark(self._take(message, now_ns), now_ns)
             self.trouble = self._errors.trouble(now_ns)
             left_s = (end_ns - now_ns) / 1e9
             if scans or left_s <= 0:

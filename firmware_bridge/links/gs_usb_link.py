@@ -17,6 +17,7 @@ from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.gs_usb_scans import GsUsbScans
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
+from firmware_bridge.links.unread import Unread
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import CanFrame
 from firmware_bridge.xela import USPA44_MAP, ModelMap
@@ -75,6 +76,7 @@ class GsUsbLink(Link):
         self._scans = GsUsbScans(model)
         self._received_bytes = 0
         self._transfers = 0
+        self._unread = Unread()
         self._device: usb.core.Device | None = None
         self._driver_detached = False
         self._packet = array.array("B", bytes(USUAL_PACKET_BYTES))
@@ -90,6 +92,7 @@ class GsUsbLink(Link):
             raise DeviceError(f"{self.name}: {_reason(error, described)}") from error
         self.serial_number = described.serial_number
         self._device = device
+        self._unread.found_empty(self._clock_ns())
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -113,9 +116,14 @@ class GsUsbLink(Link):
         end_ns = self._clock_ns() + int(timeout_s * 1e9)
         left_ns = end_ns - self._clock_ns()
         while True:
+            begun_ns = self._clock_ns()
             data = self._fetch(self._device, max(1, math.ceil(left_ns / 1e6)))
             now_ns = self._clock_ns()
-            scans = self._scans.feed(data, now_ns)
+            if data:
+                self._unread.found(begun_ns, now_ns)
+            else:
+                self._unread.found_empty(now_ns)
+            scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
             if data and len(data) < len(self._packet):
                 self._scans.end_transfer()
             self.trouble = self._scans.trouble(now_ns)

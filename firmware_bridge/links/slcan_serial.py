@@ -19,6 +19,7 @@ from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.bursts import BurstReader
 from firmware_bridge.links.ports import NO_PERMISSION, PluggedAdapter, serial_ports
+from firmware_bridge.links.unread import Unread
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
@@ -98,6 +99,7 @@ class SlcanSerialLink(Link):
         self._frames_at_opening = 0
         self._late_stamps_from = (0, 0)
         self._received_bytes = 0
+        self._unread = Unread()
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
 
@@ -137,11 +139,14 @@ class SlcanSerialLink(Link):
             raise ValueError("the link is not open: use it in a with statement")
         try:
             data = self._bursts.read(timeout_s, self._scans.bytes_until_scan())
+            self._unread.found_empty(round(self._bursts.empty_s * 1e9))
+            with suppress(OSError):  # of an error behind bytes the next call tells
+                self._bursts.look()
         except OSError as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
         self._received_bytes += len(data)
         now_ns = time.monotonic_ns()
-        scans = self._scans.feed(data, now_ns)
+        scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
         if self._questions.due(len(scans), self._scans.refusals, now_ns):
             _say(self._serial, STATUS_FLAGS)
         silence = self._questions.answered_in_silence

@@ -120,7 +120,9 @@ def oracle_rows(bench: Workbench, model: ModelSession) -> list[Row]:
     jobs = joblib.Parallel(n_jobs=-1, return_as="generator")(
         joblib.delayed(_press_and_fit)(number, steps) for number in range(count)
     )
-    done = [one for _, one in zip(tracked(range(count), "oracle", "press"), jobs, strict=True)]
+    done: list[tuple[FrozenPresses, NDArray[np.float32]]] = [
+        one for _, one in zip(tracked(range(count), "oracle", "press"), cast("Iterable[Any]", jobs), strict=True)
+    ]
     frozen = FrozenPresses(
         join_presses([one.presses for one, _ in done]), np.concatenate([one.gains for one, _ in done])
     )

@@ -69,7 +69,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     off = [NONE_OFF, *(one for one in off if one.can_be)]
     shapes = draw_shapes(count)
     jobs = joblib.Parallel(n_jobs=-1, return_as="generator")(joblib.delayed(pressed)(one.pad, shapes) for one in off)
-    read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
+    made = zip(tracked(off, "pads", "pad"), cast("Iterable[PressSet]", jobs), strict=True)
+    read = {one: freeze_presses(presses, SEED) for one, presses in made}
     model = load_shipped(bench.models)
     scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
     if bench.before is not None:
