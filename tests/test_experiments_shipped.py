@@ -14,7 +14,6 @@ from firmware_bridge.pad import Pad
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError
 from train.experiments import baselines, families, kriging, nominal, oracle, pads, scores, shipped, wrench
-from train.experiments.unseen import TEST_FIGURES
 from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import NOMINAL
@@ -121,7 +120,7 @@ class TestWrench:
         truth, summed = wrench.true_loads(wide), wrench.loads(wide.presses.traction_kpa, 2)
         assert summed[:, :3] == pytest.approx(truth[:, :3], abs=0.02)
         cells = wrench.error_cells(truth, truth)
-        assert cells["z N"] == 0 and cells["twist %"] < 1e-3 and cells["centre mm"] == 0
+        assert cells["z N"] == 0 and cells["tangential %"] < 1e-3 and cells["centre mm"] == 0
 
     def test_what_a_method_does_not_give_has_no_cell(self):
         truth = np.ones((4, 6))
@@ -191,7 +190,7 @@ class TestPages:
         assert len(named) == 22 and named[-1]["family"] == "all" and "model, over" in named[0]
         assert {row["method"] for row in rows_of(tmp_path / "families-oracle.csv")} >= {"oracle", "model"}
         assert len(rows_of(tmp_path / "families-nominal.csv")) == 9
-        assert (tmp_path / "families.png").exists() and TEST_FIGURES > 2
+        assert (tmp_path / "families.png").exists()
 
     def test_pads(self, bench, tmp_path):
         write_model(tmp_path / "before.onnx", make_contract(taps=1, version=4))

@@ -92,8 +92,8 @@ _ORACLE: Final = (
 _NOMINAL: Final = (
     "The nominal pad, whole taps of the paper's protocol, in one tap. `frozen.npz` does not hold its sensors' gains, "
     "so that only the pad can be made known there; where the gains are known too, the same presses were read by the "
-    "same procedure with gains of 1, as known gains divide out. Glyphs and polygons are of a seed that no training had, at "
-    "the end of each tap; intervals are by tap."
+    "same procedure with gains of 1, as known gains divide out. Glyphs and polygons are of a seed of their own, "
+    "at the end of each tap; intervals are by tap."
 )
 
 
