@@ -49,7 +49,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"{size[3]:.1f} N mm. `%` is the p for which errors are p % of the z force + {OFFSET_N} N in the root mean "
         "square; the tangential error is a vector's, held against the z force, too, as many presses have no drag. "
         "Linear: least squares from the 48 readings of training presses; with counts per newton known, times nominal "
-        "over known ones. Summed z: over the counts per newton, known. Centres of pressure are compared where the truth "
+        "over known ones. Summed z: over the known counts per newton. Centres of pressure are compared where the truth "
         f"and the estimate press with {LEAST_FORCE_N} N."
     )
     report.table([{"method": name} | error_cells(one, truth) for name, one in found.items()], "All families.")
