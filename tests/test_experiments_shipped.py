@@ -51,11 +51,12 @@ class TestScores:
         assert scores.share_beside(np.full(101, 0.04), reading, 0.05) == pytest.approx(0, abs=1e-6)
 
 
-class TestShipped:
-    @pytest.fixture(scope="class")
-    def few(self):
-        return load_frozen_presses().pick(np.arange(5))
+@pytest.fixture(scope="module")
+def few():
+    return load_frozen_presses().pick(np.arange(5))
 
+
+class TestShipped:
     def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(self, bench, few):
         model = shipped.load_shipped(bench.models)
         found = {known: shipped.infer_presses(model, few, known).patterns for known in shipped.KNOWN}
@@ -137,7 +138,7 @@ class TestWrench:
 
 
 def test_the_oracle_finds_a_press_again_from_a_place_nearby():
-    known = oracle.KnownSurface("triangle", NOMINAL)
+    known = oracle.KnownSurface("small triangle", NOMINAL)
     start = oracle._PRIOR_MEAN + np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0])
     numbers = start + np.array([0.4, -0.3, 4, 0.002, 0, 0.1, 0.1, 0, 0, 0])
     press = known.press(numbers[None])
