@@ -14,7 +14,6 @@ from firmware_bridge.pad import Pad
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError
 from train.experiments import baselines, families, kriging, nominal, oracle, pads, scores, shipped, wrench
-from train.experiments.unseen import TEST_FIGURES
 from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import NOMINAL
@@ -52,11 +51,12 @@ class TestScores:
         assert scores.share_beside(np.full(101, 0.04), reading, 0.05) == pytest.approx(0, abs=1e-6)
 
 
-class TestShipped:
-    @pytest.fixture(scope="class")
-    def few(self):
-        return load_frozen_presses().pick(np.arange(5))
+@pytest.fixture(scope="module")
+def few():
+    return load_frozen_presses().pick(np.arange(5))
 
+
+class TestShipped:
     def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(self, bench, few):
         model = shipped.load_shipped(bench.models)
         found = {known: shipped.infer_presses(model, few, known).patterns for known in shipped.KNOWN}
@@ -121,7 +121,7 @@ class TestWrench:
         truth, summed = wrench.true_loads(wide), wrench.loads(wide.presses.traction_kpa, 2)
         assert summed[:, :3] == pytest.approx(truth[:, :3], abs=0.02)
         cells = wrench.error_cells(truth, truth)
-        assert cells["z N"] == 0 and cells["twist %"] < 1e-3 and cells["centre mm"] == 0
+        assert cells["z N"] == 0 and cells["tangential %"] < 1e-3 and cells["centre mm"] == 0
 
     def test_what_a_method_does_not_give_has_no_cell(self):
         truth = np.ones((4, 6))
@@ -138,7 +138,7 @@ class TestWrench:
 
 
 def test_the_oracle_finds_a_press_again_from_a_place_nearby():
-    known = oracle.KnownSurface("triangle", NOMINAL)
+    known = oracle.KnownSurface("small triangle", NOMINAL)
     start = oracle._PRIOR_MEAN + np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0])
     numbers = start + np.array([0.4, -0.3, 4, 0.002, 0, 0.1, 0.1, 0, 0, 0])
     press = known.press(numbers[None])
@@ -191,7 +191,7 @@ class TestPages:
         assert len(named) == 22 and named[-1]["family"] == "all" and "model, over" in named[0]
         assert {row["method"] for row in rows_of(tmp_path / "families-oracle.csv")} >= {"oracle", "model"}
         assert len(rows_of(tmp_path / "families-nominal.csv")) == 9
-        assert (tmp_path / "families.png").exists() and TEST_FIGURES > 2
+        assert (tmp_path / "families.png").exists()
 
     def test_pads(self, bench, tmp_path):
         write_model(tmp_path / "before.onnx", make_contract(taps=1, version=4))

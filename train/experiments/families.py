@@ -84,16 +84,16 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 _ORACLE: Final = (
-    "What is possible: presses of the paper's surfaces on pads of their own, all known but the pose, the depth and the "
-    "drag. The oracle knows the surface, the pad and the gains, starts from a place nearby, and fits the simulator "
-    "itself to the readings by Gauss-Newton; what drift, hysteresis and cross-talk do it knows as a covariance only. "
-    "No method that does not know the surface can do as well."
+    "What is possible: presses of the paper's surfaces on pads of their own. The oracle knows surface, pad, "
+    "gains, and the place to 0.5 mm and 5 degrees (standard deviations), and fits the simulator itself to the readings "
+    "by Gauss-Newton; what drift, hysteresis and cross-talk do it knows as a covariance only. No method that does not "
+    "know the surface can be expected to do as well."
 )
 _NOMINAL: Final = (
     "The nominal pad, whole taps of the paper's protocol, in one tap. `frozen.npz` does not hold its sensors' gains, "
     "so that only the pad can be made known there; where the gains are known too, the same presses were read by the "
-    "same procedure with gains of 1, as known gains divide out. Glyphs and polygons are of a seed that no training had, at "
-    "the end of each tap; intervals are by tap."
+    "same procedure with gains of 1, as known gains divide out. Glyphs and polygons are of a seed of their own, "
+    "at the end of each tap; intervals are by tap."
 )
 
 

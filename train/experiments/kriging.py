@@ -33,19 +33,21 @@ class Kriging:
     def __init__(self, pad: GrippedPad) -> None:
         self._size, self._cell_mm = pad.size, pad.cell_mm
         self._solver = ContactSolver(pad.pad.layer, pad.size, pad.cell_mm)
-        cells = pad.size**2
-        one = (np.eye(cells, dtype=np.float32) * np.float32(_LIGHT_N / pad.cell_mm**2)).reshape(-1, *2 * (pad.size,))
+        cells, light_mpa = pad.size**2, np.float32(_LIGHT_N / pad.cell_mm**2)
+        one = (np.eye(cells, dtype=np.float32) * light_mpa).reshape(-1, *2 * (pad.size,))
         none = np.zeros_like(one)
         fields = [(one, None)] + [(none, np.stack(both, axis=1)) for both in ((one, none), (none, one))]
-        self._readings = np.stack(
+        readings = np.stack(
             [
                 pad.skin.frames(pressure[None], None if traction is None else traction[None])[0].reshape(cells, -1).T
                 for pressure, traction in fields
             ]
-        ).reshape(len(fields), -1, pad.size, pad.size)  # (3, 48, size, size), of pressure and tractions
+        )
+        # (3, 48, size, size) in counts per MPa, of pressure and tractions.
+        self._readings = readings.reshape(len(fields), -1, pad.size, pad.size) / light_mpa
 
     def matrix(self, length_mm: float, noise: float) -> NDArray[np.float32]:
-        """What brings readings (n, 48) to patterns (n, pixels), but for one factor.
+        """What brings readings (n, 48) in counts to deflections (n, pixels) in [mm].
 
         Args:
             length_mm: of the fields' smoothness.

@@ -5,9 +5,10 @@ twist, and friction. They have the Gaussian prior that they are drawn from; what
 Gaussian error. Gauss-Newton goes to the most probable press, whose pattern is the oracle's.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, cast
 
 import joblib
 import numpy as np
@@ -47,6 +48,9 @@ _MODEL_SHARE: Final = 0.03
 """Of a reading, what hysteresis and cross-talk leave that no press explains."""
 
 
+_Fitted = tuple[FrozenPresses, NDArray[np.float32]]
+
+
 @dataclass(frozen=True)
 class KnownSurface:
     """One flat surface under one pad.
@@ -72,8 +76,8 @@ class KnownSurface:
         pad = self._gripped
         places = as_poses(numbers[:, :3])
         heights = -footprints([self._relief] * len(numbers), places, pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm
-        slopes = numbers[:, 3:5].astype(np.float32)[:, :, None, None]
-        heights = heights + slopes[:, 0] * pad.places_mm[0] + slopes[:, 1] * pad.places_mm[1]
+        slopes = numbers[:, 3:5, None, None]
+        heights = (heights + slopes[:, 0] * pad.places_mm[0] + slopes[:, 1] * pad.places_mm[1]).astype(np.float32)
         depth_mm = np.clip(numbers[:, _DEPTH], *INDENTATION_MM)
         return pad.press(heights, depth_mm, numbers[:, 6:8], numbers[:, 8], np.exp(numbers[:, 9]))
 
@@ -117,12 +121,9 @@ def error_covariance(reading: NDArray[np.floating], nuisances: Nuisances) -> NDA
 def oracle_rows(bench: Workbench, model: ModelSession) -> list[Row]:
     """Errors of the oracle and of the model on the same presses."""
     count, steps = (2, 1) if bench.quick else (PRESSES, STEPS)
-    jobs = joblib.Parallel(n_jobs=-1, return_as="generator")(
-        joblib.delayed(_press_and_fit)(number, steps) for number in range(count)
-    )
-    done: list[tuple[FrozenPresses, NDArray[np.float32]]] = [
-        one for _, one in zip(tracked(range(count), "oracle", "press"), cast("Iterable[Any]", jobs), strict=True)
-    ]
+    pool = joblib.Parallel(n_jobs=-1, return_as="generator")
+    jobs = cast(Iterator[_Fitted], pool(joblib.delayed(_press_and_fit)(number, steps) for number in range(count)))
+    done = [one for _, one in zip(tracked(range(count), "oracle", "press"), jobs, strict=True)]
     frozen = FrozenPresses(
         join_presses([one.presses for one, _ in done]), np.concatenate([one.gains for one, _ in done])
     )
@@ -138,7 +139,7 @@ def oracle_rows(bench: Workbench, model: ModelSession) -> list[Row]:
 
 
 @one_thread()
-def _press_and_fit(number: int, steps: int) -> tuple[FrozenPresses, NDArray[np.float32]]:
+def _press_and_fit(number: int, steps: int) -> _Fitted:
     """One press as its sensor reads it, and the oracle's pattern (H, W) of it."""
     rng = np.random.default_rng([SEED, number])
     known = KnownSurface(str(rng.choice(SURFACES)), draw_pad(rng))

@@ -4,9 +4,10 @@ Shapes, poses, depths, drags, friction and every draw of the nuisances are the s
 press by press. Half of the shapes are the paper's, half random figures.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import joblib
 import numpy as np
@@ -68,9 +69,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     off = [OffPad(name, sign * part) for name in names for part in percent for sign in (-1, 1)]
     off = [NONE_OFF, *(one for one in off if one.can_be)]
     shapes = draw_shapes(count)
-    jobs = joblib.Parallel(n_jobs=-1, return_as="generator")(joblib.delayed(pressed)(one.pad, shapes) for one in off)
-    made = zip(tracked(off, "pads", "pad"), cast("Iterable[PressSet]", jobs), strict=True)
-    read = {one: freeze_presses(presses, SEED) for one, presses in made}
+    pool = joblib.Parallel(n_jobs=-1, return_as="generator")
+    jobs = cast(Iterator[PressSet], pool(joblib.delayed(pressed)(one.pad, shapes) for one in off))
+    read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
     model = load_shipped(bench.models)
     scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
     if bench.before is not None:
