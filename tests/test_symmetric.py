@@ -1,4 +1,4 @@
-"""A pad that is turned or mirrored gives the turned or mirrored pattern, layer by layer and through the whole network."""
+"""A pad that is turned or mirrored gives the turned or mirrored pattern, by every layer and by the whole network."""
 
 import numpy as np
 import pytest
