@@ -172,7 +172,7 @@ def test_deviations_learn_where_errors_are():
     # Two kinds of windows: one tells its pattern, the other leaves a coin to be thrown for a third of the pixels.
     torch.manual_seed(3)
     generator = torch.Generator().manual_seed(4)
-    net, objective = CompactNet(1, 2, 16, 1).train(), HeteroscedasticError()
+    net, objective = CompactNet(1, 2, 16, 1, group="p1").train(), HeteroscedasticError()
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     sure, unsure = window(1, taps=1, seed=1), window(1, taps=1, seed=2)
     windows = torch.cat([sure, unsure]).repeat(16, 1, 1, 1)

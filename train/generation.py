@@ -111,7 +111,7 @@ class Generation:
             "samples of a cell": SAMPLES,
         }
         facts = asdict(self) | {"surfaces": list(self.surfaces), "world": world}
-        meshes = {name: _mesh_sha256(name) for name in self.surfaces if name.startswith("mesh:")}
+        meshes = {name: mesh_sha256(name) for name in self.surfaces if name.startswith("mesh:")}
         return facts | ({"meshes": meshes} if meshes else {})
 
     def targets(self, chunk: int, rng: np.random.Generator) -> Targets:
@@ -126,7 +126,7 @@ class Generation:
         return paper_targets(positions_of(self.split), self.surfaces)
 
 
-def _mesh_sha256(name: str) -> str:
+def mesh_sha256(name: str) -> str:
     """Of a user's file: the same name may stand for another surface tomorrow."""
     try:
         return hashlib.sha256(Path(name.removeprefix("mesh:")).read_bytes()).hexdigest()

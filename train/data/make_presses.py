@@ -40,7 +40,7 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
 
     Raises:
         DatasetError: what lies at `path` or beside it was made otherwise, or cannot be written.
-        SurfaceError: a family's name means nothing.
+        SurfaceError: nothing of a user's mesh lies under the pad.
         MeshError: a user's mesh cannot be used.
     """
     facts = world.facts()

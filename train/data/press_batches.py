@@ -84,8 +84,8 @@ class PressBatches:
         toss = rng.random(len(constants))[:, None]
         coins = rng.random(constants.shape) < 0.5
         known = np.where(toss < _NOTHING, False, (toss < _NOTHING + _ALL) | coins)
-        measured = constants + np.float32(_SURE) * rng.standard_normal(constants.shape).astype(np.float32)
-        return known_numbers(measured.astype(np.float32), known, gains_known)
+        unsure = (_SURE * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
+        return known_numbers(constants + unsure, known, gains_known)
 
     def _index(self, number: int) -> NDArray[np.int64]:
         """The sequences of a batch, (batch,): all of them once in each epoch, but for what does not fill a batch."""

@@ -1,5 +1,6 @@
 """Presses to learn from and to be evaluated on, each with a pad of its own, as one npz file with a hash."""
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -108,7 +109,8 @@ class PressSet:
                 write(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
             draft.replace(path)
         except OSError as error:
-            draft.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                draft.unlink()
             raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
 
 

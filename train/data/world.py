@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from train.data.presses import PressSet
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
-from train.generation import one_thread
+from train.generation import mesh_sha256, one_thread
 from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
@@ -77,9 +77,11 @@ class World:
         return ceil(self.count / self.per_pad)
 
     def facts(self) -> dict[str, Any]:
-        """The configuration as JSON gives it back, with the ranges that pads are drawn from."""
+        """The configuration as JSON gives it back, with the ranges that pads are drawn from and the meshes' hashes."""
         ranges = {name: list(bounds) for name, bounds in RANGES.items()}
-        return asdict(self) | {"families": dict(self.families), "ranges": ranges, "inputs": list(INPUTS)}
+        facts = asdict(self) | {"families": dict(self.families), "ranges": ranges, "inputs": list(INPUTS)}
+        meshes = {name: mesh_sha256(name) for name in self.families if name.startswith("mesh:")}
+        return facts | ({"meshes": meshes} if meshes else {})
 
 
 @one_thread()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.depth import Relief, footprints
+from train.errors import SurfaceError
 from train.families import faces, rounds, solids
 from train.families.shape import Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
@@ -84,7 +85,8 @@ def draw_shape(
         pose_error: standard deviations of where a tap lands, in [mm] and [deg].
 
     Raises:
-        SurfaceError: no family of that name.
+        SurfaceError: nothing of a user's mesh lies under the pad.
+        MeshError: the user's mesh cannot be used.
     """
     if family in FIGURES or family.startswith("mesh:"):
         return _draw_figure(rng, family, pad, taps, pose_error)
@@ -157,7 +159,10 @@ def _draw_figure(
     poses = turned_back(random_targets(rng, 1, [name]), taps)[0]
     poses = poses + rng.standard_normal((taps, 3)).clip(-2, 2) * (pose_error[0], pose_error[0], pose_error[1])
     relief = _relief(name)
-    seen = footprints([relief] * taps, as_poses(poses), pad.size * SAMPLES, pad.cell_mm / SAMPLES)
+    try:
+        seen = footprints([relief] * taps, as_poses(poses), pad.size * SAMPLES, pad.cell_mm / SAMPLES)
+    except ValueError as error:  # a user's mesh is a ring, or smaller than the poses' reach
+        raise SurfaceError(f"{error}; tap a surface that has no hole as wide as the pad") from error
     heights = -seen.depth_mm
     if rng.random() > _LEVEL:
         slope = rng.uniform(-_FIGURE_SLOPE, _FIGURE_SLOPE, 2).astype(np.float32)

@@ -1,0 +1,145 @@
+"""Families of shapes: each gives heights wherever a pad looks, and turns, tilts and joins as a figure does."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from train.errors import MeshError, SurfaceError
+from train.families import catalogue, solids
+from train.families.catalogue import FIGURES, SHAPES, SHARES, draw_shape
+from train.families.faces import SLOPE, flat
+from train.families.shape import NOWHERE_MM, Lie, log_uniform
+from train.physics.covers import BARE
+from train.physics.gripped import SAMPLES, GrippedPad
+from train.physics.pads import NOMINAL
+
+STILL = (0.0, 0.0)
+"""No error of where a tap lands."""
+
+
+@pytest.fixture(scope="module")
+def pad():
+    return GrippedPad(NOMINAL)
+
+
+@pytest.fixture
+def level(monkeypatch):
+    """Shapes that lie level, so that what is highest of them is known."""
+    monkeypatch.setattr(catalogue, "_LEVEL", 1.0)
+
+
+def draw(pad, family, seed=0, taps=1):
+    return draw_shape(np.random.default_rng(seed), family, pad, taps, STILL)
+
+
+def highest(pad, heights_mm):
+    """Place of the highest part, x and y in [mm]."""
+    row, col = np.unravel_index(heights_mm.argmax(), heights_mm.shape)
+    return pad.places_mm[0][0, col], pad.places_mm[1][row, 0]
+
+
+def angle_deg(x_mm, y_mm):
+    return np.degrees(np.arctan2(y_mm, x_mm))
+
+
+@pytest.mark.parametrize("family", SHARES)
+def test_every_family_gives_finite_heights_that_reach_the_pad(pad, family):
+    side = pad.size * SAMPLES
+    for seed in range(6):
+        tapped = draw(pad, family, seed, taps=2)
+        assert tapped.heights_mm.shape == (2, side, side) and tapped.heights_mm.dtype == np.float32
+        assert np.isfinite(tapped.heights_mm).all()
+        assert (tapped.heights_mm.max(axis=(1, 2)) > -50).all(), "something lies under the pad"
+        assert np.allclose(np.diff(tapped.angle_deg), -5)
+        assert (tapped.cover == BARE) == (family not in ("soft", "glove"))
+    again = draw(pad, family, 0, taps=2)
+    assert np.array_equal(again.heights_mm, draw(pad, family, 0, taps=2).heights_mm)
+    assert any(not np.array_equal(again.heights_mm, draw(pad, family, seed, taps=2).heights_mm) for seed in range(1, 9))
+
+
+@pytest.mark.parametrize("solid", solids._SOLIDS)
+def test_every_solid_is_a_shape_of_its_own(pad, solid):
+    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
+    one, other = (solid(np.random.default_rng(seed))(x_mm, y_mm) for seed in (0, 1))
+    assert np.isfinite(one).all() and one.shape == x_mm.shape
+    assert not np.array_equal(one, other)
+    assert (one > -10).any(), "it lies under the pad that is over it"
+
+
+def test_all_families_are_drawn_and_figures_are_half_of_what_is_rigid():
+    assert set(SHARES) == set(SHAPES) | set(FIGURES) | {"two", "soft", "glove"}
+    assert sum(SHARES[name] for name in FIGURES) > 0.4 * sum(SHARES.values())
+
+
+def test_a_shape_turns_from_tap_to_tap_as_a_figure_does(pad, level, tmp_path):
+    """A bump beside the pad's centre goes round it: the same way and as far, drawn as a mesh and as a function."""
+    bump = trimesh.creation.icosphere(subdivisions=4, radius=6.0)
+    plate = trimesh.creation.box([40, 40, 1])
+    bump.apply_translation([3.0, 2.0, 0])
+    plate.apply_translation([0, 0, -4])
+    trimesh.util.concatenate([bump, plate]).export(tmp_path / "bump.stl")
+    for family in (f"mesh:{tmp_path / 'bump.stl'}", "dome"):
+        for seed in range(3):
+            tapped = draw(pad, family, seed, taps=3)
+            places = [highest(pad, heights) for heights in tapped.heights_mm]
+            away_mm = [np.hypot(*place) for place in places]
+            if min(away_mm) < 3 or max(np.abs(places).ravel()) > 9:
+                continue  # too near to its centre to tell an angle, or beside the pad
+            turned = [angle_deg(*place) - angle_deg(*places[0]) for place in places]
+            turned = [(turn + 180) % 360 - 180 for turn in turned]
+            assert turned == pytest.approx([0, -5, -10], abs=2), family
+            break
+        else:
+            pytest.fail(f"no {family} lies where its turn can be told")
+
+
+def test_a_tilt_raises_one_side_by_its_slope(pad):
+    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
+    lie = Lie(1.0, -2.0, 40.0, slope_x=0.03, slope_y=-0.02)
+    assert np.allclose(lie.seen(flat(np.random.default_rng(0)), x_mm, y_mm), 0.03 * x_mm - 0.02 * y_mm, atol=1e-5)
+    slopes = []
+    for seed in range(60):
+        heights = draw(pad, "flat", seed).heights_mm[0]
+        slopes.append(np.hypot(np.ptp(heights[:, 0]), np.ptp(heights[0])) / np.ptp(pad.places_mm[0]))
+    assert np.max(slopes) <= 1.01 * SLOPE and np.max(slopes) > 0.6 * SLOPE
+    assert 0.15 < np.mean(np.array(slopes) < 1e-6) < 0.45, "some lie level"
+
+
+def test_a_tilt_turns_with_the_shape_from_tap_to_tap(pad):
+    for seed in range(40):
+        heights = draw(pad, "flat", seed, taps=3).heights_mm
+        slope = np.stack([heights[:, 0, -1] - heights[:, 0, 0], heights[:, -1, 0] - heights[:, 0, 0]])
+        if np.hypot(*slope[:, 0]) > 0.1:
+            turned = [(one - angle_deg(*slope[:, 0]) + 180) % 360 - 180 for one in angle_deg(*slope)]
+            assert turned == pytest.approx([0, -5, -10], abs=0.1)
+            return
+    pytest.fail("every face lies level")
+
+
+def test_two_shapes_lie_on_either_side_at_one_height(pad, level, monkeypatch):
+    monkeypatch.setattr(catalogue, "_PAIRED", ("block",))
+    heights = np.stack([draw(pad, "two", seed).heights_mm[0] for seed in range(12)])
+    middle = heights.shape[-1] // 2
+    left, right = heights[..., :middle].max(axis=(1, 2)), heights[..., middle:].max(axis=(1, 2))
+    assert (np.abs(left) < 1e-4).all() and (np.abs(right) < 1e-4).all()
+    assert (heights < NOWHERE_MM / 2).any(axis=(1, 2)).any(), "there is a gap beside some"
+
+
+def test_a_users_mesh_is_a_family(pad, tmp_path):
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=4, radius=20.0).export(path)
+    tapped = draw(pad, f"mesh:{path}", taps=2)
+    assert tapped.cover == BARE and tapped.heights_mm.shape[0] == 2
+    assert highest(pad, tapped.heights_mm[0]) != highest(pad, tapped.heights_mm[1])
+    trimesh.creation.annulus(r_min=28.0, r_max=30.0, height=3.0).export(tmp_path / "ring.stl")
+    with pytest.raises(SurfaceError, match=r"ring\.stl.* lies under the pad .*; tap a surface"):
+        draw(pad, f"mesh:{tmp_path / 'ring.stl'}")
+    with pytest.raises(MeshError, match="No such file"):
+        draw(pad, f"mesh:{tmp_path / 'absent.stl'}")
+
+
+def test_numbers_are_drawn_evenly_by_their_size():
+    rng = np.random.default_rng(0)
+    drawn = np.array([log_uniform(rng, 1, 100) for _ in range(4000)])
+    assert drawn.min() >= 1 and drawn.max() <= 100
+    assert np.median(drawn) == pytest.approx(10, rel=0.1)

@@ -1,0 +1,182 @@
+"""Presses of any shape: held against closed forms, against flat taps, and against themselves in the limits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge.metrics import contact_iou
+from firmware_bridge.geometry import USPA44
+from train.depth import Pose, Relief, footprints
+from train.families.shape import NOWHERE_MM
+from train.layer import surface_compliance
+from train.physics.covers import BARE, Cover
+from train.physics.gripped import MOST_FORCE_N, SAMPLES, SCALE, TRACTION_SCALE, GrippedPad, PressError
+from train.physics.pads import NOMINAL
+from train.resample import resample
+from train.simulation import FINE_SCALE, SimulatedSensor
+from train.surfaces import surface_mesh
+
+PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
+
+
+@pytest.fixture(scope="module")
+def pad():
+    return GrippedPad(NOMINAL)
+
+
+def figure(pad, name="C", pose=None):
+    """Heights of a figure under the pad, (1, m, m) in [mm]."""
+    pose = Pose(0.5, -0.5, 20.0) if pose is None else pose
+    relief = Relief(name, surface_mesh(name))
+    return -footprints([relief], [pose], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm
+
+
+def face(pad, slope=0.0):
+    x_mm, _ = np.broadcast_arrays(*pad.places_mm)
+    return (slope * x_mm)[None].astype(np.float32)
+
+
+def press(pad, heights_mm, depth_mm=0.2, slide_mm=(0.0, 0.0), twist_rad=0.0, friction=0.5, cover=BARE, **options):
+    """One press."""
+    return pad.press(
+        heights_mm,
+        np.array([depth_mm]),
+        np.array([slide_mm]),
+        np.array([twist_rad]),
+        np.array([friction]),
+        [cover],
+        **options,
+    )
+
+
+def test_under_a_flat_face_pressure_is_even_inside_and_rises_towards_the_edge(pad):
+    done = press(pad, face(pad))
+    inside = done.traction_kpa[0, 2, 2:-2, 2:-2]
+    assert np.ptp(inside) < 0.05 * inside.mean()  # measured .04
+    assert done.traction_kpa[0, 2].max() > 1.2 * inside.max()
+    assert done.traction_kpa[0, 2].sum() * 1e-3 * PIXEL_MM**2 == pytest.approx(done.force_n[0, 2], rel=1e-4)
+    assert done.touching.all()
+    assert np.allclose(done.patterns, 0.2, atol=1e-6)
+    assert not np.abs(done.traction_kpa[0, :2]).max() > 1e-3 and not np.abs(done.force_n[0, :2]).max() > 1e-4
+
+
+def test_a_flat_face_on_a_thin_compressible_pad_sinks_as_under_an_even_load():
+    """There depth over the layer's compliance at wave number 0; a pad that keeps its volume gives way to the sides."""
+    shares = []
+    for thickness_mm, poisson in ((3.2, 0.3), (3.6, 0.4), (4.5, 0.45)):
+        pad = GrippedPad(replace(NOMINAL, thickness_mm=thickness_mm, poisson=poisson))
+        even_kpa = 1e3 * 0.2 / float(surface_compliance(pad.pad.layer, np.array([0.0]))[0])
+        shares.append(press(pad, face(pad)).traction_kpa[0, 2, 2:-2, 2:-2].mean() / even_kpa)
+    assert shares == pytest.approx([0.99, 0.91, 0.68], abs=0.02)
+
+
+def test_a_tilted_face_presses_harder_where_it_stands_higher(pad):
+    pressure = press(pad, face(pad, slope=0.01)).traction_kpa[0, 2]
+    assert pressure[:, 5:].sum() > 1.5 * pressure[:, :3].sum()
+    assert np.allclose(pressure, pressure[::-1], rtol=1e-2, atol=0.2), "as much above as below"
+
+
+@pytest.mark.parametrize(("slide_mm", "twist_rad"), [((0.1, 0.0), 0.0), ((0.0, -0.3), 0.0), ((0.05, 0.1), 0.03)])
+def test_traction_adds_up_to_force_and_twist(pad, slide_mm, twist_rad):
+    done = press(pad, figure(pad), 0.3, slide_mm, twist_rad, friction=0.6)
+    added_n = done.traction_kpa[0].sum(axis=(1, 2)) * 1e-3 * PIXEL_MM**2
+    assert added_n == pytest.approx(done.force_n[0], rel=1e-4, abs=1e-5)
+    across_mm = (np.arange(8) - 3.5) * PIXEL_MM
+    x_kpa, y_kpa, _ = done.traction_kpa[0]
+    twist = float((y_kpa * across_mm - x_kpa * across_mm[:, None]).sum() * 1e-3 * PIXEL_MM**2)
+    # Coarse pixels know no arm within themselves: off by 5 % of force times the pixel, measured.
+    most = 0.08 * float(np.abs(done.force_n[0, :2]).max()) * PIXEL_MM
+    assert twist == pytest.approx(float(done.twist_nmm[0]), abs=most + 1e-3)
+    assert np.abs(done.force_n[0, :2]).max() > 0.1 or abs(done.twist_nmm[0]) > 1, "it is dragged"
+
+
+def test_what_is_dragged_holds_with_the_pressure_times_friction_at_most(pad):
+    dragged = press(pad, figure(pad), 0.3, slide_mm=(2.0, 0.0), friction=0.4)
+    assert dragged.force_n[0, 0] == pytest.approx(0.4 * dragged.force_n[0, 2], rel=0.01)
+    assert dragged.force_n[0, 2] == pytest.approx(press(pad, figure(pad), 0.3).force_n[0, 2], rel=1e-5)
+    left = press(pad, figure(pad), 0.3, slide_mm=(-2.0, 0.0), friction=0.4)
+    assert left.force_n[0, 0] == pytest.approx(-dragged.force_n[0, 0], rel=1e-3)
+    assert np.abs(dragged.counts - left.counts).max() > 50, "the readings tell which way"
+
+
+@pytest.mark.parametrize("name", ["C", "small square", "O"])
+def test_a_rigid_figure_gives_what_a_flat_tap_gives(pad, name):
+    pose = Pose(1.0, -0.5, 30.0)
+    tap = SimulatedSensor().tap([name], [pose], 5.0)
+    depth_mm = float(tap.indentation_mm[0, -1])
+    done = press(pad, figure(pad, name, pose), depth_mm)
+    # The same solver, cells and skin; measured 1.5e-6.
+    assert np.abs(done.counts[0] - tap.counts[0, -1]).max() < 1e-4 * np.abs(tap.counts[0, -1]).max()
+    assert done.force_n[0, 2] == pytest.approx(tap.force_n[0, -1], rel=1e-4)
+    # Truth is made of the cells here, of the figure's outline there. A cell that is touched at all is pressed in: the
+    # outline lies .1 mm further out. Measured over five figures: RMS .023 to .037, 3.4 to 5.9 % more volume, IoU .94.
+    true = resample(tap.patterns[:, 0], FINE_SCALE, SCALE)
+    assert np.sqrt(np.mean((done.patterns - true) ** 2)) < 0.04 * depth_mm
+    assert 0 < done.patterns.sum() / true.sum() - 1 < 0.065
+    touched = resample(tap.touching[:, 0], FINE_SCALE, SCALE) >= 0.5
+    assert contact_iou(done.touching.astype(np.float32), touched, 0.5)[0] > 0.93
+
+
+@pytest.mark.parametrize("cover", [Cover(soft_mpa=1e6), Cover(cloth_mm=1e-6, cloth_mpa=1e6)])
+def test_an_object_that_does_not_give_way_and_a_cloth_of_no_thickness_are_the_bare_press(pad, cover):
+    bare, covered = (press(pad, figure(pad), 0.3, (0.1, 0.05), 0.01, cover=one) for one in (BARE, cover))
+    assert covered.force_n == pytest.approx(bare.force_n, abs=1e-3)
+    assert np.abs(covered.counts - bare.counts).max() < 1e-3 * np.abs(bare.counts).max()
+    assert np.array_equal(covered.touching, bare.touching)
+    # Under a cover truth is the layer's own surface, else the tactile PSF. Measured: RMS .038 of the indentation.
+    assert np.sqrt(np.mean((covered.patterns - bare.patterns) ** 2)) < 0.045 * 0.3
+
+
+def test_a_soft_object_presses_less_and_a_cloth_spreads_what_it_carries(pad):
+    bare = press(pad, figure(pad), 0.3)
+    soft, softer = (press(pad, figure(pad), 0.3, cover=Cover(soft_mpa=mpa)) for mpa in (1.0, 0.1))
+    assert softer.force_n[0, 2] < 0.6 * soft.force_n[0, 2] < 0.6 * bare.force_n[0, 2]
+    assert softer.patterns.max() < soft.patterns.max() < bare.patterns.max()
+    thin, thick = (press(pad, figure(pad), 0.3, cover=Cover(cloth_mm=mm)) for mm in (0.2, 1.0))
+    sharpness = [one.traction_kpa[0, 2].max() / one.force_n[0, 2] for one in (bare, thin, thick)]
+    assert sharpness[0] > sharpness[1] > sharpness[2]
+    assert thick.force_n[0, 2] == pytest.approx(float(thick.traction_kpa[0, 2].sum() * 1e-3 * PIXEL_MM**2), rel=1e-4)
+
+
+def test_presses_do_not_change_each_other(pad):
+    heights = np.concatenate([figure(pad, name) for name in ("C", "O", "T")])
+    covers = [BARE, Cover(soft_mpa=0.5), Cover(cloth_mm=0.4)]
+    depth_mm, slide_mm = np.array([0.3, 0.2, 0.4]), np.array([[0.1, 0], [0, 0.1], [0.05, 0.05]])
+    together = pad.press(heights, depth_mm, slide_mm, np.full(3, 0.01), np.full(3, 0.5), covers)
+    for number in range(3):
+        alone = press(pad, heights[[number]], depth_mm[number], slide_mm[number], 0.01, 0.5, covers[number])
+        assert np.abs(alone.counts[0] - together.counts[number]).max() < 5e-3 * np.abs(alone.counts).max()
+        assert alone.force_n[0] == pytest.approx(together.force_n[number], rel=5e-3, abs=2e-3)
+
+
+def test_a_press_that_takes_too_much_force_goes_less_deep():
+    stiff = GrippedPad(replace(NOMINAL, thickness_mm=3.6, shear_modulus_mpa=0.15))
+    free = press(stiff, face(stiff), 0.5, most_force_n=1e3)
+    held = press(stiff, face(stiff), 0.5)
+    assert free.force_n[0, 2] > 1.3 * MOST_FORCE_N
+    assert 0.7 * MOST_FORCE_N < held.force_n[0, 2] <= MOST_FORCE_N
+    assert held.indentation_mm[0] < free.indentation_mm[0] == 0.5
+    assert held.patterns.max() == pytest.approx(held.indentation_mm[0], rel=1e-4)
+    light = press(stiff, face(stiff), 0.1)
+    assert light.indentation_mm[0] == pytest.approx(0.1) and light.force_n[0, 2] < MOST_FORCE_N
+
+
+@pytest.mark.parametrize("depth_mm", [0.0, -0.1, 0.51, float("nan")])
+def test_a_press_beyond_what_is_linear_is_refused(pad, depth_mm):
+    with pytest.raises(PressError, match=f"indentation of {depth_mm:g} mm, expected above 0 to 0.5 mm"):
+        pad.press(face(pad).repeat(2, 0), np.array([0.2, depth_mm]), np.zeros((2, 2)), np.zeros(2), np.ones(2))
+
+
+def test_nothing_under_the_pad_is_refused(pad):
+    with pytest.raises(PressError, match="nothing lies under the pad"):
+        press(pad, np.full_like(face(pad), NOWHERE_MM))
+
+
+def test_a_pad_of_its_own_reads_differently(pad):
+    """Harder reads more, and so do stronger taxels; an uneven one is pressed unevenly."""
+    bare = press(pad, face(pad)).counts
+    for change in ({"shear_modulus_mpa": 0.15}, {"counts_per_newton": 1.2 * NOMINAL.counts_per_newton}):
+        assert press(GrippedPad(replace(NOMINAL, **change)), face(pad)).counts[0, 2].sum() > 1.1 * bare[0, 2].sum()
+    uneven = GrippedPad(replace(NOMINAL, uneven_mm=0.015, seed=3))
+    assert np.ptp(press(uneven, face(pad)).traction_kpa[0, 2, 2:-2, 2:-2]) > 2

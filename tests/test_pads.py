@@ -1,0 +1,114 @@
+"""Pads: drawn within their ranges, the same for one seed, and known to a network as the runtime tells them."""
+
+from math import inf
+
+import numpy as np
+import pytest
+
+from edge.contract import Contract
+from firmware_bridge.pad import PAD_RANGES
+from firmware_bridge.pad import Pad as KnownPad
+from train.physics.pads import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
+
+DRAWN = [draw_pad(np.random.default_rng([7, number])) for number in range(300)]
+
+
+def test_every_constant_is_drawn_over_its_whole_range_and_not_beyond():
+    for name, (low, high) in RANGES.items():
+        values = np.array([getattr(pad, name) for pad in DRAWN])
+        assert low <= values.min() and values.max() <= high, name
+        assert values.min() < low + 0.05 * (high - low) and values.max() > high - 0.05 * (high - low), name
+        assert low <= getattr(NOMINAL, name) <= high, name
+    assert max(pad.uneven_mm for pad in DRAWN) <= 0.015
+    assert len({pad.seed for pad in DRAWN}) == len(DRAWN)
+
+
+def test_one_seed_is_one_pad_and_spread_draws_it_towards_the_nominal_one():
+    again = draw_pad(np.random.default_rng([7, 0]))
+    assert again == DRAWN[0] != DRAWN[1]
+    near = draw_pad(np.random.default_rng([7, 0]), spread=0.1)
+    for name in RANGES:
+        nominal = getattr(NOMINAL, name)
+        assert getattr(near, name) - nominal == pytest.approx(0.1 * (getattr(again, name) - nominal), abs=1e-12)
+
+
+def test_what_differs_from_magnet_to_magnet_follows_from_the_seed():
+    first, same, perfect = DRAWN[0], Pad(seed=DRAWN[0].seed), Pad()
+    assert np.array_equal(first.rest(16), same.rest(16)) and np.array_equal(first.moments(16), same.moments(16))
+    assert not np.array_equal(first.rest(16), DRAWN[1].rest(16))
+    assert not perfect.rest(16).any() and (perfect.moments(16) == 1).all()
+    moments = np.array([pad.moments(16) for pad in DRAWN])
+    assert moments.std() == pytest.approx(0.026, abs=0.003) and abs(moments - 1).max() <= 0.06 + 1e-9
+
+
+def test_unevenness_has_the_size_that_it_says():
+    x_mm, y_mm = np.linspace(-12, 12, 80)[None], np.linspace(-12, 12, 80)[:, None]
+    assert not Pad().uneven(x_mm, y_mm).any()
+    ratios = [np.sqrt(np.mean(pad.uneven(x_mm, y_mm) ** 2)) / pad.uneven_mm for pad in DRAWN[:60]]
+    assert np.mean(ratios) == pytest.approx(1, abs=0.15)
+
+
+def test_known_numbers_are_values_flags_and_gains_and_zeros_where_nothing_is_known():
+    scaled = np.arange(1, 2 * len(INPUTS) + 1, dtype=np.float32).reshape(2, -1)
+    known = np.zeros(scaled.shape, dtype=bool)
+    known[0, 1] = True
+    numbers = known_numbers(scaled, known, np.array([True, False]))
+    assert numbers.shape == (2, KNOWN)
+    assert not numbers[1].any()
+    expected = np.zeros(KNOWN)
+    expected[[1, len(INPUTS) + 1, -1]] = (scaled[0, 1], 1, 1)
+    assert np.array_equal(numbers[0], expected)
+
+
+def contract() -> Contract:
+    """One that takes what the bundled networks take of a pad."""
+    return Contract(
+        version=5,
+        batch=1,
+        taps=1,
+        scale=10,
+        tap_order="newest first",
+        angle_step_deg=5.0,
+        counts_per_unit=(500.0, 500.0, 1000.0),
+        output_unit="mm",
+        output_full_scale=0.5,
+        contact_level=0.5,
+        sensor="uSPa44",
+        rows=4,
+        cols=4,
+        pitch_mm=4.7,
+        arithmetic="float32",
+        interval_factor=None,
+        confidence={},
+        training_sha256="a",
+        test_set_sha256="b",
+        test_error={},
+        pad_inputs=tuple(input_scale()),
+        takes_gains=True,
+    )
+
+
+@pytest.mark.parametrize("gains", [None, (1.0,) * 48])
+def test_training_and_runtime_tell_a_network_the_same_of_a_pad(gains):
+    """What is drawn for training is what the runtime makes of a sensor's file."""
+    takes = contract()
+    assert takes.pad_width == KNOWN
+    for pad in DRAWN[:20]:
+        scaled = constants(pad)[None]
+        told = known_numbers(scaled, np.ones(scaled.shape, dtype=bool), np.array([gains is not None]))[0]
+        known = KnownPad(**{name: getattr(pad, name) for name in INPUTS}, gains=gains)
+        assert np.allclose(takes.pad_row(known), told, atol=1e-6)
+        assert abs(scaled).max() <= 2
+    some = KnownPad(thickness_mm=5.0)
+    flags = np.array([[name == "thickness_mm" for name in INPUTS]])
+    told = known_numbers(constants(Pad(thickness_mm=5.0))[None], flags, np.array([False]))[0]
+    assert np.allclose(takes.pad_row(some), told, atol=1e-6)
+    assert not takes.pad_row(None).any()
+
+
+def test_every_input_can_be_told_by_a_sensors_file_over_all_that_is_drawn():
+    assert set(INPUTS) <= set(PAD_RANGES) and set(INPUTS) <= set(RANGES)
+    for name, centre, spread in input_scale():
+        low, high = PAD_RANGES[name]
+        assert low <= RANGES[name][0] < RANGES[name][1] <= high, name
+        assert low <= centre <= high and 0 < spread < inf

@@ -1,0 +1,124 @@
+"""Batches of presses: one number is one batch, and what is said to be known is what was done."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from press_samples import make_press_set
+
+from train.batches import COUNTS_PER_UNIT
+from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses
+from train.data.press_batches import PressBatches, read_presses
+from train.nuisances import Nuisances
+from train.physics.pads import INPUTS
+
+QUIET = Nuisances.none()
+GAINS_ALONE = replace(QUIET, gain_spread=0.1)
+
+
+@pytest.fixture(scope="module")
+def presses():
+    return make_press_set(count=64, taps=2)
+
+
+def counts_of(batch):
+    """Newest taps of a batch, (n, 3, rows, cols) in counts."""
+    return batch.window[:, :3].numpy() * np.asarray(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
+
+
+def test_one_number_is_one_batch_whatever_was_drawn_before(presses):
+    one, other = (PressBatches(presses, (0.4, 0.6), 16, seed=3) for _ in range(2))
+    for number in (5, 0, 9):
+        other(number + 1)
+        for name in ("window", "pattern", "pad", "traction"):
+            assert getattr(one(number), name).equal(getattr(other(number), name)), name
+    assert not one(0).window.equal(one(4).window)
+    assert not one(0).window.equal(PressBatches(presses, (0.4, 0.6), 16, seed=4)(0).window)
+
+
+def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
+    batches = PressBatches(presses, (1.0,), 16, seed=1, nuisances=QUIET)
+    marks = [row.tobytes() for row in presses.traction_kpa[:, 0, 0].astype(np.float32)]  # each has its own
+    for first in (0, 4):
+        drawn = [batches(number) for number in range(first, first + 4)]
+        traction = np.concatenate([batch.traction.numpy() for batch in drawn])
+        index = [marks.index(row.tobytes()) for row in traction[:, 0, 0]]
+        assert sorted(index) == list(range(64))
+        assert np.array_equal(traction, presses.traction_kpa[index].astype(np.float32))
+        patterns = np.concatenate([batch.pattern.numpy() for batch in drawn])
+        assert np.array_equal(patterns, presses.patterns[index].astype(np.float32))
+        apart = np.abs(np.concatenate([counts_of(batch) for batch in drawn]) - presses.counts[index, 0])
+        unknown = np.concatenate([batch.pad[:, -1].numpy() for batch in drawn]) == 0
+        assert apart[unknown].max() < 0.51, "no nuisance but the rounding"
+        assert apart[~unknown].max() > 1, "gains are known but for what calibration leaves open"
+
+
+def test_of_a_third_of_the_pads_nothing_is_known_of_a_third_all(presses):
+    batches = PressBatches(presses, (1.0,), 64, seed=2, nuisances=QUIET)
+    pads = np.concatenate([batches(number).pad.numpy() for number in range(40)])
+    count = len(INPUTS)
+    values, flags, gains = pads[:, :count], pads[:, count:-1], pads[:, -1]
+    assert set(np.unique(flags)) == {0, 1} == set(np.unique(gains))
+    assert not values[flags == 0].any()
+    nothing, everything = (flags == 0).all(axis=1).mean(), (flags == 1).all(axis=1).mean()
+    assert nothing == pytest.approx(0.35, abs=0.05) and everything == pytest.approx(0.35, abs=0.05)
+    assert gains.mean() == pytest.approx(0.45, abs=0.02)
+    assert not pads[(flags == 0).all(axis=1) & (gains == 0)].any(), "of an unknown pad all is zero"
+
+
+def test_known_constants_are_near_the_pads_own(presses):
+    same = replace(presses, constants=np.full_like(presses.constants, 0.7))
+    pads = np.concatenate([PressBatches(same, (1.0,), 64, seed=2, nuisances=QUIET)(n).pad.numpy() for n in range(20)])
+    values = pads[:, : len(INPUTS)][pads[:, len(INPUTS) : -1] == 1]
+    assert values.mean() == pytest.approx(0.7, abs=0.01) and values.std() == pytest.approx(0.1, abs=0.01)
+
+
+def test_readings_of_known_gains_are_evened_out(presses):
+    """One clean press read by many sensors: where gains are known, what is left of their spread is small."""
+    one = replace(presses, counts=np.broadcast_to(np.float32(4000), presses.counts.shape).copy())
+    batch = PressBatches(one, (1.0,), 64, seed=5, nuisances=GAINS_ALONE)(0)
+    spread = counts_of(batch).std(axis=(1, 2, 3)) / 4000
+    known = batch.pad[:, -1].numpy() == 1
+    assert spread[known].max() < 0.03 < 0.05 < spread[~known].min()
+
+
+def test_absent_taps_are_zeros(presses):
+    batch = PressBatches(presses, (0.5, 0.5), 64, seed=6)(0)
+    older = batch.window[:, 3:].abs().amax(dim=(1, 2, 3)).numpy()
+    assert 0.3 < (older == 0).mean() < 0.7
+    assert (batch.window[:, :3].abs().amax(dim=(1, 2, 3)) > 0).all()
+    readings = read_presses(presses.with_taps(4), Nuisances(), 1)
+    assert readings.shape == (64, 4, 3, 4, 4)
+    assert not readings[:, 2:].any() and readings[:, :2].any(axis=(2, 3, 4)).all()
+    assert np.array_equal(readings, np.rint(readings))
+
+
+def test_frozen_presses_are_read_once_by_sensors_whose_gains_divide_out(presses):
+    frozen = freeze_presses(presses, 9, GAINS_ALONE)
+    raw, evened = frozen.windows(2), frozen.windows(2, gains_known=True)
+    assert np.abs(evened - presses.counts).max() < 1.2, "but for two roundings to whole counts"
+    assert np.abs(raw - presses.counts).max() > 20
+    assert freeze_presses(presses, 9, GAINS_ALONE).presses.sha256() == frozen.presses.sha256()
+    assert freeze_presses(presses, 10, GAINS_ALONE).presses.sha256() != frozen.presses.sha256()
+    assert not frozen.pads(known=False).any()
+    assert (frozen.pads(known=True)[:, len(INPUTS) :] == 1).all()
+    assert np.array_equal(frozen.pads(known=True)[:, : len(INPUTS)], presses.constants)
+
+
+def test_a_frozen_set_is_saved_without_its_gains_and_has_them_again(presses, tmp_path):
+    frozen = freeze_presses(presses, 9)
+    frozen.presses.save(tmp_path / "test.npz", compressed=True)
+    read = load_frozen_presses(tmp_path / "test.npz")
+    assert isinstance(read, FrozenPresses) and np.array_equal(read.gains, frozen.gains)
+    assert np.array_equal(read.windows(1, gains_known=True), frozen.windows(1, gains_known=True))
+    some = read.pick(np.arange(3))
+    assert len(some) == 3 and np.array_equal(some.gains, frozen.gains[:3])
+
+
+def test_to_the_runtimes_evaluation_it_is_a_frame_a_tap(presses):
+    frozen = freeze_presses(presses, 9)
+    given = frozen.as_frozen_set()
+    assert len(given) == 64 and given.scale == 10
+    assert np.array_equal(given.windows(2), frozen.windows(2))
+    assert np.allclose(given.patterns(), frozen.patterns(), atol=1e-3)
+    assert np.array_equal(given.force_n, presses.force_n[:, 2])

@@ -1,0 +1,136 @@
+"""Sets of presses: written whole, read back the same, and refused in one line where they are not."""
+
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from press_samples import make_press_set
+
+from train.data.files import load_taps
+from train.data.presses import join_presses, load_presses
+from train.errors import DatasetError
+from train.loop import Recipe
+from train.training import batches_of
+
+
+def arrays_of(presses):
+    return {name: getattr(presses, name) for name in ("family", "pad", "counts", "patterns", "touching", "twist_nmm")}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_what_is_saved_is_read_back_to_the_bit(tmp_path, compressed):
+    made = make_press_set()
+    made.save(tmp_path / "deep" / "presses.npz", compressed=compressed)
+    read = load_presses(tmp_path / "deep" / "presses.npz")
+    assert read.sha256() == made.sha256() and read.config == made.config
+    for name, array in arrays_of(made).items():
+        assert getattr(read, name).dtype == array.dtype and np.array_equal(getattr(read, name), array), name
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["presses.npz"]
+    content = (tmp_path / "deep" / "presses.npz").read_bytes()
+    made.save(tmp_path / "again.npz", compressed=compressed)
+    assert (tmp_path / "again.npz").read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["counts", "touching", "family", "constants", "traction_kpa", "config"])
+def test_the_hash_changes_with_everything(name):
+    made = make_press_set()
+    if name == "config":
+        other = replace(made, config={**made.config, "seed": 1})
+    else:
+        array = getattr(made, name).copy()
+        array[-1] = ~array[-1] if array.dtype == bool else array[0]
+        other = replace(made, **{name: array})
+    assert other.sha256() != made.sha256()
+
+
+def test_a_damaged_file_is_told_from_one_that_is_none(tmp_path):
+    made, path = make_press_set(), tmp_path / "presses.npz"
+    made.save(path)
+    with np.load(path) as held:
+        arrays = dict(held)
+    arrays["counts"][0, 0, 0, 0, 0] += 1
+    np.savez(path, **arrays)
+    with pytest.raises(DatasetError, match=r"presses\.npz is damaged: its sha256 is .*: make it again$"):
+        load_presses(path)
+    for name, value, told in (
+        ("counts", arrays["counts"][:3], r"expected float32 \(12, "),
+        ("counts", arrays["counts"].astype(np.float64), "counts is float64"),
+        ("version", np.array(99), "of version 99, expected .* of at most 1"),
+        ("schema", np.array("another"), "is 'another' of version 1"),
+        ("facts", np.array("{"), "or a damaged one"),
+    ):
+        np.savez(path, **{**arrays, name: value})
+        with pytest.raises(DatasetError, match=rf"presses\.npz.*{told}"):
+            load_presses(path)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no zip at all", "cut"])
+def test_what_is_no_file_of_presses_is_refused_in_one_line(tmp_path, content):
+    path = tmp_path / "presses.npz"
+    make_press_set(count=3).save(path)
+    if content == "cut":
+        path.write_bytes(path.read_bytes()[:2000])
+    elif content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"^[^\n]*presses\.npz[^\n]*make (it again|one with)[^\n]*$"):
+        load_presses(path)
+
+
+def test_a_file_that_cannot_be_written_is_said_and_leaves_nothing(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(DatasetError, match=r"taken.*cannot be written"):
+        make_press_set(count=3).save(tmp_path / "taken" / "presses.npz")
+    assert (tmp_path / "taken").read_text() == ""
+
+
+def test_absent_taps_are_zeros_and_come_last():
+    made = make_press_set(taps=2)
+    more, fewer = made.with_taps(4), made.with_taps(1)
+    assert more.taps == 4 and np.array_equal(more.counts[:, :2], made.counts) and not more.counts[:, 2:].any()
+    assert more.angle_deg.shape == (12, 4)
+    assert fewer.taps == 1 and np.array_equal(fewer.counts[:, 0], made.counts[:, 0])
+
+
+def test_sets_are_joined_with_their_pads_apart():
+    one, two = make_press_set(taps=1), make_press_set(count=5, taps=3, seed=1)
+    empty = one.pick(np.zeros(12, dtype=bool))
+    joined = join_presses([one, empty, two])
+    assert len(joined) == 17 and joined.taps == 3
+    assert len(np.unique(joined.pad)) == 3 + 2 and joined.pad[:12].max() < joined.pad[12:].min()
+    assert np.array_equal(joined.counts[12:], two.counts) and not joined.counts[:12, 1:].any()
+    assert joined.config == {"parts": [one.config, one.config, two.config]}
+    assert join_presses([two]).sha256() == two.sha256()
+    with pytest.raises(DatasetError, match="name at least one file"):
+        join_presses([])
+
+
+def test_files_of_two_kinds_do_not_mix(tmp_path):
+    from test_dataset import make_sequences
+
+    make_press_set(taps=1).save(tmp_path / "presses.npz")
+    make_press_set(taps=2).save(tmp_path / "more.npz")
+    make_sequences(count=3).save(tmp_path / "taps.npz")
+    presses, more, taps = (tmp_path / f"{name}.npz" for name in ("presses", "more", "taps"))
+    assert len(load_taps([presses, more])) == 24
+    assert load_taps([taps]).seed == 0
+    with pytest.raises(DatasetError, match=r"taps\.npz of train\.generate beside presses"):
+        load_taps([presses, taps])
+
+
+def test_only_sequences_with_all_taps_are_trained_on_and_none_is_said():
+    joined = join_presses([make_press_set(taps=1), make_press_set(count=6, taps=2, seed=1)])
+    batch = batches_of(joined, 10, Recipe(1, batch=64, given=(0.0, 1.0)), seed=0)(0)
+    assert len(batch.window) == 6 and (batch.window[:, 3:].abs().amax(dim=(1, 2, 3)) > 0).all()
+    with pytest.raises(DatasetError, match="no sequences of 3 taps: make some with"):
+        batches_of(joined, 10, Recipe(1, given=(0.5, 0.0, 0.5)), seed=0)
+    with pytest.raises(DatasetError, match="patterns at x8 asked for, presses have them at x10"):
+        batches_of(joined, 8, Recipe(1), seed=0)
+
+
+def test_the_file_is_a_plain_npz(tmp_path):
+    make_press_set(count=3).save(tmp_path / "presses.npz")
+    with zipfile.ZipFile(tmp_path / "presses.npz") as held:
+        assert "traction_kpa.npy" in held.namelist()

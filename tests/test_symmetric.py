@@ -1,0 +1,183 @@
+"""A pad that is turned or mirrored gives the turned or mirrored pattern, by every layer and by the whole network."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from train.networks.compact import CompactNet
+from train.networks.cost import macs, parameters_count
+from train.networks.symmetric import (
+    Channels,
+    SymmetricConv2d,
+    SymmetricResidual,
+    fields,
+    scalars,
+    symmetries,
+    vectors,
+    write_out,
+)
+
+GROUPS = {"p1": 1, "p4": 4, "p4m": 8}
+TOLERANCE = 1e-5
+
+
+def maps_of(channels: int, side: int = 4, count: int = 3, seed: int = 0):
+    return torch.randn(count, channels, side, side, generator=torch.Generator().manual_seed(seed))
+
+
+def moved(maps, channels: Channels, number: int):
+    """Maps (n, channels, H, W) after one of the symmetries: places move, and channels among each other."""
+    index, sign = torch.from_numpy(channels.index[number].copy()), torch.from_numpy(channels.sign[number].copy())
+    placed = symmetries(channels.group)[number](maps.detach().numpy())
+    return torch.from_numpy(placed.copy())[:, index] * sign[:, None, None]
+
+
+def assert_keeps(layer, enter: Channels, leave: Channels, side=4):
+    """The layer of moved maps is the moved layer of the maps."""
+    given = maps_of(len(enter), side)
+    with torch.inference_mode():
+        result = layer(given)
+        for number in range(len(enter.index)):
+            apart = (layer(moved(given, enter, number)) - moved(result, leave, number)).abs().max()
+            assert apart <= TOLERANCE * result.abs().max(), f"symmetry {number}"
+
+
+def layer_kinds(group):
+    return {
+        "vectors to fields": (vectors(group, 2) + scalars(group, 3), fields(group, 16)),
+        "fields to fields": (fields(group, 16), fields(group, 24)),
+        "fields to vectors": (fields(group, 8), vectors(group)),
+        "fields to a pixel's parts": (fields(group, 8), scalars(group, 1).shuffled(5)),
+        "fields to fields' parts": (fields(group, 8), fields(group, 8).shuffled(2)),
+    }
+
+
+@pytest.mark.parametrize("kernel", [1, 3, 5])
+@pytest.mark.parametrize("kind", layer_kinds("p1"))
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_convolution_keeps_every_symmetry(group, kind, kernel):
+    torch.manual_seed(0)
+    enter, leave = layer_kinds(group)[kind]
+    assert_keeps(SymmetricConv2d(enter, leave, kernel), enter, leave)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_residual_block_and_a_pixel_shuffle_keep_every_symmetry(group):
+    torch.manual_seed(0)
+    wide = fields(group, 16)
+    assert_keeps(SymmetricResidual(wide), wide, wide)
+    assert_keeps(nn.PixelShuffle(3), wide.shuffled(3), wide)
+
+
+def test_there_are_as_many_symmetries_as_are_said_and_no_two_are_the_same():
+    maps = np.arange(9).reshape(3, 3)
+    for group, count in GROUPS.items():
+        assert len({move(maps).tobytes() for move in symmetries(group)}) == count
+
+
+def test_what_points_to_the_right_points_up_after_a_quarter_turn_and_to_the_left_in_a_mirror():
+    right = torch.zeros(1, 3, 3, 3)
+    right[0, 0, 1, 2] = 1  # x at the right edge
+    right[0, 2] = 0.5  # z does not turn
+    channels = vectors("p4m")
+    turned, mirrored = moved(right, channels, 1), moved(right, channels, 4)
+    assert turned[0, 1, 0, 1] == -1 and turned[0, :2].abs().sum() == 1, "y points down the rows"
+    assert mirrored[0, 0, 1, 0] == -1 and mirrored[0, :2].abs().sum() == 1
+    assert (turned[0, 2] == 0.5).all() and (mirrored[0, 2] == 0.5).all()
+
+
+@pytest.mark.parametrize(("taps", "group"), [(1, None), (1, "p4"), (4, None), (2, "p1")])
+def test_the_whole_network_keeps_every_symmetry(taps, group):
+    """Pattern and deviation move as they are, the traction's vectors turn; whatever is known of the pad."""
+    torch.manual_seed(0)
+    net = CompactNet(taps, 10, channels=16, blocks=2, known=5, group=group).eval()
+    assert net.group == (group or ("p4m" if taps == 1 else "p4"))
+    assert_network_keeps(net)
+    assert_network_keeps(write_out(net))
+
+
+def assert_network_keeps(net):
+    enter, one, traction = vectors(net.group, net.taps), scalars(net.group, 1), vectors(net.group)
+    window, pad = maps_of(len(enter)), torch.randn(3, 5, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        pattern, deviation, pulled = net(window, pad)
+        assert pattern.max() > 0 and pulled.abs().max() > 0
+        for number in range(GROUPS[net.group]):
+            pairs = zip(
+                net(moved(window, enter, number), pad),
+                (pattern[:, None], deviation[:, None], pulled),
+                (one, one, traction),
+                strict=True,
+            )
+            for got, before, channels in pairs:
+                expected = moved(before, channels, number).reshape(got.shape)
+                assert (got - expected).abs().max() <= TOLERANCE * before.abs().max()
+
+
+def test_a_network_that_is_not_symmetric_is_told_apart():
+    torch.manual_seed(0)
+    net = write_out(CompactNet(1, 10, channels=16, blocks=1, known=5).eval())
+    with torch.no_grad():
+        net.leave[0].weight[0] *= 1.1
+    with pytest.raises(AssertionError):
+        assert_network_keeps(net)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_written_out_it_computes_the_same(group):
+    torch.manual_seed(0)
+    layer = SymmetricConv2d(vectors(group, 2), fields(group, 16), 3)
+    plain = layer.written_out()
+    given = maps_of(6)
+    with torch.inference_mode():
+        torch.testing.assert_close(plain(given), layer(given), rtol=1e-6, atol=1e-6)
+        plain.weight.zero_()
+        assert layer.weight.abs().max() > 0, "weights of its own"
+    net = CompactNet(1, 10, channels=16, blocks=1).eval()
+    with torch.inference_mode():
+        before = net(maps_of(3))
+        write_out(net)
+        for true, mine in zip(before, net(maps_of(3)), strict=True):
+            assert (true - mine).abs().max() <= TOLERANCE * true.abs().max()
+    assert not any(isinstance(module, SymmetricConv2d) for module in net.modules())
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_assigning_takes_the_nearest_symmetric_kernel(group):
+    torch.manual_seed(0)
+    enter, leave = vectors(group, 2) + scalars(group, 1), fields(group, 8) + vectors(group)
+    layer, other = (SymmetricConv2d(enter, leave, 3) for _ in range(2))
+    weight, bias = torch.randn(layer.weight.shape), torch.randn(layer.bias.shape)
+    with torch.no_grad():
+        layer.assign(weight, bias)
+        assert_keeps(layer, enter, leave)
+        # What is left out stands at right angles to every symmetric kernel.
+        left_out = ((weight - layer.weight) * other.weight).sum(), ((bias - layer.bias) * other.bias).sum()
+        assert max(abs(float(part)) for part in left_out) < 1e-4
+        before = layer.weight.clone(), layer.bias.clone()
+        layer.assign(*before)
+        torch.testing.assert_close(layer.weight, before[0])
+        torch.testing.assert_close(layer.bias, before[1])
+        assert (torch.equal(layer.weight, weight)) == (group == "p1")
+
+
+@pytest.mark.parametrize(("group", "share"), GROUPS.items())
+def test_free_numbers_are_one_for_as_many_entries_as_there_are_symmetries(group, share):
+    wide = fields(group, 16)
+    layer = SymmetricConv2d(wide, wide, 3)
+    assert layer.weight_free.numel() * share == layer.weight.numel() == 16 * 16 * 9
+    assert layer.bias_free.numel() * share == layer.bias.numel() == 16
+
+
+def test_a_network_costs_what_it_costs_written_out_and_learns_an_eighth_of_its_numbers():
+    net = CompactNet(1, 10, channels=32, blocks=4).eval()
+    learnt, work = parameters_count(net), macs(net)
+    write_out(net)
+    assert macs(net) == work > 1e6
+    assert 0.115 < learnt / parameters_count(net) < 0.14
+
+
+def test_channels_that_do_not_divide_into_fields_are_refused():
+    with pytest.raises(ValueError, match="12 channels, expected a multiple of the 8 symmetries of p4m"):
+        fields("p4m", 12)

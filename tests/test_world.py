@@ -1,0 +1,186 @@
+"""Worlds of pads and shapes: every pad by itself, the same bytes after a kill, and one line where it cannot be made."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from edge_samples import ROOT
+
+from train.data import make_presses as making
+from train.data.make_presses import main, make_presses
+from train.data.presses import load_presses
+from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
+from train.errors import DatasetError
+from train.families.catalogue import FIGURES, SHARES
+from train.physics.gripped import MOST_FORCE_N
+from train.physics.pads import INPUTS, Pad, constants
+
+SMALL = World(count=14, taps=2, per_pad=5, seed=5)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """The small world made in one go on one core, and its file."""
+    path = tmp_path_factory.mktemp("whole") / "small.npz"
+    make_presses(SMALL, path, jobs=1)
+    return path
+
+
+def test_a_pad_is_the_same_whatever_was_solved_before():
+    once = solve_pad(SMALL, 2)
+    solve_pad(replace(SMALL, seed=6), 0)
+    assert solve_pad(SMALL, 2).sha256() == once.sha256()
+    assert solve_pad(SMALL, 1).counts.tobytes() != once.counts.tobytes()
+    assert solve_pad(replace(SMALL, seed=6), 2).counts.tobytes() != once.counts.tobytes()
+
+
+def test_what_is_made_is_what_was_asked_for(small):
+    made = load_presses(small)
+    assert 0 < len(made) <= 14 and made.taps == 2
+    assert len(set(made.pad.tolist())) == SMALL.chunks == 3 and set(made.family.tolist()) <= set(SHARES)
+    assert made.config == SMALL.facts() and made.config["inputs"] == list(INPUTS)
+    assert (made.force_n[:, 2] > LEAST_FORCE_N).all() and (made.force_n[:, 2] <= MOST_FORCE_N).all()
+    assert (made.indentation_mm <= INDENTATION_MM[1]).all()
+    assert made.touching.any(axis=(1, 2)).all() and np.isfinite(made.counts).all()
+    assert np.allclose(np.diff(made.angle_deg, axis=1), -5, atol=4), "a step of the pad, and where it landed"
+    for pad in np.unique(made.pad):
+        assert len(np.unique(made.constants[made.pad == pad], axis=0)) == 1
+    assert len(np.unique(made.constants, axis=0)) == len(np.unique(made.pad))
+    assert not small.with_name("small.npz.parts").exists()
+
+
+def test_families_are_met_as_often_as_asked():
+    world = World(count=40, per_pad=20, families={"flat": 3.0, "dome": 1.0}, spread=0.0, seed=2)
+    made = [solve_pad(world, number) for number in range(2)]
+    family = np.concatenate([one.family for one in made])
+    assert 27 <= (family == "flat").sum() <= 30 and 6 <= (family == "dome").sum() <= 10
+    assert (made[0].constants == constants(Pad())).all(), "without spread every pad is the nominal one"
+    assert set(World(families=dict.fromkeys(FIGURES, 1.0)).families) == set(FIGURES)
+
+
+def test_several_processes_make_the_same_bytes(small, tmp_path):
+    make_presses(SMALL, tmp_path / "small.npz", jobs=2)
+    assert (tmp_path / "small.npz").read_bytes() == small.read_bytes()
+
+
+def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(small, tmp_path, monkeypatch):
+    path, solved = tmp_path / "small.npz", []
+
+    def until_killed(world, number):
+        if len(solved) == 1:
+            raise KeyboardInterrupt
+        solved.append(number)
+        return solve_pad(world, number)
+
+    monkeypatch.setattr(making, "_AT_ONCE", 1)
+    monkeypatch.setattr(making, "solve_pad", until_killed)
+    with pytest.raises(KeyboardInterrupt):
+        make_presses(SMALL, path, jobs=1)
+    assert solved == [0] and not path.exists()
+    assert [part.name for part in (tmp_path / "small.npz.parts").iterdir()] == ["000000.npz"]
+    monkeypatch.setattr(making, "solve_pad", lambda world, number: solved.append(number) or solve_pad(world, number))
+    make_presses(SMALL, path, jobs=1)
+    assert solved == [0, 1, 2], "what was there was not solved again"
+    assert path.read_bytes() == small.read_bytes() and not (tmp_path / "small.npz.parts").exists()
+
+
+def test_what_was_made_otherwise_is_not_overwritten(small, tmp_path):
+    before = small.read_bytes()
+    with pytest.raises(DatasetError, match="is there and was made otherwise: delete it, or write to another file"):
+        make_presses(replace(SMALL, seed=6), small, jobs=1)
+    assert small.read_bytes() == before
+    folder = tmp_path / "other.npz.parts"
+    folder.mkdir()
+    replace(solve_pad(SMALL, 0), config=SMALL.facts()).save(folder / "000000.npz")
+    with pytest.raises(DatasetError, match=r"other\.npz\.parts holds parts that were made otherwise: delete it"):
+        make_presses(replace(SMALL, seed=6), tmp_path / "other.npz", jobs=1)
+
+
+def test_a_users_mesh_that_has_changed_is_another_world(tmp_path):
+    path = tmp_path / "part.stl"
+    trimesh.creation.icosphere(radius=20.0).export(path)
+    world = World(count=3, families={f"mesh:{path}": 1.0})
+    first = world.facts()
+    trimesh.creation.icosphere(radius=21.0).export(path)
+    assert world.facts() != first
+    made = make_presses(world, tmp_path / "part.npz", jobs=1)
+    assert set(made.family.tolist()) == {f"mesh:{path}"}
+
+
+def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
+    path = tmp_path / "cut.npz"
+    command = ["train.data.make_presses", str(path), "--families", "flat", "--count", "9000", "--per-pad", "1"]
+    run = subprocess.Popen(
+        [sys.executable, "-m", *command, "--jobs", "2"],
+        cwd=ROOT,
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    parts = path.with_name(path.name + ".parts")
+    while not any(parts.glob("*.npz")):
+        assert run.poll() is None, run.stderr.read().decode()
+        time.sleep(0.01)
+    os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to the workers too
+    out, complaint = run.communicate()
+    assert run.returncode == 130
+    assert complaint.decode() == "train.data.make_presses: interrupted; the same command goes on from here\n"
+    assert not out and any(parts.glob("*.npz"))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--count", "0"], "count is 0, expected 1 or more"),
+        (["--taps", "0"], "taps is 0"),
+        (["--taps", "8"], "taps is 8, expected 1 to 7"),
+        (["--per-pad", "0"], "per_pad is 0"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--spread", "1.5"], "spread is 1.5, expected 0 to 1"),
+        (["--spread", "nan"], "spread is nan"),
+        (["--families", "dome,sphere"], "no family 'sphere': expected some of paper, "),
+        (["--families", "none"], "no family named: expected some of"),
+        (["--mesh", "absent.stl"], "cannot be read: No such file"),
+        (["--mesh", "ball.stl", "--mesh-share", "0"], "is 0.0, expected more than 0"),
+        (["--families", "none", "--mesh", "ring.stl"], r"ring\.stl' lies under the pad"),
+    ],
+)
+def test_what_cannot_be_made_is_said_in_one_line(tmp_path, monkeypatch, capsys, options, told):
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere(radius=20.0).export("ball.stl")
+    trimesh.creation.annulus(r_min=28.0, r_max=30.0, height=3.0).export("ring.stl")
+    assert main(["out.npz", "--count", "2", "--jobs", "1", *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train.data.make_presses: ")
+    assert re.search(told, line)
+
+
+def test_a_folder_that_is_a_file_and_no_process_are_said_in_one_line(tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    assert main([str(tmp_path / "taken" / "out.npz"), "--count", "2", "--jobs", "1"]) == 1
+    assert "cannot be made: Not a directory" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        main([str(tmp_path / "out.npz"), "--jobs", "0"])
+    assert end.value.code == 2 and "--jobs is 0" in capsys.readouterr().err
+
+
+def test_a_set_of_which_nothing_is_felt_is_said(tmp_path, monkeypatch):
+    nothing = solve_pad(SMALL, 0).pick(np.zeros(5, dtype=bool)[: len(solve_pad(SMALL, 0))])
+    monkeypatch.setattr(making, "solve_pad", lambda world, number: nothing)
+    with pytest.raises(DatasetError, match=r"came out lighter than 0\.1 N: ask for more"):
+        make_presses(SMALL, tmp_path / "out.npz", jobs=1)
+
+
+def test_the_command_says_what_it_made(tmp_path, capsys):
+    path = tmp_path / "out" / "presses.npz"
+    assert main([str(path), "--families", "flat,soft", "--count", "4", "--jobs", "1", "--compress"]) == 0
+    made = load_presses(path)
+    assert capsys.readouterr().out.startswith(f"{path}: {len(made)} sequences, ")
+    assert set(made.family.tolist()) == {"flat", "soft"}
