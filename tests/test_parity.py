@@ -20,8 +20,9 @@ from export import verify as verify_module
 from export.errors import ExportError, ParityError
 from export.graph import outputs
 from export.int8 import convolutions
-from export.parity import LEVELS, GraphRun, differences, extreme_windows, read_windows
+from export.parity import FULL_TRACTION_KPA, LEVELS, GraphRun, differences, extreme_windows, read_windows
 from export.reference import network_of
+from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 
 passes: Counter[str] = Counter()
@@ -66,9 +67,9 @@ def test_every_bundled_model_keeps_every_bound_at_every_level(name):
 
 
 @pytest.mark.parametrize("name", IN_INTEGERS)
-def test_integers_cost_a_tenth_of_a_decibel_at_most(name):
+def test_integers_cost_no_more_than_they_may(name):
     lost_db = [-row.psnr_change_db for row in rows(name) if row.psnr_change_db is not None]
-    assert len(lost_db) == len(LEVELS) and min(lost_db) > -0.1 and max(lost_db) <= 0.1
+    assert len(lost_db) == len(LEVELS) and min(lost_db) > -0.1 and max(lost_db) <= MOST_LOSS_DB
     session, in_float = (ModelSession(find_model(each)) for each in (name, name.removesuffix("-int8")))
     taps = str(session.contract.taps)
     said_db = in_float.contract.test_error[taps]["psnr_db"] - session.contract.test_error[taps]["psnr_db"]
@@ -225,8 +226,9 @@ def test_a_batch_that_is_not_full_is_filled_and_cut():
     model, contract = graph_of("stsr")
     windows = read_windows(frozen(), contract)[:5]
     net = network_of(model)
-    for mine, true in zip(GraphRun(model)(windows), outputs(net, torch.from_numpy(windows)), strict=True):
-        np.testing.assert_allclose(mine, true.numpy(), atol=1e-6)
+    given = zip(GraphRun(model)(windows), outputs(net, torch.from_numpy(windows)), strict=True)
+    for (mine, true), unit in zip(given, (1, 1, FULL_TRACTION_KPA), strict=True):
+        np.testing.assert_allclose(mine, true.numpy(), atol=1e-6 * unit)
 
 
 def test_the_table_shows_of_extreme_windows_the_worst():
