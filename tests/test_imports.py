@@ -70,7 +70,7 @@ print(code, within[0], sorted(sys.modules), sep="\\n")
 """
 
 
-def test_a_run_loads_what_it_uses_and_starts_one_thread(tmp_path):
+def test_a_run_loads_what_it_uses_and_starts_two_threads(tmp_path):
     write_recording(tmp_path / "rest.csv", make_counts(20))
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(tmp_path / "rest.csv")],
@@ -83,6 +83,6 @@ def test_a_run_loads_what_it_uses_and_starts_one_thread(tmp_path):
     )
     code, threads, modules = done.stdout.splitlines()
     assert code == "0", done.stderr
-    assert ast.literal_eval(threads) == ["MainThread", "scan-reader_0"]
+    assert ast.literal_eval(threads) == ["MainThread", "ending", "scan-reader_0"]
     assert not set(ast.literal_eval(modules)) & (UNUSED_IN_A_REPLAY | FORBIDDEN)
     assert "edge.sinks.status" in ast.literal_eval(modules)
