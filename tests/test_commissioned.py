@@ -78,7 +78,9 @@ def test_a_pad_goes_from_the_file_into_every_runtime(pressed, tmp_path):
         ):
             model = FakeModel(make_pad_contract())
             with opened() as source:
-                assert next(iter(Stream(source, open_runtime(model, source, **settings)))).state == "contact"
+                results = Stream(source, open_runtime(model, source, **settings))
+                # A replay keeps the recording's time: a scan that waited while the runtime was made may be dropped.
+                assert next(result for result in results if result.state != "dropped").state == "contact"
             np.testing.assert_array_equal(model.pads[0], model.contract.pad_row(expected))
 
 
