@@ -74,11 +74,14 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def found_pad(found: Estimate) -> Pad:
     """What is told of a pad, as the sensor file holds it."""
-    constants, intervals = {}, {}
+    constants: dict[str, float] = {}
+    intervals: dict[str, tuple[float, float]] = {}
     for number, (name, centre, spread) in enumerate(input_scale()):
         if found.told[number]:
             constants[name] = float(f"{centre + spread * found.constants[number]:.4g}")
-            ends = np.clip(found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.told)], -1, 1)
+            ends = np.clip(
+                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.told)], -1, 1
+            )
             intervals[name] = (float(f"{centre + spread * ends[0]:.4g}"), float(f"{centre + spread * ends[1]:.4g}"))
     return Pad(**constants, intervals=intervals, gains=tuple(np.exp(found.log_gains).round(4).tolist()))
 
@@ -96,11 +99,16 @@ def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
 def table(sensor: str, found: Estimate) -> str:
     """What is known of a sensor, line by line."""
     pad = found_pad(found)
-    lines = [f"{sensor}: {found.contacts} distinct contacts", f"{'constant':18} {'prior':>18} {'estimate':>10}  90 % interval"]
+    lines = [
+        f"{sensor}: {found.contacts} distinct contacts",
+        f"{'constant':18} {'prior':>18} {'estimate':>10}  90 % interval",
+    ]
     for name, (low, high) in ((name, RANGES[name]) for name, *_ in input_scale()):
-        known = f"{pad.constants[name]:10.4g}  {pad.intervals[name][0]:.4g} .. {pad.intervals[name][1]:.4g}" if (
-            name in pad.constants
-        ) else f"{'-':>10}  not told by these contacts"
+        known = (
+            f"{pad.constants[name]:10.4g}  {pad.intervals[name][0]:.4g} .. {pad.intervals[name][1]:.4g}"
+            if (name in pad.constants)
+            else f"{'-':>10}  not told by these contacts"
+        )
         lines.append(f"{name:18} {f'{low:.4g} .. {high:.4g}':>18} {known}")
     gains = np.asarray(pad.gains).reshape(len(AXES), USPA44.rows, USPA44.cols)
     width = found.half_width[: gains.size].reshape(gains.shape)

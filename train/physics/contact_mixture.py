@@ -22,7 +22,7 @@ CHANNELS: Final = len(AXES) * USPA44.taxel_count
 Z: Final = slice(AXES.index("z") * USPA44.taxel_count, (AXES.index("z") + 1) * USPA44.taxel_count)
 LEAST_COUNTS: Final = 200.0
 """Largest z of the weakest contact that is used: below, drift is a fifth of it."""
-_COMPONENTS: Final = 32
+_COMPONENTS: Final = 72
 _ROUNDS: Final = 12
 _RIDGE: Final = 1e-4
 """Variance added on each channel: a hundredth of the mean z."""
@@ -93,7 +93,7 @@ def load_mixture(path: Path) -> ContactMixture:
 
 
 def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Contacts (n, channels) over the RMS of their z, of scans (n, 3, rows, cols); and which are strong and unclipped."""
+    """Scans (n, 3, rows, cols) as contacts (n, channels) over the RMS of z; and which are strong and not clipped."""
     flat = counts.reshape(len(counts), -1).astype(np.float64)
     peaks = np.abs(counts).max(axis=(2, 3))
     usable = (counts[:, AXES.index("z")].max(axis=(1, 2)) > LEAST_COUNTS) & (peaks < LARGEST_COUNTS).all(axis=1)
@@ -122,20 +122,26 @@ def fit_mixture(
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
     rng = np.random.default_rng(seed)
-    centres = contacts[rng.choice(len(contacts), components, replace=False)]
-    for _ in range(rounds):
-        nearest = (-2 * contacts @ centres.T + (centres**2).sum(axis=1)).argmin(axis=1)
-        weights = (nearest[:, None] == np.arange(components)).astype(np.float64)
-        centres = weights.T @ contacts / np.maximum(weights.sum(axis=0), 1.0)[:, None]
-    mixture = _fitted(contacts, design, weights)
+    mixture = _fitted(contacts, design, _nearest(contacts, rng, components, rounds))
     for _ in range(rounds):
         mixture = _fitted(contacts, design, _given_constants(mixture, contacts, design))
     return mixture
 
 
-def _fitted(
-    contacts: NDArray[np.float64], design: NDArray[np.float64], weights: NDArray[np.float64]
-) -> ContactMixture:
+def _nearest(
+    contacts: NDArray[np.float64], rng: np.random.Generator, components: int, rounds: int
+) -> NDArray[np.float64]:
+    """Weights (n, k), each 0 or 1, of k means."""
+    weights = np.zeros((len(contacts), components))
+    centres = contacts[rng.choice(len(contacts), components, replace=False)]
+    for _ in range(rounds):
+        nearest = (-2 * contacts @ centres.T + (centres**2).sum(axis=1)).argmin(axis=1)
+        weights = (nearest[:, None] == np.arange(components)).astype(np.float64)
+        centres = weights.T @ contacts / np.maximum(weights.sum(axis=0), 1.0)[:, None]
+    return weights
+
+
+def _fitted(contacts: NDArray[np.float64], design: NDArray[np.float64], weights: NDArray[np.float64]) -> ContactMixture:
     """Components by weighted least squares; those of few presses lean on the covariance of all."""
     pooled = np.cov(contacts.T)
     means, covariances = [], []
@@ -146,7 +152,9 @@ def _fitted(
         spread = away.T @ (weight[:, None] * away) + 0.1 * pooled
         means.append(mean)
         covariances.append(spread / (weight.sum() + 1) + _RIDGE * np.eye(CHANNELS))
-    return ContactMixture((weights.sum(axis=0) + 1) / (len(weights) + weights.shape[1]), np.array(means), np.array(covariances))
+    return ContactMixture(
+        (weights.sum(axis=0) + 1) / (len(weights) + weights.shape[1]), np.array(means), np.array(covariances)
+    )
 
 
 def _given_constants(
