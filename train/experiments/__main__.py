@@ -31,6 +31,7 @@ EXPERIMENTS: Final = {
     "real": "a hidden taxel of real recordings",
     "robust": "error against the severity of nuisances",
     "dead": "dead taxels, found and unfound",
+    "identify": "gains and constants of a sensor from its own contacts",
     "zeroing": "drift followed, holds not eaten",
     "calibration": "how true the deviations are",
     "confidence": "expected error and early stop against what came out",

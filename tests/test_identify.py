@@ -1,0 +1,147 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from experiment_samples import quick_bench
+
+from firmware_bridge.pad import Pad
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file_text import save_sensor_file
+from train import identify
+from train.errors import DatasetError
+from train.experiments import identify as experiment
+from train.experiments.hidden_taxel import recording_paths, recordings_folder
+from train.physics.contact_mixture import CHANNELS, ContactMixture, Z, load_mixture
+from train.physics.gain_estimate import CONSTANT_SPREAD, estimate
+from train.physics.pads import INPUTS
+
+FOLDER = recordings_folder()
+
+
+@pytest.fixture(scope="module")
+def mixture():
+    """Two kinds of contacts, of which the third constant moves every x."""
+    rng = np.random.default_rng(0)
+    means = np.zeros((2, 1 + len(INPUTS), CHANNELS))
+    means[:, 0] = rng.normal(0, 0.5, (2, CHANNELS))
+    means[:, 0, Z] = 1 + rng.normal(0, 0.2, (2, 16))
+    means[:, 3, :16] = 0.3
+    mixing = rng.normal(0, 0.06, (2, CHANNELS, 4))
+    covariances = mixing @ mixing.transpose(0, 2, 1) + 4e-4 * np.eye(CHANNELS)
+    return ContactMixture(np.array([0.6, 0.4]), means, covariances)
+
+
+def contacts(mixture, count, gains, constants, seed):
+    rng = np.random.default_rng(seed)
+    kind = rng.choice(2, count, p=mixture.share)
+    drawn = np.stack([rng.multivariate_normal(mixture.centres(constants)[k], mixture.covariances[k]) for k in kind])
+    drawn /= np.sqrt((drawn[:, Z] ** 2).mean(axis=1, keepdims=True))
+    return (drawn * gains * rng.uniform(400, 700, (count, 1))).reshape(count, 3, 4, 4).astype(np.float32)
+
+
+def sensor(mixture, seed, count=100):
+    """True log-gains (48,) and constants (6,), and what contacts tell of them."""
+    rng = np.random.default_rng([1, seed])
+    log_gains = rng.normal(0, 0.075, (3, 16))
+    log_gains = (log_gains - log_gains.mean(axis=1, keepdims=True)).ravel()
+    constants = np.zeros(len(INPUTS))
+    constants[2] = rng.uniform(-0.8, 0.8)
+    return log_gains, constants, estimate(contacts(mixture, count, np.exp(log_gains), constants, seed), mixture)
+
+
+def test_gains_and_the_constant_that_shows_are_recovered_within_their_intervals(mixture):
+    cases = [sensor(mixture, seed) for seed in range(12)]
+    true = np.array([case[0] for case in cases])
+    found = np.array([case[2].log_gains for case in cases])
+    half = np.array([case[2].half_width for case in cases])
+    assert np.sqrt(((found - true) ** 2).mean()) < np.sqrt((true**2).mean()) / 2
+    assert (np.abs(found - true) <= half[:, :CHANNELS]).mean() > 0.9
+    for _, constants, one in cases:
+        assert one.constants[2] == pytest.approx(constants[2], abs=0.15)
+
+
+def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
+    _, _, found = sensor(mixture, 3)
+    silent = [0, 1, 3, 4, 5]
+    np.testing.assert_allclose(found.constants[silent], 0, atol=1e-9)
+    np.testing.assert_allclose(found.deviations[CHANNELS:][silent], CONSTANT_SPREAD)
+    assert found.told.tolist() == [False, False, True, False, False, False]
+    pad = identify.found_pad(found)
+    assert list(pad.constants) == list(pad.intervals) == ["poisson"]
+    assert "not told" in identify.table("4", found)
+
+
+def test_more_contacts_leave_less_open(mixture):
+    few, many = (sensor(mixture, 5, count)[2] for count in (3, 100))
+    assert (many.deviations[:CHANNELS] < few.deviations[:CHANNELS]).all()
+
+
+def test_weak_and_clipped_contacts_are_not_used(mixture):
+    read = contacts(mixture, 20, np.ones(CHANNELS), np.zeros(len(INPUTS)), 6)
+    read[:5] *= 0.1
+    read[5, 0, 1, 1] = 1400
+    assert estimate(read, mixture).contacts == 14
+    with pytest.raises(DatasetError, match="none of 5 contacts"):
+        estimate(read[:5], mixture)
+
+
+def test_a_hidden_taxel_is_told_from_the_others_alone(mixture):
+    read = contacts(mixture, 40, np.ones(CHANNELS), np.zeros(len(INPUTS)), 7).reshape(40, -1)
+    read = read / np.sqrt((read[:, Z] ** 2).mean(axis=1, keepdims=True))
+    expected = mixture.hidden_z(read, np.zeros(len(INPUTS)), 6)
+    truth = read[:, Z][:, 6]
+    assert np.sqrt(((expected - truth) ** 2).mean()) < 0.75 * truth.std()
+    changed = read.copy()
+    changed[:, 6::16] = 9
+    np.testing.assert_array_equal(mixture.hidden_z(changed, np.zeros(len(INPUTS)), 6), expected)
+
+
+def test_a_held_grip_is_one_contact(mixture):
+    read = contacts(mixture, 2, np.ones(CHANNELS), np.zeros(len(INPUTS)), 8)
+    read[1] = read[0] * np.linspace(0.5, 1.5, 16).reshape(4, 4)
+    held = np.repeat(read, 30, axis=0) * np.linspace(0.8, 1.2, 60, dtype=np.float32)[:, None, None, None]
+    assert len(identify.distinct(held)) == 2
+
+
+def test_a_mixture_is_read_back_and_a_damaged_one_named(mixture, tmp_path):
+    mixture.save(tmp_path / "a.npz")
+    np.testing.assert_array_equal(load_mixture(tmp_path / "a.npz").means, mixture.means)
+    replace(mixture, means=mixture.means[:, :2]).save(tmp_path / "b.npz")
+    with pytest.raises(DatasetError, match=r"b\.npz is no mixture"):
+        load_mixture(tmp_path / "b.npz")
+
+
+def test_the_sensor_file_that_is_there_is_extended(tmp_path):
+    path = tmp_path / "sensor.toml"
+    save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(counts_per_newton=1100.0), "5": SensorEntry()}))
+    pad = Pad(poisson=0.45, intervals={"poisson": (0.43, 0.47)}, gains=tuple([1.1] * CHANNELS))
+    save_sensor_file(path, identify.extended(path, {"4": pad}))
+    found = load_sensor_file(path)
+    assert found.pads == {"4": pad}
+    assert set(found.sensors) == {"4", "5"}
+    assert found.counts_per_newton == {"4": 1100.0}
+
+
+def test_a_folder_without_recordings_is_one_line(tmp_path, capsys):
+    assert identify.main([str(tmp_path / "none")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "expected a folder of TRIAL/xela_SENSOR.csv" in said
+
+
+def test_the_report_is_of_simulated_sensors_where_there_are_no_recordings(tmp_path, tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path))
+    page = experiment.run(quick_bench(tmp_path_factory), tmp_path / "reports").read_text()
+    assert "Gains, 12 mixed contacts, 3 sensors." in page
+    assert "No recordings were there" in page
+
+
+@pytest.mark.skipif(not recording_paths(FOLDER), reason=f"no real recordings at {FOLDER} (TACTILE_RECORDINGS)")
+def test_real_recordings_give_each_sensor_its_gains(mixture, tmp_path, capsys):
+    mixture.save(tmp_path / "some.mixture.npz")
+    out = tmp_path / "sensor.toml"
+    assert identify.main([str(FOLDER), "--presses", str(tmp_path / "some.npz"), "--out", str(out)]) == 0
+    pads = load_sensor_file(out).pads
+    assert set(pads) == {"sensor1", "sensor2"}
+    assert all(pad.gains is not None and max(pad.gains) > 1.02 for pad in pads.values())
+    assert "sensor1" in capsys.readouterr().out

@@ -1,0 +1,155 @@
+"""Identify a sensor from its own recordings: the gains of its channels, and what contacts tell of its pad.
+
+    python -m train.identify recordings --out sensor.toml
+
+RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed. What
+contacts tell is written into the sensor file's [pad] section with its 90 % interval; what they leave as open as the
+range of simulated pads does is left out. What simulated pads read is fitted once, beside the presses.
+"""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.errors import BridgeError
+from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.pad import Pad
+from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file_text import save_sensor_file
+from train.data.presses import load_presses
+from train.errors import DatasetError, TrainError
+from train.experiments.hidden_taxel import recorded_sets, recording_paths
+from train.physics.contact_mixture import ContactMixture, fit_mixture, load_mixture, normalise
+from train.physics.gain_estimate import Estimate, estimate
+from train.physics.pads import RANGES, input_scale
+
+_APART: Final = 0.1
+"""Least difference of two contacts that count as two, over the RMS of their z: five times what noise and drift make."""
+_PREFIX: Final = "xela_"
+
+
+def mixture_beside(presses: Path) -> ContactMixture:
+    """The mixture of contacts fitted to a file of presses: read if it is there, else fitted and kept.
+
+    Raises:
+        DatasetError: there are no presses, or one of the files is damaged.
+    """
+    path = presses.with_suffix(".mixture.npz")
+    if not path.exists():
+        fit_mixture(load_presses(presses)).save(path)
+    return load_mixture(path)
+
+
+def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
+    """Distinct contacts (n, 3, rows, cols) of each sensor.
+
+    Raises:
+        DatasetError: no recordings there, or one cannot be read.
+    """
+    if not recording_paths(folder):
+        raise DatasetError(f"{folder} holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv")
+    sets = recorded_sets(folder)
+    return {
+        sensor: distinct(np.concatenate([one.counts for one in sets if one.sensor == sensor]))
+        for sensor in dict.fromkeys(one.sensor for one in sets)
+    }
+
+
+def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scans that differ from all kept before them: a grip that is held is one contact, however long."""
+    contacts, _ = normalise(counts)
+    kept: list[int] = []
+    for number, contact in enumerate(contacts):
+        away = contacts[kept] - contact
+        if not kept or np.sqrt((away**2).mean(axis=1)).min() > _APART:
+            kept.append(number)
+    return counts[kept]
+
+
+def found_pad(found: Estimate) -> Pad:
+    """What is told of a pad, as the sensor file holds it."""
+    constants: dict[str, float] = {}
+    intervals: dict[str, tuple[float, float]] = {}
+    for number, (name, centre, spread) in enumerate(input_scale()):
+        if found.told[number]:
+            constants[name] = float(f"{centre + spread * found.constants[number]:.4g}")
+            ends = np.clip(
+                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.told)], -1, 1
+            )
+            intervals[name] = (float(f"{centre + spread * ends[0]:.4g}"), float(f"{centre + spread * ends[1]:.4g}"))
+    return Pad(**constants, intervals=intervals, gains=tuple(np.exp(found.log_gains).round(4).tolist()))
+
+
+def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
+    """The sensor file that is there with these pads, or one with nothing else."""
+    before = load_sensor_file(path) if path.exists() else SensorFile()
+    sensors = dict(before.sensors)
+    for name, pad in pads.items():
+        entry = sensors.get(name, SensorEntry(assumed=frozenset(("mounting",))))
+        sensors[name] = replace(entry, pad=pad)
+    return replace(before, sensors=sensors)
+
+
+def table(sensor: str, found: Estimate) -> str:
+    """What is known of a sensor, line by line."""
+    pad = found_pad(found)
+    lines = [
+        f"{sensor}: {found.contacts} distinct contacts",
+        f"{'constant':18} {'prior':>18} {'estimate':>10}  90 % interval",
+    ]
+    for name, (low, high) in ((name, RANGES[name]) for name, *_ in input_scale()):
+        known = (
+            f"{pad.constants[name]:10.4g}  {pad.intervals[name][0]:.4g} .. {pad.intervals[name][1]:.4g}"
+            if (name in pad.constants)
+            else f"{'-':>10}  not told by these contacts"
+        )
+        lines.append(f"{name:18} {f'{low:.4g} .. {high:.4g}':>18} {known}")
+    gains = np.asarray(pad.gains).reshape(len(AXES), USPA44.rows, USPA44.cols)
+    width = found.half_width[: gains.size].reshape(gains.shape)
+    for axis, plane, half in zip(AXES, gains, width, strict=True):
+        lines.append(f"gains of {axis}, each within {100 * half.min():.0f} to {100 * half.max():.0f} % of:")
+        lines += ["  " + "  ".join(f"{gain:.3f}" for gain in row) for row in plane]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; 0 when done, 1 on a clear error."""
+    options = _parser().parse_args(arguments)
+    try:
+        contacts = recorded_contacts(options.recordings)
+        mixture = mixture_beside(options.presses)
+        pads = {}
+        for sensor, counts in contacts.items():
+            found = estimate(counts, mixture)
+            pads[sensor.removeprefix(_PREFIX)] = found_pad(found)
+            sys.stdout.write(table(sensor.removeprefix(_PREFIX), found) + "\n")
+        if options.out is not None:
+            save_sensor_file(options.out, extended(options.out, pads))
+            sys.stdout.write(f"{options.out}: pads of {', '.join(pads)}\n")
+    except (TrainError, BridgeError) as error:
+        sys.stderr.write(f"train.identify: {error}\n")
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
+    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
+    parser.add_argument(
+        "--presses",
+        type=Path,
+        default=Path("data/gripped.npz"),
+        help="simulated presses of many pads; the mixture fitted to them is kept beside (data/gripped.npz)",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
