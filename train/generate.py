@@ -24,6 +24,7 @@ import os
 import shutil
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, cast
@@ -131,6 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
     options = _parser().parse_args(arguments)
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), _TRACKER_QUIET)))
+    # Joblib warns of it when an interruption leaves chunks unsolved, which is what was asked for.
+    warnings.filterwarnings("ignore", r"\d+ tasks which were still being processed")
     started_s = time.monotonic()
     try:
         config = _config(options)
