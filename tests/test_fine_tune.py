@@ -58,6 +58,7 @@ def hostile():
     net = compact()
     first, second = net.trunk[0].body[0], net.trunk[0].body[2]
     with torch.no_grad():
+        net.leave[2].bias += 0.05  # or patterns that nobody trained are cut at zero, and there is nothing to lose
         first.weight[0] *= 300
         first.bias[0] *= 300
         second.weight[:, 0] /= 300
@@ -125,7 +126,8 @@ def test_torch_rounds_as_onnxruntime_does(every, windows):
     in_float = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows))]
     for level in ("none", "all"):
         for true, rounding, plain in zip(GraphRun(integers, level)(windows), mine, in_float, strict=True):
-            lost = np.abs(true - plain).mean()
+            # An output that integers do not reach differs by the rounding of float32 alone.
+            lost = max(np.abs(true - plain).mean(), 1e-6)
             # A value that lies half-way between two steps may go either way, and takes others along.
             assert np.abs(true - rounding).mean() < lost / 100
             assert (np.abs(true - rounding) > lost / 10).mean() < 1e-2

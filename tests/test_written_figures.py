@@ -122,7 +122,7 @@ def test_figures_of_the_readme_are_those_of_the_families_report():
     """Each number of a row is one of that method's first row in the report, rounded as the README has it."""
     report = {}
     for method, *cells in rows((ROOT / "reports" / "families.md").read_text()):
-        report.setdefault(method, [float(number) for cell in cells for number in re.findall(r"[\d.]*\d", cell)])
+        report.setdefault(method, [float(number) for cell in cells for number in re.findall(r"\d+(?:\.\d+)?", cell)])
     readme = {method: cells for method, *cells in rows((ROOT / "README.md").read_text())}
     for name, method in FAMILIES.items():
         numbers = [number for cell in readme[name] for number in re.findall(r"\d*\.?\d+", cell)]
