@@ -18,6 +18,7 @@ from torch.nn.utils import fuse_conv_bn_eval, parametrize
 
 from export.errors import ExportError
 from train.networks.blocks import MultiScaleResidual, PatternNet, Residual
+from train.networks.compact import CompactNet
 from train.networks.symmetric import SymmetricResidual, write_out
 
 _MOST_WEIGHT: Final = 127
@@ -167,6 +168,11 @@ def rounded(net: PatternNet, convolutions: Mapping[str, IntegerConvolution]) -> 
             match module:
                 case Residual() | SymmetricResidual():
                     first, last = f"{name}.body.0", f"{name}.body.2"
+                case CompactNet() if "leave.0" in named and "traction" not in named:
+                    # The traction is made in float of the features that the pattern is made of in integers.
+                    taking = _taking(named["leave.0"].taken)
+                    undone.callback(module.traction.register_forward_pre_hook(taking).remove)
+                    continue
                 case MultiScaleResidual():
                     first, last = f"{name}.fine.0", f"{name}.fuse"
                 case _:
