@@ -66,7 +66,8 @@ def pressed_in(
     """
     size = cells_mm.shape[1]
     rim, pixels = size - pattern_cells, 2 * pattern_cells
-    fine_mm = carrying(depth_mm, 2 * size)[0][:, rim : rim + pixels, rim : rim + pixels]
+    middle = (slice(None), slice(rim, rim + pixels), slice(rim, rim + pixels))
+    fine_mm, fine_share = (maps[middle] for maps in carrying(depth_mm, 2 * size))
     indented_mm = indentation_mm[:, None, None]
     close_mm = np.empty_like(pressure_mpa)
     for cover, which in which_of(covers):
@@ -77,12 +78,23 @@ def pressed_in(
     to_pixels = _between(size, pixels)
     touching = (to_pixels @ close_mm @ to_pixels.T > 0) & (fine_mm < REACH * indented_mm)
     # The press bottoms out on the highest part, whichever cells that lies between.
-    touching |= fine_mm <= fine_mm.min(axis=(1, 2), keepdims=True) + 1e-4
+    bottom = fine_mm <= fine_mm.min(axis=(1, 2), keepdims=True) + 1e-4
+    touching = (touching | bottom) & _mostly(fine_share)
+    touching |= bottom & ~touching.any(axis=(1, 2), keepdims=True)  # a tip thinner than half a pixel
     covered = np.array([cover != BARE for cover in covers])
     if covered.any():
         sunk_mm = to_pixels @ solvers[BARE].displacement_mm(on_pad_mpa[covered]) @ to_pixels.T
         fine_mm[covered] = np.clip(indented_mm[covered] - sunk_mm, 0, indented_mm[covered])
     return fine_mm, touching
+
+
+def _mostly(share: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels of which the carrying part is more than half; of those with just half, every other one.
+
+    An edge then lies where it is in the mean; with all of these it would lie a quarter of a pixel further out.
+    """
+    rows, cols = np.indices(share.shape[1:])
+    return np.where((rows + cols) % 2, share > 0.5, share >= 0.5)
 
 
 def _between(size: int, pixels: int) -> NDArray[np.float32]:
