@@ -37,6 +37,7 @@ from train.errors import DatasetError, TrainError
 from train.generation import FORCE_N, Generation, one_thread, random_figures, solve_chunk
 from train.poses import ANGLE_STEP_DEG, MAX_TAPS
 from train.surfaces import PLATES, SURFACES, surface_mesh
+from train.workers import start_workers
 
 _INTERRUPTED: Final = 130
 # Joblib's resource tracker, a process of its own, finds now and then that an interrupted pool's semaphore is gone
@@ -138,6 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         config = _config(options)
         total = config.sequences * config.taps
+        if options.jobs and config.chunks > 1:
+            start_workers(options.jobs)
         made = generate(config, options.out, options.jobs)
     except TrainError as error:
         sys.stderr.write(f"train.generate: {error}\n")

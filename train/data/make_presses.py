@@ -24,6 +24,7 @@ from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
+from train.workers import start_workers
 
 _INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16
@@ -86,6 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started_s = time.monotonic()
     try:
         world = _world(options)
+        if world.chunks > 1:
+            start_workers(options.jobs)
         made = make_presses(world, options.out, options.jobs, compressed=options.compress)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.progress import tracked
 from firmware_bridge.geometry import AXES, USPA44
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
@@ -88,7 +89,7 @@ def _simulated(
 ) -> None:
     found: list[Estimate] = []
     gains, pads = [], []
-    for number in range(world.chunks):
+    for number in tracked(range(world.chunks), caption, "sensor"):
         mine = sensors.pick(sensors.pad == np.unique(sensors.pad)[number])
         read, true, constant = read_by_sensor(mine, world, number)
         if flat:
