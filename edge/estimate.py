@@ -17,7 +17,7 @@ from firmware_bridge.npz import read_npz
 
 RIDGE: Final = 2e-3
 """Of a kind's mean variance, added to every channel: gains and noise of a sensor of its own."""
-WIDENING: Final = (1.0, 1.05, 1.12, 1.18, 1.28, 1.35, 1.47, 1.56, 1.74)
+WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
 """Of deviations with so many taxels dead, that 90 % intervals hold 90 % of pixels: on validation presses, the larger of
 STSR's and MTSR-4's. On contacts unlike those of training it may be too little."""
 MOST_BYTES: Final = 1 << 24

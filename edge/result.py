@@ -72,8 +72,8 @@ class Result:
         dead: taxels that are not believed, row-major from the top left, and why: "silent", "saturated", "stuck", "far"
             (reads what no contact makes) or "unzeroed"; empty where all are. A pattern made meanwhile is made without
             them.
-        filled: what stood for the dead ones: an estimate from their "neighbours"; None where none is dead, or no pattern
-            can be made.
+        filled: what stood for the dead ones: an estimate from their "neighbours"; None where none is dead, or there is
+            no pattern.
         note: what the user should know, such as why zeroing started over.
         event: what happened before this scan: why there is another model, what came of zeroing on demand, a step in
             rest level; else None.

@@ -136,7 +136,8 @@ def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
     shapes = rng.uniform(100, 1000, (2, 48)) * [[1], [0.2]]
     shapes[1, :40] = 0
     readings = np.concatenate([np.outer(rng.uniform(0.5, 5, 300), shape) for shape in shapes])
-    found = fit_kinds((readings + rng.normal(0, 2, readings.shape)).reshape(-1, 3, 4, 4), kinds=2)
+    noisy = (readings + rng.normal(0, 2, readings.shape)).astype(np.float32)
+    found = fit_kinds(noisy.reshape(-1, 3, 4, 4), kinds=2)
     angles = [
         [shape @ covariance @ shape / (shape @ shape * np.trace(covariance)) for shape in shapes]
         for covariance in found

@@ -93,7 +93,7 @@ def fit_classical(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) 
 
 
 def fit_taxels(taps: PressSet | Sequences, windows: int = 2 * CLASSICAL_WINDOWS) -> dict[str, NDArray]:
-    """Covariances (kinds, 48, 48) of taxels' readings, x of all first; none of them dead, and the pad turned all ways."""
+    """Covariances (kinds, 48, 48) of taxels' readings, x of all first; none is dead, and the pad is turned all ways."""
     newest, patterns = drawn(taps, windows)
     turned = [quarter_turns(newest[:, None], patterns, turns)[0][:, 0] for turns in range(4)]
     return {"covariances": fit_kinds(np.concatenate(turned))}
