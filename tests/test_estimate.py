@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
+from numpy.typing import NDArray
 
 from edge.bundle import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.errors import EdgeError
@@ -47,9 +48,9 @@ def noisy(scans, *, z_counts=0.0, seed=0):
     return rows
 
 
-def one_way(shape):
+def one_way(shape) -> NDArray[np.float64]:
     """Covariance of readings in which any living taxel tells every dead one: rank 3, one pattern an axis."""
-    return np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape))
+    return np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape)).astype(np.float64)
 
 
 def test_readings_drawn_from_a_covariance_are_estimated_without_error_where_the_others_tell_all():
