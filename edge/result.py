@@ -20,7 +20,7 @@ MADE: Final = (
 """Of a result, what is made of a pattern."""
 
 State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
-Filled = Literal["rest", "neighbours"]
+Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
 
 
@@ -72,8 +72,8 @@ class Result:
         dead: taxels that are not believed, row-major from the top left, and why: "silent", "saturated", "stuck", "far"
             (reads what no contact makes) or "unzeroed"; empty where all are. A pattern made meanwhile is made without
             them.
-        filled: what stood for the dead ones: "rest", which networks are trained to make up for, or an estimate from
-            their "neighbours"; None where none is dead, or no pattern can be made.
+        filled: what stood for the dead ones: an estimate from their "neighbours"; None where none is dead, or there is
+            no pattern.
         note: what the user should know, such as why zeroing started over.
         event: what happened before this scan: why there is another model, what came of zeroing on demand, a step in
             rest level; else None.

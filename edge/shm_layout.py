@@ -99,7 +99,7 @@ FIELDS: Final = (
 
 SOURCES: Final = ("device", "replay", "emulated")
 STATES: Final = ("zeroing", "incomplete", "idle", "contact", "dropped")
-FILLED: Final = ("rest", "neighbours")
+FILLED: Final = ("rest", "neighbours")  # the first only by earlier releases
 WRENCH_ORIGINS: Final = ("nominal", "calibrated")
 # Told by their place, from 1: memory that nobody wrote must not pass for a sensor's.
 

@@ -163,7 +163,7 @@ class TaxelWatch:
         """What to tell of taxels that are not believed; None while there is nothing to tell.
 
         Args:
-            filled: what stands for dead ones, "rest" or "neighbours"; None where there is no pattern for them.
+            filled: what stands for dead ones; None where there is no pattern for them.
         """
         if self._sound:
             return None
@@ -175,8 +175,7 @@ class TaxelWatch:
         if filled is not None and kinds:
             dead = ", ".join(f"{_named(taxels)} {_WORDS[reason]}" for reason, taxels in kinds.items())
             owner = "its" if len(self._reasons) == 1 else "their"
-            how = f"estimated from {owner} neighbours" if filled == "neighbours" else "taken as at rest"
-            notes.append(f"{dead}: {how}")
+            notes.append(f"{dead}: estimated from {owner} neighbours")
             return "; ".join(notes)
         silent_long = self.silent_long
         id_map = 2 * np.count_nonzero(silent_long) == silent_long.size

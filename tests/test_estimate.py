@@ -6,8 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
+from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR, TAXELS, find_model
+from edge.bundle import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.errors import EdgeError
 from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import load_frozen_set
@@ -18,7 +19,6 @@ from edge.sinks.jsonl import record_line
 from edge.taxels import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ScanSeries
-from train.data.frozen_presses import load_frozen_presses
 
 GRID = (4, 4)
 PRESS = 3000
@@ -48,17 +48,27 @@ def noisy(scans, *, z_counts=0.0, seed=0):
     return rows
 
 
+def one_way(shape) -> NDArray[np.float64]:
+    """Covariance of readings in which any living taxel tells every dead one: rank 3, one pattern an axis."""
+    return np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape)).astype(np.float64)
+
+
 def test_readings_drawn_from_a_covariance_are_estimated_without_error_where_the_others_tell_all():
-    """Rank 3: one pattern an axis, so that any living taxel tells every dead one."""
-    rng = np.random.default_rng(0)
-    shape = rng.uniform(500, 1500, 16)
-    covariance = np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape))
-    filler = TaxelEstimator(covariance, GRID).filler(dead(1, 6, 11))
+    shape = np.random.default_rng(0).uniform(500, 1500, 16)
+    filler = TaxelEstimator(one_way(shape)[None], GRID).filler(dead(1, 6, 11))
     counts = np.outer([0.3, -0.2, 2.0], shape).astype(np.float32).reshape(3, 4, 4)
     told = filler(np.where(dead(1, 6, 11), 1e6, counts).astype(np.float32))
-    assert told.filled == "rest" and told.z_counts == pytest.approx(counts[2].sum(), rel=0.01)
-    assert not told.counts[:, dead(1, 6, 11)].any()
+    assert told.filled == "neighbours" and told.z_counts == pytest.approx(counts[2].sum(), rel=0.01)
+    np.testing.assert_allclose(told.counts, counts, rtol=0.02)
     np.testing.assert_array_equal(told.counts[:, ~dead(1, 6, 11)], counts[:, ~dead(1, 6, 11)])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_what_dead_taxels_read_is_estimated_by_the_kind_of_contact_that_the_living_ones_show(kind):
+    shapes = np.random.default_rng(0).uniform(-1500, 1500, (2, 16))
+    filler = TaxelEstimator(np.stack([one_way(shape) for shape in shapes]), GRID).filler(dead(1, 6))
+    counts = np.outer([0.3, -0.2, 2.0], shapes[kind]).astype(np.float32).reshape(3, 4, 4)
+    np.testing.assert_allclose(filler(counts).counts, counts, rtol=0.02)
 
 
 @pytest.mark.parametrize("taxels", [(5,), (0,), (5, 6), (0, 3, 9, 14)])
@@ -81,32 +91,25 @@ def test_an_estimate_grows_with_what_it_is_made_of():
     assert filler(0 * counts).z_counts == 0
 
 
-def ends_of_figures():
-    return load_frozen_set(BUNDLE_DIR / "frozen.npz").newest[15::16].astype(np.float32)
-
-
-def wide_presses():
-    return load_frozen_presses().as_frozen_set().newest[::4].astype(np.float32)
-
-
-@pytest.mark.parametrize(("scans", "left"), [(wide_presses, 0.55), (ends_of_figures, 0.65)])
-def test_simulated_taps_are_left_to_the_network_and_their_force_is_told_better(scans, left):
-    """The covariance is of the wide world. Measured: .52 of the deviation is left there, .63 on the figures."""
-    newest = scans()
+def test_of_simulated_taps_the_force_is_told_better_than_with_nothing_in_place_of_the_dead():
+    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    newest = frozen.newest[15::16].astype(np.float32)  # ends of taps
     whole, without, told = newest[:, 2].sum(axis=(1, 2)), [], []
     for taxel in range(16):
         filler = estimator().filler(dead(taxel))
-        readings = [filler(scan) for scan in newest]
-        assert np.mean([reading.filled == "rest" for reading in readings]) > 0.99
-        told.append([reading.z_counts for reading in readings] - whole)
-        without.append([reading.counts[2].sum() for reading in readings] - whole)
-    assert np.std(told) < left * np.std(without)
+        told.append([filler(scan).z_counts for scan in newest] - whole)
+        without.append(-newest[:, 2].reshape(-1, 16)[:, taxel])
+    assert np.std(told) < 0.6 * np.std(without)
 
 
-@pytest.mark.parametrize("covariance", [np.eye(47), np.full((48, 48), np.nan)])
-def test_a_covariance_that_is_none_is_refused(covariance):
-    with pytest.raises(EdgeError, match="freeze it again"):
-        TaxelEstimator(covariance, GRID)
+@pytest.mark.parametrize(
+    "covariances",
+    [np.eye(47)[None], np.eye(48), np.empty((0, 48, 48)), np.full((1, 48, 48), np.nan), -np.eye(48)[None]],
+    ids=["of another grid", "without kinds", "none", "nan", "negative"],
+)
+def test_covariances_that_are_none_are_refused(covariances):
+    with pytest.raises(EdgeError, match="freeze them again"):
+        TaxelEstimator(covariances, GRID)
 
 
 def test_a_file_that_is_none_is_refused(tmp_path):
@@ -170,9 +173,8 @@ def test_earlier_taps_are_forgotten_when_a_taxel_dies_and_when_it_is_believed_ag
 
 
 def test_patterns_with_dead_taxels_found_are_better_than_with_what_they_send():
-    """Measured 24.2 dB with the taxel found and 23.0 with what it sends; 24.7 with the whole pad."""
-    frozen, model = load_frozen_set(BUNDLE_DIR / "frozen.npz"), ModelSession(find_model("stsr"))
-    frames = np.arange(15, len(frozen), 16)[::6]
+    frozen, model = load_frozen_set(BUNDLE_DIR / "frozen.npz"), ModelSession(find_model(DEFAULT_MODEL))
+    frames = np.arange(15, len(frozen), 16)[::2]
     found, unfound = [], []
     for frame in frames:
         held = REST + frozen.newest[frame]

@@ -51,4 +51,4 @@ def test_no_dead_taxel_is_what_the_models_own_judge_says():
     direct = np.stack([model.run(model.contract.scale_window(window)).copy() for window in windows])
     # Noise of one count is all that is between them.
     assert np.abs(np.stack(told.patterns) - direct).max() < 0.02
-    assert told.neighbours == 0 and told.delays_scans == []
+    assert told.delays_scans == []

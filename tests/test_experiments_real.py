@@ -1,38 +1,26 @@
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from experiment_samples import quick_bench
 
+from edge.bundle import DEFAULT_MODEL, find_model
+from edge.session import ModelSession
+from edge.taxels import HOLD_SCANS
 from firmware_bridge.recording import CSV_HEADER
 from train.errors import DatasetError
 from train.experiments import real
 from train.experiments.hidden_taxel import (
-    BILINEAR,
-    GAMMAS,
-    OTHERS,
-    SIMULATED,
-    TRUTH,
-    ScanSet,
-    fit_gamma,
-    hidden_taxels,
-    hide,
+    from_other_trials,
     linear_from_others,
     neighbours_mean,
+    recorded_grips,
     recorded_sets,
 )
 from train.experiments.workbench import Workbench
-from train.networks.registry import build
-from train.psf_net import degrade
 
 REST = np.array([15_900, 16_430, 38_600])[:, None, None] + 11 * np.arange(16).reshape(4, 4)
-
-
-@pytest.fixture(scope="module")
-def net():
-    torch.manual_seed(0)
-    return build("compact-stsr", 10, channels=16, blocks=1).eval()
 
 
 @pytest.fixture
@@ -62,59 +50,9 @@ def save_recording(path, counts):
     path.write_text("\n".join(lines) + "\n")
 
 
-def scans(count, seed, **more):
-    rng = np.random.default_rng(seed)
-    counts = rng.integers(100, 1500, (count, 3, 4, 4)).astype(np.float32)
-    return ScanSet("1", str(seed), counts, **more)
-
-
 def rows_of(path):
     with path.open() as file:
         return list(csv.DictReader(file))
-
-
-def test_a_hidden_taxel_reads_nothing_and_the_others_what_they_did():
-    counts = scans(5, 1).counts
-    hidden = hide(counts, 6)
-    assert not hidden[:, :, 1, 2].any()
-    hidden[:, :, 1, 2] = counts[:, :, 1, 2]
-    np.testing.assert_array_equal(hidden, counts)
-
-
-@pytest.mark.parametrize("truth_known", [True, False])
-def test_no_method_sees_what_it_is_to_tell(net, truth_known):
-    """Whatever the hidden taxel reads, the word on it is the same."""
-    rng = np.random.default_rng(4)
-    maps = rng.random((6, 40, 40), dtype=np.float32)
-    sets = [scans(6, seed, patterns=maps if truth_known else None) for seed in (1, 2)]
-    taxel = 9
-    changed = sets[0].counts.copy()
-    changed[:, :, taxel // 4, taxel % 4] = rng.integers(-9000, 9000, (6, 3))
-    others = [ScanSet("1", "1", changed, sets[0].patterns), sets[1]]
-    simulated = scans(40, 3).counts
-    before, after = (hidden_taxels(these, {"net": net}, 0.6, simulated) for these in (sets, others))
-    assert list(before) == ["net", BILINEAR, SIMULATED, TRUTH if truth_known else OTHERS]
-    for name in before:
-        np.testing.assert_allclose(after[name][0][:, taxel], before[name][0][:, taxel], rtol=1e-4)
-        assert not np.allclose(after[name][0][:, taxel - 1], before[name][0][:, taxel - 1], rtol=1e-4)
-
-
-def test_patterns_that_the_degradation_explains_are_told_exactly():
-    patterns = np.random.default_rng(5).random((7, 40, 40), dtype=np.float32)
-    z = 370 * degrade(torch.from_numpy(patterns), torch.tensor(0.6)).numpy()
-    counts = np.zeros((7, 3, 4, 4), np.float32)
-    counts[:, 2] = z
-    told = hidden_taxels([ScanSet("1", "1", counts, patterns)], {}, 0.6, scans(40, 3).counts)
-    np.testing.assert_allclose(told[TRUTH][0], z.reshape(7, 16), rtol=1e-4)
-
-
-@pytest.mark.parametrize("index", [5, 30, 50])
-def test_the_gamma_that_made_the_readings_is_found(index):
-    patterns = np.random.default_rng(6).random((20, 40, 40), dtype=np.float32)
-    z = 123 * degrade(torch.from_numpy(patterns), torch.tensor(GAMMAS[index])).flatten(1).numpy()
-    gamma, unexplained = fit_gamma(patterns, z)
-    assert gamma == GAMMAS[index]
-    assert unexplained < 1e-9
 
 
 def test_neighbours_tell_a_plane_exactly_inside_the_rim():
@@ -158,25 +96,51 @@ def test_a_damaged_recording_is_named(recordings):
         recorded_sets(recordings)
 
 
-def test_the_report_compares_all_methods_on_recordings_and_on_simulated_scans(recordings, tmp_path_factory):
+def test_a_trial_is_told_from_the_others_alone():
+    rng = np.random.default_rng(8)
+    z = [rng.normal(size=(60, 3)) @ rng.normal(size=(3, 16)) for _ in range(3)]
+    told = from_other_trials(["a", "a", "b"], z)
+    np.testing.assert_allclose(told[0], linear_from_others(z[2], z[0]), rtol=1e-6)
+    np.testing.assert_allclose(told[2], linear_from_others(np.concatenate(z[:2]), z[2]), rtol=1e-6)
+
+
+def test_measures_of_a_face_of_half_a_face_and_of_a_hole():
+    face, half, hole = np.ones((3, 40, 40))
+    half[:20] = 0
+    hole[15:20, 15:20] = 0
+    patterns = np.stack([face, half, hole])
+    np.testing.assert_allclose(real.share_touched(patterns), [1, 0.5, 1 - 25 / 1600])
+    np.testing.assert_allclose(real.unevenness(patterns)[:2], [0, 1])
+    assert real.has_hole(patterns).tolist() == [False, False, True]
+
+
+def test_a_hidden_taxel_is_not_seen_by_what_tells_it(recordings):
+    """Whatever it reads."""
+    model = ModelSession(find_model(DEFAULT_MODEL))
+    grip = recorded_grips(recordings)[0]
+    changed = grip.counts.copy()
+    changed[:, :, 1, 2] += 700
+    other = replace(grip, counts=changed)
+    before, after = (real.play(one, model, hidden=6) for one in (grip, other))
+    assert np.isfinite(before.patterns[HOLD_SCANS:]).all() and before.run_time_us[-1] > 0
+    np.testing.assert_array_equal(before.patterns, after.patterns)
+    whole, moved = (real.play(one, model) for one in (grip, other))
+    assert np.abs(whole.patterns - moved.patterns).max() > 0.01
+    np.testing.assert_array_equal(whole.zeroed[:, :, 0], moved.zeroed[:, :, 0])
+
+
+def test_the_report_compares_the_shipped_way_with_linear_ones(recordings, tmp_path_factory):
     page = real.run(quick_bench(tmp_path_factory), tmp_path_factory.mktemp("reports"))
-    rows = rows_of(page.with_suffix(".csv"))
-    assert [(row["scans"], row["method"]) for row in rows] == [
-        *(("recordings", name) for name in ("stsr", BILINEAR, SIMULATED, OTHERS)),
-        *(("simulated", name) for name in ("stsr", BILINEAR, SIMULATED, TRUTH)),
+    rows = {row["method"]: row for row in rows_of(page.with_suffix(".csv"))}
+    shipped = [DEFAULT_MODEL, "bilinear", "linear map"]
+    fitted = [f"{DEFAULT_MODEL}, gains fitted on other trials", "linear map, fitted on other trials"]
+    assert list(rows) == shipped + fitted
+    for name in shipped:
+        assert 0 < float(rows[name]["share of the pad"]) <= 1 and float(rows[name]["run time us"]) > 0
+        assert float(rows[name]["hidden taxel counts"].split()[0]) > 0
+    trials = rows_of(page.with_name("real-trials.csv"))
+    assert [(row["trial"], row["sensor"]) for row in trials] == [
+        (f"trial-{trial}", f"xela_sensor{sensor}") for sensor in (1, 2) for trial in "ab"
     ]
-    error = {(row["scans"], row["method"]): float(row["RMS error counts"].split()[0]) for row in rows}
-    # Even a network of two steps leaves these two in their order: one has the truth.
-    assert error["simulated", TRUTH] < error["simulated", "stsr"]
-    assert {"correlation", "correlation within a trial", "parameters", "MMAC", "run time ms"} <= set(rows[0])
-    for source in ("recordings", "simulated"):
-        assert len(rows_of(page.with_name(f"real-{source}.csv"))) == 16
     assert page.with_suffix(".png").stat().st_size > 10_000
     assert str(recordings) not in page.read_text()
-
-
-def test_a_quick_run_does_without_recordings_and_says_so(tmp_path, tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path))
-    page = real.run(quick_bench(tmp_path_factory), tmp_path / "reports")
-    assert "No recordings were there" in page.read_text()
-    assert {row["scans"] for row in rows_of(page.with_suffix(".csv"))} == {"simulated"}

@@ -13,6 +13,7 @@ from train.freeze import SEED, TEST_FORCE_N, demo_recording, drawn, fit_classica
 from train.generation import Generation, solve_all
 from train.nuisances import Nuisances
 from train.simulation import FRAMES, MAX_INDENTATION_MM
+from train.taxels import KINDS, fit_kinds
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +112,7 @@ def test_files_are_replaced_by_those_that_load_and_stay_as_bak(tmp_path, monkeyp
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, *baks])
     assert (tmp_path / "frozen.npz").stat() == test_set
     before = (tmp_path / "taxels.npz").read_bytes()
-    monkeypatch.setattr("train.freeze.fit_taxels", lambda _: {"covariances": np.zeros(3)})
+    monkeypatch.setattr("train.freeze.fit_taxels", lambda _: {"covariance": np.zeros(3)})
     with pytest.raises(EdgeError, match="cannot be read"):
         main([str(tmp_path), "--data", "seen.npz"])
     assert (tmp_path / "taxels.npz").read_bytes() == before
@@ -130,12 +131,26 @@ def test_presses_are_drawn_like_taps_whole_and_each_with_its_own_truth():
     assert set(fit_classical(presses, windows=20)) == {"bilinear_gain", "bicubic_gain", "linear_map"}
 
 
+def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
+    rng = np.random.default_rng(0)
+    shapes = rng.uniform(100, 1000, (2, 48)) * [[1], [0.2]]
+    shapes[1, :40] = 0
+    readings = np.concatenate([np.outer(rng.uniform(0.5, 5, 300), shape) for shape in shapes])
+    noisy = (readings + rng.normal(0, 2, readings.shape)).astype(np.float32)
+    found = fit_kinds(noisy.reshape(-1, 3, 4, 4), kinds=2)
+    angles = [
+        [shape @ covariance @ shape / (shape @ shape * np.trace(covariance)) for shape in shapes]
+        for covariance in found
+    ]
+    np.testing.assert_allclose(sorted(angles, reverse=True), np.eye(2), atol=0.15)
+
+
 def test_taxels_covary_as_their_readings_do(sequences):
-    covariance = fit_taxels(sequences, windows=400)["covariance"]
-    assert covariance.shape == (48, 48) and covariance.dtype == np.float32
-    np.testing.assert_array_equal(covariance, covariance.T)
-    assert np.linalg.eigvalsh(covariance.astype(np.float64)).min() > -1e-3 * np.trace(covariance)
-    # The press is in z, and a neighbour shares more of it than the far corner does.
-    z = covariance[32:, 32:]
-    assert np.trace(z) > 5 * np.trace(covariance[:32, :32]) / 2
-    np.testing.assert_array_equal(covariance, fit_taxels(sequences, windows=400)["covariance"])
+    covariances = fit_taxels(sequences, windows=400)["covariances"]
+    assert covariances.shape == (KINDS, 48, 48) and covariances.dtype == np.float32
+    np.testing.assert_allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-4, atol=1e-6)
+    # The press is in z, and of one strength in all of them.
+    traces = np.trace(covariances, axis1=1, axis2=2)
+    np.testing.assert_allclose(traces, 48, rtol=0.01)
+    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.7 * traces).all()
+    np.testing.assert_array_equal(covariances, fit_taxels(sequences, windows=400)["covariances"])

@@ -687,7 +687,7 @@ class TestStatus:
     def test_dead_taxels_are_named(self):
         sink = self.make()
         result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan())
-        sink.write(replace(result, dead={3: "stuck", 7: "silent"}, filled="rest"), RUN)
+        sink.write(replace(result, dead={3: "stuck", 7: "silent"}, filled="neighbours"), RUN)
         assert "4 idle without taxel 3,7 " in sink.line() + " "
 
     def test_a_note_while_zeroing_is_shown(self):

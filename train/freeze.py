@@ -26,7 +26,7 @@ from train.batches import Draw, WindowBatches
 from train.data.files import load_taps
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
-from train.dataset import Sequences, between_frames
+from train.dataset import Sequences, between_frames, quarter_turns
 from train.depth import Pose
 from train.errors import TrainError
 from train.generation import Generation, solve_all
@@ -35,6 +35,7 @@ from train.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position
 from train.resample import resample
 from train.simulation import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
 from train.surfaces import SURFACES
+from train.taxels import fit_kinds
 
 SEED: Final = 20240228
 """The paper's day of publication; never to be changed, or no two figures can be compared."""
@@ -91,11 +92,11 @@ def fit_classical(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) 
     }
 
 
-def fit_taxels(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
-    """Covariance (48, 48) about zero of taxels' readings, x of all first, in zeroed counts; none of them dead."""
-    newest, _ = drawn(taps, windows)
-    flat = newest.reshape(len(newest), -1).astype(np.float64)
-    return {"covariance": (flat.T @ flat / len(flat)).astype(np.float32)}
+def fit_taxels(taps: PressSet | Sequences, windows: int = 2 * CLASSICAL_WINDOWS) -> dict[str, NDArray]:
+    """Covariances (kinds, 48, 48) of taxels' readings, x of all first; none is dead, and the pad is turned all ways."""
+    newest, patterns = drawn(taps, windows)
+    turned = [quarter_turns(newest[:, None], patterns, turns)[0][:, 0] for turns in range(4)]
+    return {"covariances": fit_kinds(np.concatenate(turned))}
 
 
 def drawn(taps: PressSet | Sequences, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

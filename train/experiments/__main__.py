@@ -28,7 +28,7 @@ EXPERIMENTS: Final = {
     "force": "error by contact force",
     "force-recovery": "force through press, hold and release",
     "unseen": "surfaces that were not trained on",
-    "real": "a hidden taxel of real recordings",
+    "real": "real grips: are faces drawn as faces, and do patterns explain readings",
     "robust": "error against the severity of nuisances",
     "dead": "dead taxels, found and unfound",
     "identify": "gains and constants of a sensor from its own contacts",

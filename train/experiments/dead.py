@@ -60,14 +60,12 @@ class Told:
         half_width_mm: (n, H, W) of 90 % intervals.
         delays_scans: scans until every dead taxel was known, where they were.
         run_time_us: of the frame's scan, inference and all.
-        neighbours: frames with dead taxels estimated from neighbours.
     """
 
     patterns: list[NDArray[np.float32]] = field(default_factory=list)
     half_width_mm: list[NDArray[np.float32]] = field(default_factory=list)
     delays_scans: list[int] = field(default_factory=list)
     run_time_us: list[float] = field(default_factory=list)
-    neighbours: int = 0
 
 
 def run(bench: Workbench, folder: Path) -> Path:
@@ -151,7 +149,6 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
         told.half_width_mm.append(none if deviation is None else factor * deviation)
         told.run_time_us.append(took_us)
         told.delays_scans += [known] if known is not None else []
-        told.neighbours += result is not None and result.filled == "neighbours"
     return told
 
 
@@ -190,7 +187,6 @@ def _row(model: ModelSession, frozen: FrozenSet, told: Told, dead: int, fault: s
         "IoU": round(float(figures["contact_iou"].mean()), 3),
         "covered %": f"{100 * figures['coverage_90'].mean():.1f} ({100 * narrow.mean():.1f})",
         "no pattern": sum(not pattern.any() for pattern in told.patterns),
-        "from neighbours": told.neighbours,
         "found after scans": max(told.delays_scans, default=None),
         "run time us p50": round(float(np.median(told.run_time_us)), 0),
     }
@@ -211,16 +207,14 @@ def _real_rows(folder: Path, estimator: TaxelEstimator, quick: bool) -> list[Row
     for dead in (1,) if quick else (1, 2, 4, 8):
         rng = np.random.default_rng([SEED, 4, dead])
         masks = [(rng.permutation(_TAXELS) < dead).reshape(USPA44.rows, USPA44.cols) for _ in range(_MASKS)]
-        neighbours = 0
         apart: dict[str, list[float]] = {"at rest": [], "as shipped": []}
         alike: dict[str, list[float]] = {"at rest": [], "as shipped": []}
         z_off: dict[str, list[float]] = {"at rest": [], "as shipped": []}
         for mask in masks:
             filler = estimator.filler(mask)
             for scan, true in zip(scans, whole, strict=True):
-                readings = filler(scan)
-                neighbours += readings.filled == "neighbours"
-                for how, counts in (("at rest", np.where(mask, np.float32(0), scan)), ("as shipped", readings.counts)):
+                shipped = filler(scan).counts
+                for how, counts in (("at rest", np.where(mask, np.float32(0), scan)), ("as shipped", shipped)):
                     found = pattern(counts)
                     apart[how].append(float(((found - true) ** 2).mean()))
                     both = [one >= level * one.max() for one in (found, true)]
@@ -236,9 +230,6 @@ def _real_rows(folder: Path, estimator: TaxelEstimator, quick: bool) -> list[Row
                 "of the patterns' RMS %": round(100 * float(np.sqrt(np.mean(apart[how]) / (whole**2).mean())), 1),
                 "IoU with it": round(float(np.mean(alike[how])), 3),
                 "z off counts": round(float(np.sqrt(np.mean(z_off[how]))), 0),
-                "from neighbours %": round(100 * neighbours / (len(masks) * len(scans)), 1)
-                if how != "at rest"
-                else None,
             }
             for how in apart
         ]

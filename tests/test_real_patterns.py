@@ -1,0 +1,43 @@
+"""What the default model draws of real grips: the face of a box over the whole pad, not figures."""
+
+import numpy as np
+import pytest
+
+from edge.bundle import DEFAULT_MODEL, find_model
+from edge.session import ModelSession
+from train.experiments.hidden_taxel import recorded_grips, recording_paths, recordings_folder
+from train.experiments.real import Played, has_hole, play, share_touched, unevenness
+
+RECORDINGS = recordings_folder()
+PATHS = recording_paths(RECORDINGS)
+LEAST_SHARE, MOST_UNEVEN = 0.9, 0.3
+
+pytestmark = pytest.mark.skipif(not PATHS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
+
+
+@pytest.fixture(scope="module")
+def played() -> dict[str, Played]:
+    model = ModelSession(find_model(DEFAULT_MODEL))
+    return {f"{grip.trial} {grip.free.sensor}": play(grip, model) for grip in recorded_grips(RECORDINGS)}
+
+
+def test_every_scan_under_load_has_a_pattern(played):
+    assert sorted(played) == sorted(f"{path.parent.name} {path.stem}" for path in PATHS)
+    for name, one in played.items():
+        assert len(one.patterns) > 100 and np.isfinite(one.patterns).all(), name
+
+
+def test_the_strongest_moment_of_every_grip_covers_the_pad_evenly_without_a_hole(played):
+    for name, one in played.items():
+        strongest = one.patterns[one.zeroed[:, 2].sum(axis=(1, 2)).argmax()][None]
+        assert share_touched(strongest)[0] >= LEAST_SHARE, name
+        assert unevenness(strongest)[0] <= MOST_UNEVEN, name
+        assert not has_hole(strongest)[0], name
+
+
+def test_over_all_scans_the_pad_is_covered_evenly(played):
+    patterns = np.concatenate([one.patterns for one in played.values()])
+    assert np.median(share_touched(patterns)) >= LEAST_SHARE
+    assert np.median(unevenness(patterns)) <= MOST_UNEVEN
+    for name, one in played.items():
+        assert np.median(unevenness(one.patterns)) <= MOST_UNEVEN, name

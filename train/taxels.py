@@ -1,0 +1,42 @@
+"""Kinds of contact in the readings of simulated presses, by which dead taxels are estimated."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.estimate import Kinds, ridged
+
+KINDS: Final = 16
+"""RMS error of a hidden taxel's z on validation presses, over that of the scan: with 1 kind .61, with 16 .56. With more
+it falls on figures, but not on contacts that vary little over the pad."""
+_PASSES: Final = 10
+_PARTS: Final = 40
+"""That scans are weighed in, so as not to take a gigabyte."""
+_LEAST_COUNTS: Final = 20.0
+"""RMS of a reading below which noise is not scaled up."""
+_FELT: Final = 0.5
+_STRONG: Final = 0.9
+
+
+def fit_kinds(readings: NDArray[np.floating], kinds: int = KINDS) -> NDArray[np.float32]:
+    """Covariances (kinds, 3 taxels, 3 taxels) of scans scaled to one strength, by expectation maximisation.
+
+    Scans are sorted to begin with by the share of taxels that read nearly as much as the strongest ones.
+
+    Args:
+        readings: (n, 3, rows, cols) in zeroed counts.
+        kinds: equally many scans begin in each.
+    """
+    flat = readings.reshape(len(readings), -1).astype(np.float64)
+    flat /= np.maximum(np.sqrt(np.square(flat).mean(axis=1, keepdims=True)), _LEAST_COUNTS)
+    z = np.abs(flat[:, -readings.shape[2] * readings.shape[3] :])
+    felt = (z / np.quantile(z, _STRONG, axis=1, keepdims=True) > _FELT).mean(axis=1) + z.mean(axis=1) / 1e3
+    weight = np.eye(kinds)[felt.argsort().argsort() * kinds // len(flat)]
+    covariances = np.empty((kinds, flat.shape[1], flat.shape[1]), dtype=np.float64)
+    for _ in range(_PASSES):
+        for kind, share in enumerate(weight.T):
+            covariances[kind] = (flat * share[:, None]).T @ flat / share.sum()
+        found = Kinds(ridged(covariances))
+        weight = np.concatenate([found.weigh(part) for part in np.array_split(flat, _PARTS)])
+    return covariances.astype(np.float32)
