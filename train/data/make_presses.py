@@ -137,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--mesh", type=Path, action="append", default=[], metavar="FILE", help="an STL, OBJ or PLY to add"
     )
-    parser.add_argument("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 110 (20)")
+    parser.add_argument("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
     parser.add_argument("--spread", type=float, default=1.0, help="of the pads' constants; 0: the nominal pad (1)")
     parser.add_argument("--seed", type=int, default=1, help="of pads, shapes and drags (1)")
     parser.add_argument("--jobs", type=int, default=-1, help="processes, -1 for one on each core (-1)")
