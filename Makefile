@@ -42,10 +42,10 @@ models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the b
 	$(BIN)/python -m export.verify edge/models/*.onnx
 
 data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
-	$(BIN)/python -m train.data.make_presses $@ --count 34000 --seed 1
+	$(BIN)/python -m train.data.make_presses $@ --count 100000 --seed 1
 
 data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each
-	$(BIN)/python -m train.data.make_presses $@ --count 5000 --taps 4 --seed 2
+	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 4 --seed 2
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --seed 1000001

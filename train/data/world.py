@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.data.presses import PressSet
+from train.data.presses import VERSION, PressSet
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.generation import mesh_sha256, one_thread
@@ -79,7 +79,7 @@ class World:
     def facts(self) -> dict[str, Any]:
         """The configuration as JSON gives it back, with the ranges that pads are drawn from and the meshes' hashes."""
         ranges = {name: list(bounds) for name, bounds in RANGES.items()}
-        facts = asdict(self) | {"families": dict(self.families), "ranges": ranges, "inputs": list(INPUTS)}
+        facts = asdict(self) | {"families": dict(self.families), "ranges": ranges, "inputs": list(INPUTS), "version": VERSION}
         meshes = {name: mesh_sha256(name) for name in self.families if name.startswith("mesh:")}
         return facts | ({"meshes": meshes} if meshes else {})
 

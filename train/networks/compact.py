@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from train.data.batch import Batch
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
-from train.objectives import relative_error, truth_size
+from train.objectives import relative_rms_error, truth_size
 
 _QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added before a tap is divided by its own: noise and absent taps stay small."""
@@ -99,8 +99,13 @@ class CompactNet(PatternNet):
             nn.ReLU(),
             SymmetricConv2d(merged, wide.shuffled(2), 1),
             nn.PixelShuffle(2),
-            nn.ReLU(),
         )
+        # What the whole pad shows, and what is known of it, scales and shifts every channel of the trunk's entrance.
+        self.context = nn.Sequential(
+            SymmetricConv2d(merged + about, merged, 1), nn.ReLU(), SymmetricConv2d(merged, wide * 2, 1)
+        )
+        for part in self.context[2].parameters():
+            nn.init.zeros_(part)
         self.trunk = nn.Sequential(*(SymmetricResidual(wide) for _ in range(blocks)))
         self.force = nn.Sequential(
             SymmetricConv2d(vectors(self.group) + about, narrow, 3),
@@ -146,7 +151,10 @@ class CompactNet(PatternNet):
         planes = about[:, :, None, None].expand(count, self.known + 1, rows, cols)
         entered = self.enter(torch.cat([shapes, planes], dim=1))
         felt = self.force(torch.cat([shapes[:, :3], planes], dim=1))
-        features = torch.cat([self.trunk(self.merge(entered)), felt], dim=1)
+        everywhere = torch.cat([torch.relu(entered).mean(dim=(2, 3), keepdim=True), about[:, :, None, None]], dim=1)
+        scale, shift = self.context(everywhere).chunk(2, dim=1)
+        merged = torch.relu(self.merge(entered) * (1 + scale) + shift)
+        features = torch.cat([self.trunk(merged), felt], dim=1)
         pattern = self.leave(features)[:, 0] * newest
         traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
         # Not an exponential: on a window unlike all others it would know no bounds.
@@ -213,7 +221,7 @@ class HeteroscedasticError:
 def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta: float = 1.0) -> Tensor:
     """Relative error of the patterns, and how badly the deviations tell it; all (n, H, W) in [mm].
 
-    The deviation is judged by a Laplace likelihood, since the pattern descends a mean absolute error: with the error e
+    The deviation is judged by a Laplace likelihood, as errors have long tails: with the error e
     and b = deviation / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b^beta. That is least
     where b is the mean error, whatever beta is. With 0, the likelihood alone, its slope over log b knows no bounds, and
     most is asked of pixels that are right already; with 1 the slope is b - e, of the error's own size, and pixels in
@@ -226,4 +234,4 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta
     error = (pattern.detach() - truth).abs() / size
     spread = deviation / sqrt(2) / size + _LEAST_SHARE
     misjudged = spread.detach().pow(beta) * (spread.log() + error / spread)
-    return relative_error(pattern, truth) + misjudged.mean()
+    return relative_rms_error(pattern, truth) + misjudged.mean()
