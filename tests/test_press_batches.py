@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from press_samples import make_press_set
 
 from train.batches import COUNTS_PER_UNIT
@@ -37,7 +38,7 @@ def test_one_number_is_one_batch_whatever_was_drawn_before(presses):
 
 
 def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
-    batches = PressBatches(presses, (1.0,), 16, seed=1, nuisances=QUIET)
+    batches = PressBatches(presses, (1.0,), 16, seed=1, nuisances=QUIET, mirror=False)
     marks = [row.tobytes() for row in presses.traction_kpa[:, 0, 0].astype(np.float32)]  # each has its own
     for first in (0, 4):
         drawn = [batches(number) for number in range(first, first + 4)]
@@ -54,7 +55,7 @@ def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
 
 
 def test_of_a_third_of_the_pads_nothing_is_known_of_a_third_all(presses):
-    batches = PressBatches(presses, (1.0,), 64, seed=2, nuisances=QUIET)
+    batches = PressBatches(presses, (1.0,), 64, seed=2, nuisances=QUIET, mirror=False)
     pads = np.concatenate([batches(number).pad.numpy() for number in range(40)])
     count = len(INPUTS)
     values, flags, gains = pads[:, :count], pads[:, count:-1], pads[:, -1]
@@ -76,10 +77,43 @@ def test_known_constants_are_near_the_pads_own(presses):
 def test_readings_of_known_gains_are_evened_out(presses):
     """One clean press read by many sensors: where gains are known, what is left of their spread is small."""
     one = replace(presses, counts=np.broadcast_to(np.float32(4000), presses.counts.shape).copy())
-    batch = PressBatches(one, (1.0,), 64, seed=5, nuisances=GAINS_ALONE)(0)
+    batch = PressBatches(one, (1.0,), 64, seed=5, nuisances=GAINS_ALONE, mirror=False)(0)
     spread = counts_of(batch).std(axis=(1, 2, 3)) / 4000
     known = batch.pad[:, -1].numpy() == 1
     assert spread[known].max() < 0.03 < 0.05 < spread[~known].min()
+
+
+def test_half_of_the_windows_are_mirror_images(presses):
+    plain, images = (PressBatches(presses, (1.0,), 64, seed=7, mirror=mirror)(0) for mirror in (False, True))
+    mirrored = np.array([not torch.equal(*pair) for pair in zip(plain.window, images.window, strict=True)])
+    assert 0.3 < mirrored.mean() < 0.7
+    for name, vectors in (("window", True), ("pattern", False), ("traction", True)):
+        expected = getattr(plain, name).numpy().copy()
+        expected[mirrored] = expected[mirrored][..., ::-1]
+        if vectors:
+            expected[mirrored, ::3] *= -1
+        assert np.array_equal(getattr(images, name).numpy(), expected), name
+    assert torch.equal(plain.pad, images.pad)
+
+
+def test_no_window_of_several_taps_is_mirrored(presses):
+    plain, images = (PressBatches(presses, (0.5, 0.5), 64, seed=7, mirror=mirror)(0) for mirror in (False, True))
+    assert torch.equal(plain.window, images.window)
+
+
+def test_windows_of_one_tap_come_from_presses_of_one(presses):
+    """Of 64 presses 16 have two taps: .25 of a batch is of the other 48, and all the rest has both."""
+    counts = presses.counts.copy()
+    counts[16:, 1] = 0
+    mixed = replace(presses, counts=counts)
+    batches = PressBatches(mixed, (0.25, 0.75), 16, seed=3, nuisances=QUIET)
+    for number in range(4):
+        older = batches(number).window[:, 3:].abs().amax(dim=(1, 2, 3)).numpy()
+        assert (older == 0).tolist() == [True] * 4 + [False] * 12
+    marks = [row.tobytes() for row in presses.traction_kpa[:, 0, 0].astype(np.float32)]
+    drawn = np.array([[marks.index(row.tobytes()) for row in batches(n).traction.numpy()[:, 0, 0]] for n in range(12)])
+    assert sorted(drawn[:, :4].ravel()) == list(range(16, 64)), "each once in an epoch"
+    assert drawn[:, 4:].max() < 16
 
 
 def test_absent_taps_are_zeros(presses):

@@ -34,13 +34,13 @@ GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}
 
 _KNOWN: Final = {"known": KNOWN}
 BUNDLED: Final = (
-    Training("stsr", "compact-stsr", Recipe(steps=20_000), options=_KNOWN),
+    Training("stsr", "compact-stsr", Recipe(steps=24_000, learning_rate=3e-3), options=_KNOWN),
     Training("stsr-small", "small-stsr", Recipe(steps=8000, learning_rate=3e-3), options=_KNOWN),
     Training(
-        "mtsr4", "compact-mtsr4", Recipe(steps=3000, learning_rate=1e-3, given=GIVEN[4]), start="stsr", options=_KNOWN
+        "mtsr4", "compact-mtsr4", Recipe(steps=3000, learning_rate=7e-4, given=GIVEN[4]), start="stsr", options=_KNOWN
     ),
     Training(
-        "mtsr2", "compact-mtsr2", Recipe(steps=1000, learning_rate=7e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
+        "mtsr2", "compact-mtsr2", Recipe(steps=1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
     ),
 )
 

@@ -148,13 +148,7 @@ def batches_of(
         return WindowBatches(data.at_scale(scale), draw or Draw(), recipe.given, recipe.batch, seed)
     if scale != SCALE:
         raise DatasetError(f"patterns at x{scale} asked for, presses have them at x{SCALE}: take 'train.generate'")
-    taps = len(recipe.given)
-    whole = np.zeros(len(data), dtype=np.bool_)
-    if data.taps >= taps:
-        whole[:] = data.counts[:, taps - 1].any(axis=(1, 2, 3))
-    if not whole.any():
-        raise DatasetError(f"no sequences of {taps} taps: make some with 'python -m train.data.make_presses --taps'")
-    return PressBatches(data.pick(whole), recipe.given, recipe.batch, seed)
+    return PressBatches(data, recipe.given, recipe.batch, seed)
 
 
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:

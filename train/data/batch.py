@@ -1,6 +1,6 @@
 """A batch to learn from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +21,22 @@ class Batch:
     pattern: Tensor
     pad: Tensor | None = None
     traction: Tensor | None = None
+
+    def mirrored(self, which: Tensor) -> "Batch":
+        """Return the same with the mirror images, left for right, of some windows of one tap, (n,) of bool."""
+
+        def flipped(maps: Tensor, vectors: bool) -> Tensor:
+            image = maps.flip(-1)
+            if vectors:
+                image[:, ::3] *= -1  # x points the other way
+            return torch.where(which.view(-1, *[1] * (maps.ndim - 1)), image, maps)
+
+        return replace(
+            self,
+            window=flipped(self.window, True),
+            pattern=flipped(self.pattern, False),
+            traction=None if self.traction is None else flipped(self.traction, True),
+        )
 
     def share(self, rank: int, world: int, device: torch.device) -> "Batch":
         """Return the part of one of several processes, on its device."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from train.batches import network_input
 from train.data.batch import Batch
 from train.data.presses import PressSet
+from train.errors import DatasetError
 from train.nuisances import Nuisances, read_windows
 from train.physics.pads import known_numbers
 
@@ -28,11 +29,16 @@ class PressBatches:
     """Batches of windows, what is known of their pads, and their truth.
 
     Args:
-        presses: to draw from.
+        presses: to draw from, some of them of all K taps; windows of one tap are drawn from those of fewer, if there
+            are any: these are many more.
         given: share of windows with 1, 2, ... K taps given, older ones dropped.
         batch: windows in a batch.
         seed: of everything that is drawn.
         nuisances: of the sensors.
+        mirror: give mirror images of half of the windows, where K is 1.
+
+    Raises:
+        DatasetError: there are no presses of K taps.
     """
 
     def __init__(
@@ -42,40 +48,52 @@ class PressBatches:
         batch: int,
         seed: int,
         nuisances: Nuisances | None = None,
+        *,
+        mirror: bool = True,
     ) -> None:
-        self._presses = presses.with_taps(len(given))
+        taps = len(given)
+        self._presses = presses.with_taps(taps)
+        whole = self._presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= taps)
+        if not whole.any():
+            raise DatasetError(
+                f"no sequences of {taps} taps: make some with 'python -m train.data.make_presses --taps'"
+            )
         self._given = given
-        self._batch = min(batch, len(presses))
-        self._seed = seed
+        batch = min(batch, len(presses))
+        single = 0 if whole.all() else round(given[0] * batch)
+        counts = ((np.flatnonzero(~whole), single), (np.flatnonzero(whole), batch - single))
+        self._parts = [_Part(rows, count, [seed, 0, number]) for number, (rows, count) in enumerate(counts) if count]
+        self._single = single
+        self._seed, self._mirror = seed, mirror
         self._nuisances = Nuisances(dead_taxels=0.02) if nuisances is None else nuisances
-        self._epoch = -1
-        self._order: NDArray[np.int64] = np.empty(0, dtype=np.int64)
 
     def __call__(self, number: int) -> Batch:
         """The batch of a number."""
         rng = np.random.default_rng([self._seed, 1, number])
-        index = self._index(number)
+        index = np.concatenate([part(number) for part in self._parts])
         picked = self._presses.pick(index)
-        gains_known = np.arange(len(index)) < round(_GAINS * len(index))  # the order is random already
-        readings = np.concatenate(
-            [
-                read_presses(picked.pick(part), nuisances, int(rng.integers(2**62)))
-                for part, nuisances in (
-                    (gains_known, replace(self._nuisances, gain_spread=_LEFT_GAIN)),
-                    (~gains_known, self._nuisances),
-                )
-                if part.any()
-            ]
-        )
+        gains_known = rng.permutation(len(index)) < round(_GAINS * len(index))
+        readings = np.empty_like(picked.counts)
+        for part, gain_spread in ((gains_known, _LEFT_GAIN), (~gains_known, self._nuisances.gain_spread)):
+            if part.any():
+                nuisances = replace(self._nuisances, gain_spread=gain_spread)
+                readings[part] = read_presses(picked.pick(part), nuisances, int(rng.integers(2**62)))
         taps = len(self._given)
-        there = rng.choice(np.arange(1, taps + 1), size=len(index), p=self._given)
+        there = np.ones(len(index), dtype=np.int64)
+        shares = np.array(self._given)
+        shares[0] *= not self._single
+        if self._single < len(index):
+            there[self._single :] += rng.choice(taps, size=len(index) - self._single, p=shares / shares.sum())
         readings *= (np.arange(taps) < there[:, None])[..., None, None, None]
-        return Batch(
+        batch = Batch(
             window=network_input(readings),
             pattern=torch.from_numpy(picked.patterns.astype(np.float32)),
             pad=torch.from_numpy(self._known(rng, picked.constants, gains_known)),
             traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
         )
+        if taps > 1 or not self._mirror:  # from tap to tap a mirrored pad is turned the other way
+            return batch
+        return batch.mirrored(torch.from_numpy(rng.random(len(index)) < 0.5))
 
     @staticmethod
     def _known(
@@ -87,13 +105,21 @@ class PressBatches:
         unsure = (_SURE * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
         return known_numbers(constants + unsure, known, gains_known)
 
-    def _index(self, number: int) -> NDArray[np.int64]:
-        """The sequences of a batch, (batch,): all of them once in each epoch, but for what does not fill a batch."""
-        epoch, part = divmod(number, len(self._presses) // self._batch)
+
+class _Part:
+    """What one part of every batch is drawn from: each row once in each epoch, but for what does not fill a batch."""
+
+    def __init__(self, rows: NDArray[np.int64], count: int, seed: list[int]) -> None:
+        self._rows, self._count, self._seed = rows, min(count, len(rows)), seed
+        self._epoch, self._order = -1, rows
+
+    def __call__(self, number: int) -> NDArray[np.int64]:
+        """Rows of the batch of a number, (count,)."""
+        epoch, place = divmod(number, len(self._rows) // self._count)
         if epoch != self._epoch:
-            self._order = np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._presses))
+            self._order = np.random.default_rng([*self._seed, epoch]).permutation(self._rows)
             self._epoch = epoch
-        return self._order[part * self._batch :][: self._batch]
+        return self._order[place * self._count :][: self._count]
 
 
 def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[np.float32]:

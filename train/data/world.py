@@ -79,7 +79,12 @@ class World:
     def facts(self) -> dict[str, Any]:
         """The configuration as JSON gives it back, with the ranges that pads are drawn from and the meshes' hashes."""
         ranges = {name: list(bounds) for name, bounds in RANGES.items()}
-        facts = asdict(self) | {"families": dict(self.families), "ranges": ranges, "inputs": list(INPUTS), "version": VERSION}
+        facts = asdict(self) | {
+            "families": dict(self.families),
+            "ranges": ranges,
+            "inputs": list(INPUTS),
+            "version": VERSION,
+        }
         meshes = {name: mesh_sha256(name) for name in self.families if name.startswith("mesh:")}
         return facts | ({"meshes": meshes} if meshes else {})
 

@@ -3,7 +3,7 @@
 Against the seed's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force from
 the newest one, and leaves out the work at full resolution and batch normalisation, which cost 8 dB after
 1000 steps here (docs/log.md). It adds the uncertainty of each pixel, the traction on the pad, and what is known of the
-pad as an input; and it is exactly symmetric under quarter turns, of one tap under mirror images as well.
+pad as an input; and it is exactly symmetric under quarter turns.
 """
 
 from math import expm1, log, sqrt
@@ -60,8 +60,8 @@ class CompactNet(PatternNet):
         channels: of the trunk, a multiple of the symmetries.
         blocks: residual blocks of the trunk.
         known: numbers that say what is known of the pad, see train.physics.pads.
-        group: symmetries; None takes quarter turns and mirror images of one tap, of several quarter turns alone, since
-            a mirrored pad is turned the other way from tap to tap.
+        group: symmetries. Mirror images are those of one tap alone: a mirrored pad is turned the other way from tap to
+            tap. At the same work quarter turns leave twice the free numbers, and training mirrors windows instead.
 
     Attributes:
         deviation_scale: factor on the deviation, found after training by `train.calibration.calibrate`.
@@ -73,7 +73,7 @@ class CompactNet(PatternNet):
     deviation_scale: Tensor
 
     def __init__(
-        self, taps: int, scale: int, channels: int = 64, blocks: int = 6, known: int = 0, group: Group | None = None
+        self, taps: int, scale: int, channels: int = 64, blocks: int = 6, known: int = 0, group: Group = "p4"
     ) -> None:
         super().__init__()
         if taps < 1:
@@ -81,7 +81,7 @@ class CompactNet(PatternNet):
         if scale < 2 or scale % 2:
             raise ValueError(f"scale is {scale}, expected an even number: the trunk works at twice the taxel grid")
         self.taps, self.scale, self.known = taps, scale, known
-        self.group: Group = ("p4m" if taps == 1 else "p4") if group is None else group
+        self.group: Group = group
         self._width = (channels, blocks)
         grow = scale // 2
         wide, narrow = fields(self.group, channels), fields(self.group, channels // 2)
@@ -165,8 +165,8 @@ class CompactNet(PatternNet):
     def take_over(self, start: "CompactNet") -> None:
         """Become the same function of the newest taps as another network, further taps ignored until trained.
 
-        A network of several taps has fewer symmetries than one of one tap, and keeps all that one of one tap computes;
-        the other way round what is not symmetric is lost. At another scale the layers that make pixels start afresh.
+        From fewer symmetries to more, what is not symmetric is lost. At another scale the layers that make pixels start
+        afresh.
 
         Raises:
             ValueError: another width, or another number of inputs for the pad.

@@ -18,8 +18,8 @@ _UNEVEN_WAVES: Final = 8
 _TILT_RAD: Final = 0.05
 """Standard deviation of a magnet's lean: three degrees of a part of a millimetre set by a machine."""
 _SEAT_MM: Final = 0.02
-"""Standard deviation of one magnet's height about the pad's: with its moment it makes a gain of .04, and with the chips'
-gains of .075 the 15 % either way that is seen on devices; .05 mm would make a tenth by itself."""
+"""Standard deviation of one magnet's height about the pad's: with its moment it makes a gain of .04, and with the
+chips' of .075 the 15 % either way that is seen on devices; .05 mm would make a tenth by itself."""
 _MOMENT: Final = 0.015
 """Standard deviation of one magnet's moment, of one batch."""
 
