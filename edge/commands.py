@@ -7,8 +7,7 @@ import json
 import os
 import select
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
@@ -141,27 +140,10 @@ class AllCommands:
         return [command for place in self._places for command in place.poll()]
 
 
-@contextmanager
-def user_commands() -> Iterator[Commands]:
-    """Commands from lines on stdin, or from keys where it is a terminal, and from SIGUSR1."""
-    from edge.keys import terminal_keys
-    from edge.signals import zero_on_signal
-
-    with ExitStack() as closing:
-        places: list[Commands] = [closing.enter_context(zero_on_signal())]
-        lines = stdin_commands()
-        if lines is not None:
-            places.append(lines)
-        keys = closing.enter_context(terminal_keys())
-        if keys is not None:
-            places.append(keys)
-        yield AllCommands(places)
-
-
 def stdin_commands() -> LineCommands | None:
     """Commands from stdin; None where there is none, or where it is a terminal.
 
-    A terminal has keys (`edge.keys`). Elsewhere than on POSIX a pipe cannot be asked whether it has something.
+    A terminal has keys. Elsewhere than on POSIX a pipe cannot be asked whether it has something.
     """
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
         return None

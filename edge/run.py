@@ -34,9 +34,9 @@ from edge.api import (
     open_sink,
     pump,
 )
-from edge.commands import user_commands
 from edge.signals import stop_on_signals
 from edge.sinks.messages import MessageSink
+from edge.user_commands import user_commands
 
 if TYPE_CHECKING:
     from edge.demo import DemoScore

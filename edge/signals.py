@@ -1,11 +1,10 @@
-"""Signals: Ctrl-C and its like as an event, so that a run ends after the scans in hand; SIGUSR1 as a command."""
+"""Ctrl-C and its like as an event, so that a run ends after the scans in hand."""
 
 import contextlib
 import signal
 import threading
 from collections.abc import Iterator
 
-from edge.commands import ZERO, Command
 from edge.ending import ended_in_time
 
 
@@ -26,41 +25,3 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-class SignalCommands:
-    """Commands that signals stand for.
-
-    Attributes:
-        refused: always 0.
-    """
-
-    def __init__(self) -> None:
-        self.refused = 0
-        self._asked = False
-
-    def ask(self, number: int, frame: object) -> None:
-        """The handler: zero all sensors again."""
-        self._asked = True
-
-    def poll(self) -> list[Command]:
-        """What was asked for since the last call; asked twice meanwhile is asked once."""
-        if not self._asked:
-            return []
-        self._asked = False
-        return [ZERO]
-
-
-@contextlib.contextmanager
-def zero_on_signal() -> Iterator[SignalCommands]:
-    """SIGUSR1, where there is one, asks for zeroing again; as any request it is refused in contact."""
-    commands = SignalCommands()
-    number = getattr(signal, "SIGUSR1", None)
-    if number is None:
-        yield commands
-        return
-    before = signal.signal(number, commands.ask)
-    try:
-        yield commands
-    finally:
-        signal.signal(number, before)

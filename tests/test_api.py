@@ -39,7 +39,7 @@ from firmware_bridge.links.base import Notice
 FRONT = {
     *("edge.api", "edge.run"),
     *("edge.arguments", "edge.options", "edge.doctor.options", "edge.bench.options"),  # what may be asked
-    *("edge.commands", "edge.signals", "edge.streams", "edge.realtime"),  # keys, lines, signals, ...: of a process
+    *("edge.user_commands", "edge.signals", "edge.streams", "edge.realtime"),  # keys, lines, signals, ...: of a process
     *("edge.sinks.messages", "edge.devices", "edge.demo", "edge.draw"),  # what a person reads
     *("edge.view.live", "edge.recordings"),  # the page, and what is told of a recording
     *("edge.doctor.command", "edge.bench.command"),  # commands of their own

@@ -1,11 +1,11 @@
 import os
 import signal
+import sys
 
 import pytest
 
-from edge import commands
-from edge.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands, user_commands
-from edge.signals import zero_on_signal
+from edge.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands
+from edge.user_commands import user_commands, zero_on_signal
 
 
 @pytest.fixture
@@ -75,17 +75,17 @@ def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
 def test_a_terminal_and_a_missing_stdin_are_left_alone(monkeypatch):
     leader, follower = os.openpty()
     with os.fdopen(follower) as terminal:
-        monkeypatch.setattr(commands.sys, "stdin", terminal)
+        monkeypatch.setattr(sys, "stdin", terminal)
         assert stdin_commands() is None
     assert stdin_commands() is None  # closed
-    monkeypatch.setattr(commands.sys, "stdin", None)
+    monkeypatch.setattr(sys, "stdin", None)
     assert stdin_commands() is None
     os.close(leader)
 
 
 def test_a_pipe_is_listened_to(monkeypatch, pipe):
     with os.fdopen(os.dup(pipe[0])) as stdin:
-        monkeypatch.setattr(commands.sys, "stdin", stdin)
+        monkeypatch.setattr(sys, "stdin", stdin)
         lines = stdin_commands()
         assert lines is not None
         os.write(pipe[1], b'{"cmd": "reset"}\n')
@@ -148,7 +148,7 @@ def test_a_signal_asks_once_for_zeroing_and_is_let_go_afterwards():
 
 def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
     with os.fdopen(os.dup(pipe[0])) as stdin:
-        monkeypatch.setattr(commands.sys, "stdin", stdin)
+        monkeypatch.setattr(sys, "stdin", stdin)
         runtime = Told()
         with user_commands() as everything:
             os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')
