@@ -115,7 +115,7 @@ def _follow(options: argparse.Namespace, statistics: Statistics | None = None) -
 
 def _record(arguments: Sequence[str]) -> int:
     options = understood(record_parser(), arguments)
-    from edge.recordings import new_recording
+    from edge.new_recording import new_recording
 
     with new_recording(options) as statistics:
         _follow(options, statistics)

@@ -11,6 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edge.contact_patch import touched
+
 _K1: Final = 0.01
 _K2: Final = 0.03
 _WINDOW_SIGMA_PX: Final = 1.5
@@ -144,12 +146,6 @@ def interval_coverage(pattern: ArrayLike, truth: ArrayLike, half_width: ArrayLik
     return np.mean(errors <= half_width, axis=(-2, -1))
 
 
-def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
-    """Pixels that reach `level` of the pattern's maximum, (..., H, W) bool; none where it is not above zero."""
-    peak = pattern.max(axis=(-2, -1), keepdims=True)
-    return (pattern >= level * peak) & (peak > 0)
-
-
 def _pair(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     a, b = np.asarray(pattern, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if a.shape != b.shape or a.ndim < 2:
@@ -179,28 +175,3 @@ def _blur(maps: NDArray[np.float64]) -> NDArray[np.float64]:
     windows = np.lib.stride_tricks.sliding_window_view
     rows = windows(maps, weights.size, axis=-2) @ weights
     return windows(rows, weights.size, axis=-1) @ weights
-
-
-def touched_patch(
-    pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
-) -> tuple[float, tuple[float, float] | None]:
-    """Area and centroid of the touched pixels.
-
-    Args:
-        pattern: (H, W).
-        touching: (H, W), which pixels are touched; their pattern is above zero.
-        pixel_pitch_mm: distance of neighbouring pixels, in [mm].
-
-    Returns:
-        Area in [mm2]; pattern-weighted centroid x, y in [mm] from the pattern's centre, x to the
-        right and y down, or None where nothing is touched.
-    """
-    rows, cols = np.nonzero(touching)
-    if rows.size == 0:
-        return 0.0, None
-    weights = pattern[rows, cols].astype(np.float64)
-    weights /= weights.sum()
-    height, width = pattern.shape
-    x_mm = (float(weights @ cols) - (width - 1) / 2) * pixel_pitch_mm
-    y_mm = (float(weights @ rows) - (height - 1) / 2) * pixel_pitch_mm
-    return rows.size * pixel_pitch_mm**2, (x_mm, y_mm)

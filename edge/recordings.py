@@ -1,20 +1,12 @@
-"""What `edge-sr record` and `edge-sr replay` add to a run: the file, and what a recording knows of its sensors."""
+"""A recording as a source, with what it knows of its sensors."""
 
-import argparse
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 from edge.commissioned import settled, with_recorded
-from edge.errors import SinkError, UsageError
 from edge.progress import Progress
-from edge.sinks.forms import check_apart
 from edge.source import Source
-from edge.statistics import Statistics
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.links.replay import ReplayLink
@@ -23,45 +15,6 @@ from firmware_bridge.mounting import Mounting
 from firmware_bridge.recording import Recording, npz_baselines
 from firmware_bridge.scan import Scan
 from firmware_bridge.sensor_file import SensorEntry
-
-_NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
-"""Whose name says what is in them, which a recording is not."""
-_RECORDS: Final = "records in JSON are edge-sr --sink jsonl:FILE"
-
-
-@contextmanager
-def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
-    """Have a run recorded, and tell at its end, however it came, what there is.
-
-    Args:
-        options: of edge.options.record_parser; a sink is added.
-
-    Raises:
-        UsageError: a file of another kind is asked for, or a sink writes into it as well.
-        SinkError: the file exists.
-    """
-    path = Path(options.file)
-    if path.is_dir():
-        raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
-    if path.suffix.lower() in _NOT_WRITTEN:
-        raise UsageError(f"no {path.suffix} is recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
-    if path.suffix not in (".mcap", ".npz"):
-        path = path.with_name(path.name + ".mcap")
-    if path.exists():  # before anything is begun
-        raise SinkError(f"{path} exists: give another name, or delete it first")
-    options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
-    check_apart(options.sink)
-    statistics = Statistics()
-    try:
-        yield statistics
-    finally:
-        if path.exists():
-            size_mb = path.stat().st_size / 1e6
-            emulated = ", EMULATED" if statistics.source == "emulated" else ""
-            sure = sys.exception() is None and not statistics.unwritten  # else a sink has told what it does not hold
-            held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
-            with suppress(OSError):  # the terminal may have gone
-                sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
 
 
 def open_recording(

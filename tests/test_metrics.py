@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from edge.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global, touched
+from edge.contact_patch import touched
+from edge.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global
 
 
 def maps(seed, shape=(40, 40)):

@@ -6,8 +6,8 @@ from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan, ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.contact_patch import touched, touched_patch
 from edge.errors import ModelError, UsageError, WindowError
-from edge.metrics import touched, touched_patch
 from edge.result import mask_bits
 from edge.runtime import Runtime
 from edge.session import ModelSession

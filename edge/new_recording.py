@@ -1,0 +1,51 @@
+"""The file that `edge-sr record` adds to a run."""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from edge.errors import SinkError, UsageError
+from edge.sinks.forms import check_apart
+from edge.statistics import Statistics
+
+_NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
+"""Whose name says what is in them, which a recording is not."""
+_RECORDS: Final = "records in JSON are edge-sr --sink jsonl:FILE"
+
+
+@contextmanager
+def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
+    """Have a run recorded, and tell at its end, however it came, what there is.
+
+    Args:
+        options: of edge.options.record_parser; a sink is added.
+
+    Raises:
+        UsageError: a file of another kind is asked for, or a sink writes into it as well.
+        SinkError: the file exists.
+    """
+    path = Path(options.file)
+    if path.is_dir():
+        raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
+    if path.suffix.lower() in _NOT_WRITTEN:
+        raise UsageError(f"no {path.suffix} is recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
+    if path.suffix not in (".mcap", ".npz"):
+        path = path.with_name(path.name + ".mcap")
+    if path.exists():  # before anything is begun
+        raise SinkError(f"{path} exists: give another name, or delete it first")
+    options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
+    check_apart(options.sink)
+    statistics = Statistics()
+    try:
+        yield statistics
+    finally:
+        if path.exists():
+            size_mb = path.stat().st_size / 1e6
+            emulated = ", EMULATED" if statistics.source == "emulated" else ""
+            sure = sys.exception() is None and not statistics.unwritten  # else a sink has told what it does not hold
+            held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
+            with suppress(OSError):  # the terminal may have gone
+                sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
