@@ -5,8 +5,8 @@ import itertools
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
@@ -16,24 +16,19 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.npz import read_npz
-from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, VendorReading, is_sensor_name
+from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 
 if TYPE_CHECKING:
     from firmware_bridge.baseline import Baseline
-    from firmware_bridge.mounting import Mounting
 
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
-MOUNTING_METADATA: Final = "mounting"
-"""Of an MCAP file: one a sensor."""
-SOURCE_METADATA: Final = "source"
-"""The same: what kind of source it was."""
 _NPZ_REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
 _NPZ_ORIGINS: Final = ("origin", "source")
 """The latter of files that were written before there was the former."""
 _NPZ_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
-HIGHEST_COUNT: Final = 0xFFFF
 
 MOST_CSV_BYTES: Final = 1 << 30
 """Some eight hours of one sensor at 100 Hz."""
@@ -41,74 +36,14 @@ LONGEST_CSV_LINE_BYTES: Final = 1 << 14
 """Fifty times a row of counts."""
 MOST_NPZ_BYTES: Final = 1 << 31
 """Of the arrays that are read: a day of one sensor at 100 Hz."""
-MOST_SENSORS: Final = 64
-"""On one wire there can be sixteen."""
 RATES_HZ: Final = (1e-3, 1e5)
 """Beyond them periods in ns overflow, or are none."""
-LAST_TIME_NS: Final = 1 << 60
-"""36 years: sums of two times stay below 2^63."""
 
 CSV_HEADER: Final = tuple(f"txl{taxel}_{axis}" for taxel in range(1, USPA44.taxel_count + 1) for axis in AXES)
 _META_NAME: Final = "meta_data.csv"
 _META_RATE: Final = "frequency_hz"
 _A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 _WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
-
-
-@dataclass(frozen=True, slots=True)
-class Track:
-    """The scans of one sensor in a recording.
-
-    Attributes:
-        sensor: name of the sensor.
-        counts: (n, 3, rows, cols) int32, ABSENT where a taxel gave no reading.
-        time_ns: (n,) int64 monotonic time of each scan in [ns], never falling; None if not recorded.
-        numbers: (n,) int64, as the scans were numbered; None if not recorded, as what follows.
-        device_time_ns: (n,) int64, on the same clock as `time_ns`; -1 where the device gave none.
-        renewed: (n, rows, cols) bool, which readings were new.
-        vendor: (n,) of what the vendor's software said.
-    """
-
-    sensor: str
-    counts: NDArray[np.int32]
-    time_ns: NDArray[np.int64] | None
-    numbers: NDArray[np.int64] | None = None
-    device_time_ns: NDArray[np.int64] | None = None
-    renewed: NDArray[np.bool_] | None = None
-    vendor: tuple[VendorReading | None, ...] | None = None
-
-    @property
-    def mean_rate_hz(self) -> float | None:
-        """Scans a second by the recorded times, or None."""
-        if self.time_ns is None or self.time_ns[-1] <= self.time_ns[0]:
-            return None
-        return (len(self.time_ns) - 1) * NS_PER_S / float(self.time_ns[-1] - self.time_ns[0])
-
-
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """One file's tracks, at least one, each with at least one scan.
-
-    Attributes:
-        path: of the file.
-        tracks: one per sensor, in the order in which they first occur.
-        rate_hz: scans a second of each sensor; None if the file does not say.
-        baselines: what was subtracted from the first scan of each sensor; without those that were not zeroed yet.
-        mountings: of the sensors, by name. The taxels are in place; what is to be done still is to turn the axes.
-        unix_offset_ns: added to `time_ns` gives [ns] since 1970; None if the file does not say.
-        notes: what whoever plays it should know.
-        origin: "device" or "emulated", what its scans come from, however often they were played and recorded again;
-            None if the file does not say.
-    """
-
-    path: Path
-    tracks: tuple[Track, ...]
-    rate_hz: float | None
-    baselines: "Mapping[str, Baseline]" = field(default_factory=dict)
-    mountings: "Mapping[str, Mounting]" = field(default_factory=dict)
-    unix_offset_ns: int | None = None
-    notes: tuple[str, ...] = ()
-    origin: Literal["device", "emulated"] | None = None
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -129,14 +64,6 @@ def load_recording(path: str | Path) -> Recording:
     if recording.origin != "emulated":
         return recording
     return replace(recording, notes=(*recording.notes, f"{path} was recorded from an emulated sensor"))
-
-
-def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:
-    """What scans come from whose file names these kinds of sources."""
-    found = set(kinds)
-    if "emulated" in found:
-        return "emulated"
-    return "device" if found == {"device"} else None
 
 
 def _load_csv(path: Path) -> Recording:

@@ -16,8 +16,8 @@ from firmware_bridge.controller import FRAME_S, SlcanAdapter, bus_timeline, cont
 from firmware_bridge.faults.injector import Injector
 from firmware_bridge.faults.lines import Piece
 from firmware_bridge.pseudo_port import COUNTED_LATE_NS, PseudoPort
-from firmware_bridge.recording import Recording
 from firmware_bridge.slcan import CanFrame
+from firmware_bridge.tracks import Recording
 from firmware_bridge.xela import USPA44_MAP
 
 _STOP_POLL_S: Final = 0.05

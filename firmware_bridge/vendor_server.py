@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.recording import Recording, Track
 from firmware_bridge.scan import ABSENT
+from firmware_bridge.tracks import Recording, Track
 from firmware_bridge.xela_server import PRETENDED_VERSION, WELCOME
 
 VERSIONS: Final = ("1.7.6", "1.7.7", "1.8.0")

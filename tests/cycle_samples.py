@@ -13,10 +13,10 @@ import numpy as np
 from firmware_bridge import gs_usb
 from firmware_bridge.controller import FRAME_S, Controller, bus_timeline
 from firmware_bridge.gs_usb_scans import GsUsbScans
-from firmware_bridge.recording import Recording, Track
 from firmware_bridge.scan import Scan
 from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
+from firmware_bridge.tracks import Recording, Track
 from firmware_bridge.xela import USPA44_MAP, ModelMap
 
 LINE_BYTES: Final = 4095

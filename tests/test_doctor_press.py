@@ -15,8 +15,8 @@ from edge.doctor.verdicts import judge_press
 from firmware_bridge.baseline import deformation
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.mounting import Mounting
-from firmware_bridge.recording import Recording, Track
 from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.tracks import Recording, Track
 
 AXES = [(swap, (x, y, z)) for swap, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1))]
 UPRIGHT = list(range(16))
