@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.bundle import demo_recording, find_model
-from edge.draw import colours
 from edge.metrics import psnr_db
 from edge.session import ModelSession
+from edge.terminal.heatmap import colours
 
 SIDE_PX: Final = 180
 SMALL_PX: Final = 80

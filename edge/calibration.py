@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.progress import Progress
 from edge.runtime import Model
+from edge.terminal.progress_bar import Progress
 from firmware_bridge.schedule import Clock, Ticker
 
 ROUNDS: Final = 3

@@ -28,7 +28,6 @@ from edge.api import (
     take_baselines,
     unfinished_load,
 )
-from edge.arguments import EXIT_USAGE
 from edge.options import (
     baseline_parser,
     devices_parser,
@@ -39,6 +38,7 @@ from edge.options import (
     understood,
 )
 from edge.streams import guarded_streams, open_closed_streams
+from edge.terminal.argument_types import EXIT_USAGE
 
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
@@ -162,7 +162,7 @@ def _models(arguments: Sequence[str]) -> int:
 
 def _baseline(arguments: Sequence[str]) -> int:
     options = baseline_parser().parse_args(arguments)
-    from edge.signals import stop_on_signals
+    from edge.terminal.stop_signals import stop_on_signals
 
     with stop_on_signals() as stop, _open_source(options, give_up_s=0) as source:
         baselines = take_baselines(source, scans=options.scans, skip=options.skip, stop=stop)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.contract import Contract
-from edge.draw import Palette, Panel, draw
 from edge.metrics import psnr_db, rmse_percent, ssim
 from edge.result import Result
 from edge.sinks.base import Sink
+from edge.terminal.heatmap import Palette, Panel, draw
 from firmware_bridge.baseline import deformation
 
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from typing import TextIO
 
-from edge.wrapping import columns, wrapped
+from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.devices import Found, devices
 

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any, Final
 
 from edge.commands import RESET, ZERO, Command
-from edge.ending import before_force
+from edge.terminal.forced_end import before_force
 
 KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
 READ_BYTES: Final = 64

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from edge.commissioned import settled, with_recorded
-from edge.progress import Progress
 from edge.source import Source
+from edge.terminal.progress_bar import Progress
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.links.replay import ReplayLink

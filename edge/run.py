@@ -34,8 +34,8 @@ from edge.api import (
     open_sink,
     pump,
 )
-from edge.signals import stop_on_signals
 from edge.sinks.messages import MessageSink
+from edge.terminal.stop_signals import stop_on_signals
 from edge.user_commands import user_commands
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
 
 def _print_score(score: "DemoScore", stream: TextIO) -> None:
     from edge.demo import score_picture, score_table
-    from edge.draw import choose_palette
+    from edge.terminal.heatmap import choose_palette
 
     scores = score.scores()
     if not scores:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Final
 
 from edge.asked import check_whole
-from edge.progress import Progress
 from edge.source import Arrival, Source
+from edge.terminal.progress_bar import Progress
 from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
 

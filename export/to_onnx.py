@@ -20,7 +20,7 @@ from edge.bundle import BUNDLE_DIR, INT8_SUFFIX
 from edge.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.errors import EdgeError
 from edge.frozen import FrozenSet, load_frozen_set
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.fine_tune import FineTuning, quantised_well
 from export.graph import known_width, outputs, to_model

@@ -26,7 +26,7 @@ from edge.contract import Contract
 from edge.errors import EdgeError, ModelError
 from edge.frozen import FrozenSet, load_frozen_set
 from edge.metrics import psnr_db
-from edge.progress import Progress
+from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
 from export.graph import outputs
 from export.parity import LEVELS, TOLERANCE, Difference, GraphRun, differences, extreme_windows, read_windows

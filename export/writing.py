@@ -11,8 +11,8 @@ import onnx
 from edge.contract import ANY_BATCH, Contract
 from edge.frozen import FrozenSet
 from edge.judge import judge_model, mean_error
-from edge.progress import tracked
 from edge.session import ModelSession, load_session
+from edge.terminal.progress_bar import tracked
 from export.reference import origin
 from firmware_bridge.in_place import write_in_place
 from train.confidence import fit_confidence

@@ -140,7 +140,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     from fuzz_targets import TARGETS
 
-    from edge.progress import Progress
+    from edge.terminal.progress_bar import Progress
 
     chosen = [TARGETS[name] for name in options.parsers or TARGETS]
     if options.replay is not None:

@@ -38,9 +38,14 @@ from firmware_bridge.links.base import Notice
 
 FRONT = {
     *("edge.api", "edge.run"),
-    *("edge.arguments", "edge.options", "edge.doctor.options", "edge.bench.options"),  # what may be asked
-    *("edge.user_commands", "edge.signals", "edge.streams", "edge.realtime"),  # keys, lines, signals, ...: of a process
-    *("edge.sinks.messages", "edge.devices", "edge.demo", "edge.draw"),  # what a person reads
+    *("edge.terminal.argument_types", "edge.options", "edge.doctor.options", "edge.bench.options"),  # what may be asked
+    *(
+        "edge.user_commands",
+        "edge.terminal.stop_signals",
+        "edge.streams",
+        "edge.realtime",
+    ),  # keys, lines, signals, ...: of a process
+    *("edge.sinks.messages", "edge.devices", "edge.demo", "edge.terminal.heatmap"),  # what a person reads
     *("edge.view.live", "edge.recordings", "edge.new_recording"),  # the page, and what is told of a recording
     *("edge.doctor.command", "edge.bench.command"),  # commands of their own
 }

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from edge.draw import HALF_BLOCK, SHADES, STOPS, Panel, choose_palette, draw, resample
+from edge.terminal.heatmap import HALF_BLOCK, SHADES, STOPS, Panel, choose_palette, draw, resample
 
 ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
 PALETTES = ["truecolor", "256", "plain"]

@@ -19,8 +19,8 @@ from view_samples import HANDSHAKE, LONG_PING, Swallowing, wait_for
 from websockets.sync.client import connect
 
 from edge import cli
-from edge.ending import EXIT_FORCED
 from edge.packed import unpack
+from edge.terminal.forced_end import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
 LONG_S = 12.0
@@ -47,7 +47,7 @@ SIGNALS = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 ENDLESS = """
 import onnxruntime, numpy as np, sys
 from onnx import TensorProto as Type, helper
-from edge.signals import stop_on_signals
+from edge.terminal.stop_signals import stop_on_signals
 from edge.keys import terminal_keys
 
 def value(name, kind, shape):
@@ -70,8 +70,8 @@ with stop_on_signals(), terminal_keys():
 """
 FINISHING = """
 import os, pathlib, signal, sys, time
-from edge import ending
-from edge.signals import stop_on_signals
+from edge.terminal import forced_end as ending
+from edge.terminal.stop_signals import stop_on_signals
 path, grows = pathlib.Path(sys.argv[1]), sys.argv[2] == "grows"
 ending.END_S, ending.STALLED_S = 0.3, 0.6
 with stop_on_signals() as stop:
@@ -216,7 +216,7 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback(monkeypatch, capsys):
 
 
 def test_nothing_is_left_of_the_watch_where_it_ends_in_time():
-    from edge.signals import stop_on_signals
+    from edge.terminal.stop_signals import stop_on_signals
 
     with stop_on_signals() as stop:
         assert any(thread.name == "ending" for thread in threading.enumerate())

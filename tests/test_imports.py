@@ -45,7 +45,7 @@ UNUSED_IN_A_REPLAY = {
     "tqdm",
     "edge.bench",
     "edge.demo",
-    "edge.draw",
+    "edge.terminal.heatmap",
     "edge.realtime",
     "firmware_bridge.emulator",
     "firmware_bridge.slcan_emulator",

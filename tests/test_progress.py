@@ -21,8 +21,8 @@ from edge_samples import ROOT, make_contract, write_model
 
 from edge import cli, recordings
 from edge.bench import view
-from edge.progress import SECONDS, Progress, tracked
 from edge.sinks import status
+from edge.terminal.progress_bar import SECONDS, Progress, tracked
 from train import confidence
 
 CLEARED = re.compile(r"\r *\r$")
@@ -214,7 +214,8 @@ def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeyp
 
 AT_ONCE = """
 import sys
-from edge import cli, progress
+from edge import cli
+from edge.terminal import progress_bar as progress
 progress.Progress.__init__.__kwdefaults__["delay_s"] = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """

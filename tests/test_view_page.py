@@ -25,9 +25,9 @@ from websockets.sync.client import connect
 
 from edge import view as edge_view
 from edge.bundle import demo_recording
-from edge.draw import colours
 from edge.packed import unpack
-from edge.progress import Progress
+from edge.terminal.heatmap import colours
+from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
 from edge.wrench import Wrench
 from firmware_bridge.baseline import BaselineEstimator, save_baselines

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from edge.confidence import doubt
 from edge.frozen import FrozenSet
-from edge.progress import tracked
 from edge.runtime import Model
+from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences
 from train.freeze import SEED, freeze
 from train.nuisances import Nuisances

@@ -31,7 +31,7 @@ from typing import Final, cast
 
 import joblib
 
-from edge.progress import Progress
+from edge.terminal.progress_bar import Progress
 from train.dataset import Sequences, join, load_sequences
 from train.errors import DatasetError, TrainError
 from train.generation import FORCE_N, Generation, one_thread, random_figures, solve_chunk

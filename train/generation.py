@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, join
 from train.depth import SAMPLES
 from train.errors import DatasetError, TrainError

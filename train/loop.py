@@ -26,7 +26,7 @@ from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
-from edge.progress import Progress
+from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
 from train.ahead import drawn_ahead
 from train.data.batch import Batch

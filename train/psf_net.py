@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.tpsf import Kernel, Plateau, tpsf
 

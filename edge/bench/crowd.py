@@ -19,10 +19,10 @@ from typing import Final
 
 import numpy as np
 
-from edge.arguments import whole
 from edge.bench.program import Play, Program, edge_sr
 from edge.bench.tables import head, line
 from edge.bench.view import free_port
+from edge.terminal.argument_types import whole
 
 WARM_UP_S: Final = 20.0
 SETTLE_S: Final = 12.0

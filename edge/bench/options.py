@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from edge.arguments import Parser, positive, whole
+from edge.terminal.argument_types import Parser, positive, whole
 
 BENCH_HELP: Final = """\
 Run time is taken back to back, and one

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sized
 from typing import Final, TextIO, TypeVar
 
-from edge.progress import Progress
+from edge.terminal.progress_bar import Progress
 
 _CLEAR_LINE: Final = "\r\x1b[K"
 _Thing = TypeVar("_Thing")

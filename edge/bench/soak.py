@@ -20,7 +20,7 @@ import numpy as np
 
 from edge.bench.errors import BenchError
 from edge.bench.program import Play, Program, edge_sr
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 
 WARM_UP_S: Final = 6.0
 """Both phases, so that everything has been used once."""

@@ -22,10 +22,10 @@ from typing import Final
 
 import numpy as np
 
-from edge.arguments import positive, whole
 from edge.bench.intervals import ratio_of
 from edge.bench.program import Line, Play, Program, edge_sr
-from edge.progress import Progress
+from edge.terminal.argument_types import positive, whole
+from edge.terminal.progress_bar import Progress
 
 WARM_UP_S: Final = 2.0
 SETTLE_S: Final = 1.0

@@ -24,7 +24,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.arguments import positive, whole
 from edge.bench.errors import BenchError
 from edge.bench.machine import this_machine
 from edge.bench.page import Page
@@ -41,6 +40,7 @@ from edge.session import ModelSession
 from edge.sinks.zenoh import ZenohSink
 from edge.source import Source
 from edge.stream import Stream
+from edge.terminal.argument_types import positive, whole
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import Link

@@ -12,8 +12,8 @@ from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.keep import check_writable, keep
 from edge.doctor.visit import Visit
 from edge.doctor.watch import Watch
-from edge.signals import stop_on_signals
-from edge.wrapping import columns, wrapped
+from edge.terminal.stop_signals import stop_on_signals
+from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import LinkLostError, SensorFileError
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.sensor_file import SensorFile

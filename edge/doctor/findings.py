@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from edge.wrapping import wrapped
+from edge.terminal.text_wrap import wrapped
 
 Verdict = Literal["ok", "look", "wrong", "not known"]
 

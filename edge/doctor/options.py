@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from edge.arguments import Parser, add_source, positive
+from edge.terminal.argument_types import Parser, add_source, positive
 
 DOCTOR_HELP: Final = """\
 Keep the pad free and still until you

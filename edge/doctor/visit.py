@@ -11,8 +11,8 @@ from edge.doctor.findings import Finding
 from edge.doctor.press import GuidedPress
 from edge.doctor.verdicts import judge_press
 from edge.doctor.watch import READ_TIMEOUT_S, SILENCE_S, Watch
-from edge.progress import SECONDS, Progress
-from edge.wrapping import columns, wrapped
+from edge.terminal.progress_bar import SECONDS, Progress
+from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.baseline import deformation
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.schedule import NS_PER_S

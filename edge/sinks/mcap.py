@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 from edge.contract import Contract
-from edge.ending import finishing
 from edge.errors import SinkError
 from edge.event import Event
 from edge.mcap_file import McapFile
@@ -28,6 +27,7 @@ from edge.ros_messages import (
 )
 from edge.ros_names import sensor_path
 from edge.sinks.base import Sink
+from edge.terminal.forced_end import finishing
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.cdr import MessageType
 from firmware_bridge.geometry import USPA44

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import ArrayLike
 
-from edge.ending import finishing
 from edge.errors import SinkError
-from edge.progress import Progress
 from edge.result import Result
 from edge.sinks.base import Sink
+from edge.terminal.forced_end import finishing
+from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.errors import EdgeError
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.stability import pareto
 from export.stability.case import Case

@@ -19,7 +19,7 @@ from typing import Final, cast
 
 import joblib
 
-from edge.progress import Progress
+from edge.terminal.progress_bar import Progress
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError

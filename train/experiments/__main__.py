@@ -11,7 +11,7 @@ from typing import Final
 
 from edge.bundle import BUNDLE_DIR
 from edge.errors import EdgeError
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.errors import TrainError
 from train.experiments.workbench import Workbench
 

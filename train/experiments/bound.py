@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import AXES
 from train.experiments.report import Report, Row, with_interval
 from train.experiments.trainings import compact, mixed, trained

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.calibration import LEVEL
 from train.experiments.band_limit import WAVELENGTHS_MM, edge_distance_mm, gratings, kept_back, let_through

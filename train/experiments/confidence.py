@@ -16,9 +16,9 @@ from edge.bundle import bundled_models
 from edge.confidence import WORTH_A_TAP, expect_of
 from edge.contract import Contract
 from edge.frozen import FrozenSet
-from edge.progress import tracked
 from edge.runtime import Model
 from edge.session import ModelSession
+from edge.terminal.progress_bar import tracked
 from train.confidence import doubts_and_errors
 from train.errors import TrainError
 from train.experiments.report import Report, Row, with_interval

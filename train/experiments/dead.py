@@ -23,10 +23,10 @@ from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import FrozenSet, load_frozen_set
 from edge.judge import judge
 from edge.metrics import interval_coverage
-from edge.progress import tracked
 from edge.runtime import Runtime
 from edge.session import ModelSession
 from edge.taxels import STUCK_SCANS, TaxelWatch
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.judge import judge
-from edge.progress import tracked
 from edge.session import ModelSession
+from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.world import World
 from train.experiments.baselines import Baseline, fit_baselines

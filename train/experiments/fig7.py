@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db, rmse_percent
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
 from train.depth import depth_image

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.metrics import contact_iou, psnr_db, ssim
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, windows
 from train.experiments.methods import Method, classical_methods, compact_methods
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval

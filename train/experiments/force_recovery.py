@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.classical import fit_gain
-from edge.progress import tracked
 from edge.taps import ON_COUNTS
+from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, windows
 from train.experiments.course import (
     CLAIM_N,

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
 from train.experiments.hidden_taxel import recorded_sets, recording_paths, recordings_folder

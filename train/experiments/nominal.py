@@ -8,8 +8,8 @@ import numpy as np
 from edge.bundle import BUNDLE_DIR
 from edge.frozen import FrozenSet, load_frozen_set
 from edge.judge import judge
-from edge.progress import tracked
 from edge.session import ModelSession
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad import GAINS, Pad
 from train.experiments.report import Row
 from train.experiments.scores import pattern_cells

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.judge import judge
-from edge.progress import tracked
 from edge.session import ModelSession
+from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.presses import PressSet, join_presses
 from train.data.world import INDENTATION_MM

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.metrics import psnr_db
-from edge.progress import tracked
 from edge.session import ModelSession
+from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.presses import PressSet
 from train.data.world import press_shapes

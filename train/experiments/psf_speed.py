@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench

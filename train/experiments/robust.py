@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.experiments.methods import Method, classical_methods, compact_methods
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.sweeps import Sweep, all_sweeps, plain_set

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.judge import judge
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences
 from train.experiments.methods import classical_methods
 from train.experiments.report import Report, Row, bootstrap_interval

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.judge import judge
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row
 from train.experiments.trainings import at_scale, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells

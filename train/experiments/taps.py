@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.judge import judge
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import alike, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.progress import tracked
+from edge.terminal.progress_bar import tracked
 from edge.wrench import LEAST_FORCE_N, Wrench, wrench_of
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import FrozenPresses

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from edge.bundle import BUNDLE_DIR, find_model
 from edge.frozen import load_frozen_set
-from edge.progress import tracked
 from edge.runtime import Runtime
 from edge.session import ModelSession
 from edge.taps import OFF_COUNTS, ON_COUNTS
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording

@@ -5,7 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 
-from edge.ending import ended_in_time
+from edge.terminal.forced_end import ended_in_time
 
 
 @contextlib.contextmanager

@@ -1,0 +1,1 @@
+"""What programs in a terminal share: arguments, bars, text, signals."""
