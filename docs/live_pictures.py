@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
-from edge.bundle import demo_recording
+from edge.inference.bundled import demo_recording
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.recording import load_recording
 from firmware_bridge.slcan_emulator import Emulator

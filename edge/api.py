@@ -19,10 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge.asked import check_positive, check_whole
-from edge.bundle import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.commands import Command, Commands
 from edge.commissioned import link_to, references, refuse_emulated, settled, with_recorded
-from edge.contract import Contract
 from edge.errors import (
     EdgeError,
     MessageError,
@@ -34,7 +32,9 @@ from edge.errors import (
 )
 from edge.estimate import load_estimator
 from edge.event import Event
-from edge.loading import unfinished_load
+from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
+from edge.inference.contract import Contract
+from edge.inference.timed_loading import unfinished_load
 from edge.pump import pump
 from edge.result import Result
 from edge.runtime import Model, Runtime
@@ -68,8 +68,8 @@ from firmware_bridge.xela import ID_MAPS
 
 if TYPE_CHECKING:
     from edge.doctor.findings import Finding
+    from edge.inference.onnx_session import ModelSession
     from edge.ladder import Ladder
-    from edge.session import ModelSession
     from firmware_bridge.links.devices import Found
 
 # What only some need, onnxruntime before all, is imported where it is needed: start-up time and memory are promises.
@@ -181,7 +181,7 @@ def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None
         UsageError: a number of threads that cannot be.
     """
     check_whole("threads", threads, 1)
-    from edge.session import ModelSession
+    from edge.inference.onnx_session import ModelSession
 
     return ModelSession(find_model(model), threads, stop)
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from edge.bundle import demo_recording
 from edge.errors import UsageError
+from edge.inference.bundled import demo_recording
 from firmware_bridge.baseline import Baseline, load_baselines
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.base import Link, SourceKind

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.contract import Contract
+from edge.inference.contract import Contract
 from edge.metrics import psnr_db, rmse_percent, ssim
 from edge.result import Result
 from edge.sinks.base import Sink

@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Final
 
 from edge.budget import Candidate, Choice, choose
-from edge.bundle import alternatives, bundled_models
 from edge.calibration import ROUND_TICKS, ROUNDS, RunTime, calibrate
 from edge.calibration_cache import CalibrationCache
-from edge.confidence import is_number
 from edge.errors import ModelError
 from edge.governor import Governor
+from edge.inference.bundled import alternatives, bundled_models
+from edge.inference.expected_error import is_number
+from edge.inference.onnx_session import ModelSession
 from edge.result import Result, age_text
 from edge.runtime import Model, Runtime
-from edge.session import ModelSession
 from edge.sinks.base import Sink
 from firmware_bridge.schedule import Clock
 

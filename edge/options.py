@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from edge.bundle import DEFAULT_MODEL, DEMO_MODEL
+from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL
 from edge.sinks.forms import check_apart, check_sink
 from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, check_thresholds
 from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole

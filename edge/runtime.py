@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.asked import check_baselines, check_pads, check_positive, check_whole
-from edge.confidence import expect
 from edge.contact_patch import touched, touched_patch
-from edge.contract import MOST, Contract
 from edge.errors import ModelError, WindowError
 from edge.estimate import WIDENING, TaxelEstimator
+from edge.inference.contract import MOST, Contract
+from edge.inference.expected_error import expect
 from edge.result import MADE, Result
 from edge.rezero import REFUSED
 from edge.sensor import Sensor

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.contract import Contract
 from edge.estimate import Filler, Readings, TaxelEstimator
+from edge.inference.contract import Contract
 from edge.result import Result, WrenchOrigin
 from edge.rezero import GIVEN_UP, Rezeroing, in_contact
 from edge.scene import LastReading, TapsThatMatter

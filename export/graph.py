@@ -8,7 +8,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from edge.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME
+from edge.inference.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME
 from export.errors import ExportError
 from firmware_bridge.geometry import SensorGeometry
 from train.networks.blocks import PatternNet

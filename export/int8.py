@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from onnx import NodeProto
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-from edge.contract import INPUT_NAME, PAD_NAME, Contract
-from edge.session import LOG_FATAL_ONLY
+from edge.inference.contract import INPUT_NAME, PAD_NAME, Contract
+from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ExportError
 from train.batches import Draw
 from train.data.batch import Batch

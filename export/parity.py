@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edge.contract import INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.frozen import FrozenSet
-from edge.session import LOG_FATAL_ONLY
+from edge.inference.contract import INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
+from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ParityError
 from export.graph import known_width, outputs
 

@@ -15,7 +15,7 @@ from typing import Final
 import torch
 
 from edge.bench.subjects import WEIGHTS_KEY
-from edge.session import load_session
+from edge.inference.onnx_session import load_session
 from export.errors import ExportError
 from export.graph import to_model
 from export.rounding import folded

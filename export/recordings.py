@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.contract import Contract
+from edge.inference.contract import Contract
 from train.experiments.hidden_taxel import recorded_sets
 
 _SCANS_APART = 20

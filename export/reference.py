@@ -14,8 +14,8 @@ import onnx
 import torch
 from onnx import numpy_helper
 
-from edge.bundle import INT8_SUFFIX
-from edge.contract import Contract
+from edge.inference.bundled import INT8_SUFFIX
+from edge.inference.contract import Contract
 from export.errors import ExportError
 from train.networks.blocks import PatternNet
 from train.networks.registry import build

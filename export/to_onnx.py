@@ -16,10 +16,10 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from edge.bundle import BUNDLE_DIR, INT8_SUFFIX
-from edge.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.errors import EdgeError
 from edge.frozen import FrozenSet, load_frozen_set
+from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
+from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.fine_tune import FineTuning, quantised_well

@@ -11,7 +11,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from edge.contract import (
+from edge.inference.contract import (
     CONTRACT_VERSION,
     DEVIATION_NAME,
     INPUT_NAME,

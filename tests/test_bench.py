@@ -19,11 +19,11 @@ from edge.bench.command import Settings, run
 from edge.bench.errors import BenchError
 from edge.bench.plot import draw
 from edge.bench.subjects import Subject, bundled_subjects, classical_subjects
-from edge.bundle import BUNDLE_DIR, find_model
 from edge.cli import main
 from edge.errors import ModelError
 from edge.frozen import load_frozen_set
-from edge.session import ModelSession
+from edge.inference.bundled import BUNDLE_DIR, find_model
+from edge.inference.onnx_session import ModelSession
 
 FROZEN = load_frozen_set(BUNDLE_DIR / "frozen.npz")
 MTSR2 = Subject("mtsr2", "model", str(find_model("mtsr2")))

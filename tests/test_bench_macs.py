@@ -9,9 +9,9 @@ from onnx import TensorProto, helper, numpy_helper
 from edge.bench.macs import counted, macs_of
 from edge.bench.peak import peak_gmac_s, product_model
 from edge.bench.subjects import peer_weights
-from edge.bundle import find_model
 from edge.errors import ModelError
-from edge.session import ModelSession
+from edge.inference.bundled import find_model
+from edge.inference.onnx_session import ModelSession
 from export.peer import export_peer
 from export.peer import main as peer_main
 from export.reference import network_of

@@ -13,9 +13,9 @@ from edge.bench.soak import Soak, Window
 from edge.bench.system import Losses, StartUp, SystemRow, latencies_ns
 from edge.bench.timing import summary
 from edge.bench.verdicts import verdicts
-from edge.bundle import BUNDLE_DIR
 from edge.cli import main
 from edge.frozen import load_frozen_set
+from edge.inference.bundled import BUNDLE_DIR
 
 QUICK = summary([800_000] * 1000)
 ROW = SystemRow(system.IDLE, 1000, 1.0, (0.6, 0.4), 70.0, None, None, None, 3, 20.0, 0.5)

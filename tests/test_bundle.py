@@ -1,8 +1,8 @@
 import pytest
 from edge_samples import write_model
 
-from edge import bundle
 from edge.errors import ModelError, UsageError
+from edge.inference import bundled as bundle
 
 
 @pytest.fixture

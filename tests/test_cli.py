@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 
-from edge import bundle, cli
+from edge import cli
+from edge.inference import bundled as bundle
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.links import source
 from firmware_bridge.links.ports import Port

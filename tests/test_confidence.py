@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from edge_samples import make_contract
 
-from edge.bundle import BUNDLE_DIR, bundled_models
-from edge.confidence import Expected, doubt, expect, is_confidence
 from edge.frozen import load_frozen_set
-from edge.session import ModelSession
+from edge.inference.bundled import BUNDLE_DIR, bundled_models
+from edge.inference.expected_error import Expected, doubt, expect, is_confidence
+from edge.inference.onnx_session import ModelSession
 from train.confidence import BINS, doubts_and_errors, fit_confidence
 from train.data.frozen_presses import load_frozen_presses
 

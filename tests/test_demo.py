@@ -5,9 +5,9 @@ import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_contract, make_scan
 
 from edge import cli, run
-from edge.bundle import demo_recording
 from edge.demo import DemoScore, score_picture, score_table
 from edge.errors import UsageError
+from edge.inference.bundled import demo_recording
 from edge.metrics import psnr_db, rmse_percent, ssim
 from edge.runtime import Runtime
 from edge.source import Source

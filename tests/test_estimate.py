@@ -8,13 +8,13 @@ import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
 from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.errors import EdgeError
 from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import load_frozen_set
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.metrics import psnr_db
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.sinks.jsonl import record_line
 from edge.taxels import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from firmware_bridge.geometry import USPA44

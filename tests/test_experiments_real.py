@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from edge.bundle import DEFAULT_MODEL, find_model
-from edge.session import ModelSession
+from edge.inference.bundled import DEFAULT_MODEL, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.taxels import HOLD_SCANS
 from firmware_bridge.recording import CSV_HEADER
 from train.errors import DatasetError

@@ -9,7 +9,7 @@ from edge_samples import make_contract, make_pad_contract, write_model
 from experiment_samples import quick_bench
 
 from edge.errors import ModelError
-from edge.session import ModelSession
+from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad import Pad
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError

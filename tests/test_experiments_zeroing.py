@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from edge.bundle import find_model
-from edge.session import ModelSession
+from edge.inference.bundled import find_model
+from edge.inference.onnx_session import ModelSession
 from train.experiments import zeroing
 
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from edge.bundle import BUNDLE_DIR
 from edge.classical import fitted_methods
 from edge.errors import EdgeError
+from edge.inference.bundled import BUNDLE_DIR
 from edge.judge import judge
 from edge.taps import ON_COUNTS
 from firmware_bridge.recording import load_recording

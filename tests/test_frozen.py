@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge.bundle import BUNDLE_DIR
 from edge.frozen import FrozenSet, FrozenSetError, load_frozen_set
+from edge.inference.bundled import BUNDLE_DIR
 
 
 @pytest.fixture

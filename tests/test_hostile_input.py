@@ -17,11 +17,11 @@ from onnx import TensorProto, helper, numpy_helper
 from edge.bench.errors import BenchError
 from edge.bench.record import read_record
 from edge.calibration_cache import CalibrationCache
-from edge.contract import KEY_PREFIX, Contract
 from edge.errors import EdgeError, ModelError
 from edge.frozen import load_frozen_set
-from edge.onnx_file import check_plain, read_model
-from edge.session import ModelSession
+from edge.inference.contract import KEY_PREFIX, Contract
+from edge.inference.onnx_guard import check_plain, read_model
+from edge.inference.onnx_session import ModelSession
 from firmware_bridge import recording
 from firmware_bridge.baseline import load_baselines, save_baselines
 from firmware_bridge.bounded import read_bounded
@@ -335,7 +335,7 @@ class TestModels:
             check_plain(onnx.ModelProto(graph=onnx.GraphProto(sparse_initializer=[sparse])).SerializeToString())
 
     def test_more_fields_than_a_graph_has(self, monkeypatch):
-        monkeypatch.setattr("edge.onnx_file.MOST_FIELDS", 1000)
+        monkeypatch.setattr("edge.inference.onnx_guard.MOST_FIELDS", 1000)
         with pytest.raises(ModelError, match="more than 1000 fields"):
             check_plain(b"\x08\x01" * 1001)
 
@@ -354,7 +354,7 @@ class TestModels:
                 check_plain(broken)
 
     def test_a_file_larger_than_any_model(self, tmp_path, monkeypatch, bounded_memory):
-        monkeypatch.setattr("edge.onnx_file.MOST_BYTES", 1 << 20)
+        monkeypatch.setattr("edge.inference.onnx_guard.MOST_BYTES", 1 << 20)
         path = tmp_path / "large.onnx"
         with path.open("wb") as file:
             file.truncate(3_000_000_000)

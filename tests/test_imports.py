@@ -25,15 +25,15 @@ def test_the_runtime_loads_no_training_library():
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for package in ("edge", "firmware_bridge")
         for path in sorted((ROOT / package).rglob("*.py"))
-        if path.stem != "__init__" and (find_spec("cyclonedds") or not path.stem.startswith("ros2"))
+        if path.stem != "__init__" and (find_spec("cyclonedds") or "ros2" not in path.parts)
     ]
-    assert {"edge.cli", "edge.session", "edge.demo", "firmware_bridge.emulator"} <= set(modules)
+    assert {"edge.cli", "edge.inference.onnx_session", "edge.demo", "firmware_bridge.emulator"} <= set(modules)
     assert not loaded(*modules) & FORBIDDEN
 
 
 def test_contract_and_cli_load_no_onnxruntime():
     assert "onnxruntime" not in loaded(
-        "edge.contract", "edge.api", "edge.cli", "edge.runtime", "edge.pump", "edge.sinks.forms"
+        "edge.inference.contract", "edge.api", "edge.cli", "edge.runtime", "edge.pump", "edge.sinks.forms"
     )
 
 

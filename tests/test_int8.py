@@ -8,8 +8,8 @@ from onnx import numpy_helper
 from test_dataset import make_sequences
 from test_export import at_frames, frozen_at, save_untrained
 
-from edge.contract import Contract
-from edge.session import ModelSession
+from edge.inference.contract import Contract
+from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
 from export.graph import to_model
 from export.int8 import calibration_batch, convolutions, integer_nodes, quantised

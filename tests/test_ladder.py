@@ -12,14 +12,15 @@ from dataclasses import replace
 import pytest
 from edge_samples import BASELINE, ROOT, ListSink, make_contract, make_scan, write_model
 
-from edge import bundle, cli
+from edge import cli
 from edge.budget import Candidate, choose
 from edge.calibration import ROUND_TICKS, ROUNDS, RunTime
 from edge.calibration_cache import CalibrationCache, cache_path
 from edge.errors import ModelError
+from edge.inference import bundled as bundle
+from edge.inference.onnx_session import ModelSession
 from edge.ladder import Ladder, ModelSteps, candidate_sessions, open_ladder
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.sinks.jsonl import JsonLinesSink
 from edge.statistics import Statistics
 

@@ -12,11 +12,12 @@ import pytest
 from edge_samples import ROOT, ended, make_contract, write_model
 from onnx import helper, numpy_helper
 
-from edge import cli, session
-from edge.bundle import bundled_models
+from edge import cli
 from edge.errors import ModelError
-from edge.onnx_file import OPERATORS, check_plain
-from edge.session import ModelSession, load_session
+from edge.inference import onnx_session as session
+from edge.inference.bundled import bundled_models
+from edge.inference.onnx_guard import OPERATORS, check_plain
+from edge.inference.onnx_session import ModelSession, load_session
 
 
 def of_nodes(*nodes: onnx.NodeProto, numbers: dict[str, np.ndarray] | None = None) -> onnx.ModelProto:
@@ -153,7 +154,9 @@ def hours_of_work() -> onnx.ModelProto:
 
 PROGRAM = """
 import sys
-from edge import cli, loading, session
+from edge import cli
+from edge.inference import timed_loading as loading
+from edge.inference import onnx_session as session
 loading.LOAD_LIMIT_S = {limit_s}
 within_limit = session.within_limit
 def announced(*arguments):

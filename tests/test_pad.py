@@ -17,10 +17,10 @@ from edge_samples import (
     write_model,
 )
 
-from edge.contract import ANY_BATCH, Contract
 from edge.errors import ModelError, UsageError, WindowError
+from edge.inference.contract import ANY_BATCH, Contract
+from edge.inference.onnx_session import ModelSession
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.pad import GAINS, PAD_RANGES, Pad
 

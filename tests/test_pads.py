@@ -5,7 +5,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from edge.contract import Contract
+from edge.inference.contract import Contract
 from firmware_bridge.pad import PAD_RANGES
 from firmware_bridge.pad import Pad as KnownPad
 from train.physics.pads import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from edge.bundle import DEFAULT_MODEL, find_model
-from edge.session import ModelSession
+from edge.inference.bundled import DEFAULT_MODEL, find_model
+from edge.inference.onnx_session import ModelSession
 from train.experiments.hidden_taxel import recorded_grips, recording_paths, recordings_folder
 from train.experiments.real import Played, has_hole, play, share_touched, unevenness
 

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from edge.contact_patch import touched, touched_patch
 from edge.errors import ModelError, UsageError, WindowError
+from edge.inference.onnx_session import ModelSession
 from edge.result import mask_bits
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.taxels import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44

@@ -7,9 +7,9 @@ import pytest
 from edge_samples import make_contract, tiny_deviation, tiny_pattern, write_model
 from onnx import TensorProto
 
-from edge.contract import ANY_BATCH, KEY_PREFIX, Contract
 from edge.errors import ModelError, WindowError
-from edge.session import ModelSession
+from edge.inference.contract import ANY_BATCH, KEY_PREFIX, Contract
+from edge.inference.onnx_session import ModelSession
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, ROOT
 
 from edge.bench.fault_judge import HELD_US
-from edge.bundle import demo_recording
+from edge.inference.bundled import demo_recording
 from edge.taxels import (
     BACK_SCANS,
     FAR_SCANS,

@@ -9,7 +9,7 @@ from edge_samples import ROOT, make_contract, write_model
 RUN = """
 import os, sys
 from pathlib import Path
-from edge.session import ModelSession
+from edge.inference.onnx_session import ModelSession
 ModelSession(Path(sys.argv[1]))
 print(os.environ.get("ORT_DISABLE_TELEMETRY"), *sorted(os.listdir("/proc/self/fd")), sep=",")
 print(*[path for path in Path.home().rglob("*")], sep=",")

@@ -24,7 +24,7 @@ from view_samples import Press, live_page, wait_for
 from websockets.sync.client import connect
 
 from edge import view as edge_view
-from edge.bundle import demo_recording
+from edge.inference.bundled import demo_recording
 from edge.packed import unpack
 from edge.terminal.heatmap import colours
 from edge.terminal.progress_bar import Progress

@@ -25,7 +25,7 @@ from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT, ListSink
 
 from edge import cli, run
-from edge.bundle import demo_recording, find_model
+from edge.inference.bundled import demo_recording, find_model
 from firmware_bridge.baseline import save_baselines
 from firmware_bridge.links import devices, source
 from firmware_bridge.links.ports import Port

@@ -11,8 +11,8 @@ from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
 
 from edge import cli
-from edge.bundle import demo_recording, find_model
-from edge.contract import ADDED, Contract
+from edge.inference.bundled import demo_recording, find_model
+from edge.inference.contract import ADDED, Contract
 from firmware_bridge.baseline import save_baselines
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.pad import GAINS, PAD_RANGES, Pad

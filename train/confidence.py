@@ -1,4 +1,4 @@
-"""What a network's deviations tell of its error, found on taps that it was not trained on: see edge.confidence."""
+"""What a network's deviations tell of its error (edge.inference.expected_error), found on taps not trained on."""
 
 from collections.abc import Collection
 from typing import Final
@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.confidence import doubt
 from edge.frozen import FrozenSet
+from edge.inference.expected_error import doubt
 from edge.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences
@@ -25,7 +25,7 @@ def confidence_sets(validation: Sequences, scale: int) -> list[FrozenSet]:
 
 
 def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
-    """The table of edge.confidence for a model with deviations.
+    """The table of edge.inference.expected_error for a model with deviations.
 
     Frames are sorted by their doubt into bins of equally many; a bin's gain is that of its frames together.
 

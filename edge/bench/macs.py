@@ -16,8 +16,8 @@ import onnxruntime
 
 from edge.bench.subjects import random_feeds
 from edge.errors import ModelError
-from edge.onnx_file import read_model
-from edge.session import ORT_ERRORS, session_options
+from edge.inference.onnx_guard import read_model
+from edge.inference.onnx_session import ORT_ERRORS, session_options
 
 Shape = Sequence[int]
 

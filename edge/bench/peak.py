@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.session import load_session
+from edge.inference.onnx_session import load_session
 
 SIZES: Final = (256, 384, 512, 1024, 1536)
 SEED: Final = 0

@@ -9,9 +9,9 @@ from edge.bench.record import Record
 from edge.bench.scene import Saving, savings
 from edge.bench.subjects import Subject
 from edge.bench.tables import head, line
-from edge.bundle import DEFAULT_MODEL
 from edge.frozen import FrozenSet
-from edge.session import ModelSession
+from edge.inference.bundled import DEFAULT_MODEL
+from edge.inference.onnx_session import ModelSession
 
 MODELS: Final = (DEFAULT_MODEL, "mtsr4-int8")
 COLUMNS: Final = ("left out", "model", "scans", "inferred %", "CPU us a scan", "taps used", "PSNR dB")

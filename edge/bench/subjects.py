@@ -8,10 +8,10 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR, bundled_models
 from edge.classical import fitted_methods
 from edge.errors import ModelError, UsageError
-from edge.session import ORT_ERRORS, ModelSession, load_session
+from edge.inference.bundled import BUNDLE_DIR, bundled_models
+from edge.inference.onnx_session import ORT_ERRORS, ModelSession, load_session
 
 FROZEN_FILE: Final = BUNDLE_DIR / "frozen.npz"
 WEIGHTS_KEY: Final = "tactile.weights"

@@ -30,13 +30,13 @@ from edge.bench.page import Page
 from edge.bench.scene import REST, stream
 from edge.bench.subjects import FROZEN_FILE
 from edge.bench.tables import head, line
-from edge.bundle import DEFAULT_MODEL, find_model
 from edge.errors import EdgeError
 from edge.frozen import load_frozen_set
+from edge.inference.bundled import DEFAULT_MODEL, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.packed import unpack
 from edge.result import Result
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.sinks.zenoh import ZenohSink
 from edge.source import Source
 from edge.stream import Stream

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from edge.contract import Contract
 from edge.errors import UsageError
+from edge.inference.contract import Contract
 from edge.ros_names import base_topic
 from edge.sinks.base import Sink
 from firmware_bridge.extras import how_to_install

@@ -8,9 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-from edge.contract import Contract
 from edge.errors import SinkError
 from edge.event import Event
+from edge.inference.contract import Contract
 from edge.mcap_file import McapFile
 from edge.record import record
 from edge.result import Result

@@ -14,9 +14,9 @@ from typing import Final
 
 import numpy as np
 
-from edge.contract import Contract
 from edge.errors import SinkError
 from edge.event import Event
+from edge.inference.contract import Contract
 from edge.result import Result, mask_bits
 from edge.shm_layout import (
     FIELDS,

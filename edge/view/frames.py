@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from edge.contract import Contract
 from edge.event import Event
+from edge.inference.contract import Contract
 from edge.packed import pack
 from edge.record import encodable, event_record, record
 from edge.view.heard import Heard, Newest, Point, Told

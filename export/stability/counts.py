@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bundle import DEFAULT_MODEL, TAXELS, find_model
 from edge.estimate import load_estimator
+from edge.inference.bundled import DEFAULT_MODEL, TAXELS, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.result import Result
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.taps import ON_COUNTS
 from export.stability.case import Case, timed
 from firmware_bridge.baseline import Baseline, deformation

@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from edge.bundle import find_model
 from edge.errors import WindowError
+from edge.inference.bundled import find_model
+from edge.inference.onnx_session import ModelSession
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from export.stability.case import Case, refused
 from firmware_bridge.scan import Scan
 

@@ -9,8 +9,8 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from edge.bundle import bundled_models
-from edge.contract import DEVIATION_NAME, Contract
+from edge.inference.bundled import bundled_models
+from edge.inference.contract import DEVIATION_NAME, Contract
 from export.errors import ParityError
 from export.graph import outputs
 from export.parity import Difference, GraphRun, differences, extreme_windows

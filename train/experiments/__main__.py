@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from edge.bundle import BUNDLE_DIR
 from edge.errors import EdgeError
+from edge.inference.bundled import BUNDLE_DIR
 from edge.terminal.progress_bar import tracked
 from train.errors import TrainError
 from train.experiments.workbench import Workbench

@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bundle import bundled_models
-from edge.confidence import WORTH_A_TAP, expect_of
-from edge.contract import Contract
 from edge.frozen import FrozenSet
+from edge.inference.bundled import bundled_models
+from edge.inference.contract import Contract
+from edge.inference.expected_error import WORTH_A_TAP, expect_of
+from edge.inference.onnx_session import ModelSession
 from edge.runtime import Model
-from edge.session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.confidence import doubts_and_errors
 from train.errors import TrainError

@@ -18,13 +18,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR, TAXELS, demo_recording, find_model
 from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import FrozenSet, load_frozen_set
+from edge.inference.bundled import BUNDLE_DIR, TAXELS, demo_recording, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.judge import judge
 from edge.metrics import interval_coverage
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.taxels import STUCK_SCANS, TaxelWatch
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline

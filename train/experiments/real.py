@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
-from edge.bundle import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.classical import fit_linear_map, fitted_methods
 from edge.estimate import load_estimator
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ABSENT, ScanSeries

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bundle import DEFAULT_MODEL
-from edge.session import ModelSession
+from edge.inference.bundled import DEFAULT_MODEL
+from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad import Pad
 from train.data.frozen_presses import FrozenPresses
 

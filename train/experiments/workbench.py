@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR
 from edge.frozen import FrozenSet
+from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import FrozenPresses, load_frozen_presses
 from train.data.make_presses import make_presses

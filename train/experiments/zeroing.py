@@ -18,10 +18,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.bundle import BUNDLE_DIR, find_model
 from edge.frozen import load_frozen_set
+from edge.inference.bundled import BUNDLE_DIR, find_model
+from edge.inference.onnx_session import ModelSession
 from edge.runtime import Runtime
-from edge.session import ModelSession
 from edge.taps import OFF_COUNTS, ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.confidence import is_confidence, is_number
 from edge.errors import ModelError
+from edge.inference.expected_error import is_confidence, is_number
 from firmware_bridge.geometry import AXES, SensorGeometry
 from firmware_bridge.pad import PAD_RANGES, Pad
 
@@ -69,8 +69,8 @@ class Contract:
         arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are float32 always.
         interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
             None where the model gives no deviation.
-        confidence: number of taps given -> what the deviations say of the pattern's error, see edge.confidence; empty
-            where the model gives no deviation.
+        confidence: number of taps given -> what the deviations say of the pattern's error, see
+            edge.inference.expected_error; empty where the model gives no deviation.
         training_sha256: of the training configuration.
         test_set_sha256: of the frozen test set that `test_error` was measured on.
         test_error: number of taps given -> metric name -> value; empty where the test set has another scale.

@@ -5,7 +5,7 @@ from typing import Final
 
 from edge.errors import ModelError, UsageError
 
-BUNDLE_DIR: Final = Path(__file__).resolve().parent / "models"
+BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
 TAXELS: Final = BUNDLE_DIR / "taxels.npz"
 """What dead taxels are estimated by."""
 DEFAULT_MODEL: Final = "stsr-int8"

@@ -12,10 +12,18 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright: ignore[reportAttributeAccessIssue]
 
-from edge.contract import ANY_BATCH, DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.errors import ModelError, WindowError
-from edge.loading import flush_denormals, within_limit
-from edge.onnx_file import read_model
+from edge.inference.contract import (
+    ANY_BATCH,
+    DEVIATION_NAME,
+    INPUT_NAME,
+    OUTPUT_NAME,
+    PAD_NAME,
+    TRACTION_NAME,
+    Contract,
+)
+from edge.inference.onnx_guard import read_model
+from edge.inference.timed_loading import flush_denormals, within_limit
 
 WARM_UP_RUNS: Final = 10
 """The first takes 3 to 10 times as long as the tenth, after which run times stay."""

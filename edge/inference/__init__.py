@@ -1,0 +1,1 @@
+"""Models: their contract, and how onnxruntime is kept to it."""
