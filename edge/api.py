@@ -30,22 +30,22 @@ from edge.errors import (
     UsageError,
     WindowError,
 )
-from edge.estimate import load_estimator
-from edge.event import Event
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
+from edge.perception.dead_taxel_fill import load_estimator
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.perception.runtime import Model, Runtime
+from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
+from edge.perception.wrench import Wrench
 from edge.pump import pump
-from edge.result import Result
-from edge.runtime import Model, Runtime
 from edge.sinks import forms
 from edge.sinks.base import Sink
 from edge.sinks.fan import Fan
 from edge.source import Source
 from edge.statistics import Statistics
 from edge.stream import Stream
-from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
-from edge.wrench import Wrench
 from edge.zeroing import take_baselines
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import (

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from edge.frozen import FrozenSet
 from edge.inference.contract import Contract
 from edge.metrics import boundary_distance_mm, contact_iou, interval_coverage, psnr_db, rmse_percent, ssim, ssim_global
-from edge.runtime import Model
+from edge.perception.runtime import Model
 from firmware_bridge.geometry import USPA44
 
 

@@ -15,8 +15,8 @@ from edge.governor import Governor
 from edge.inference.bundled import alternatives, bundled_models
 from edge.inference.expected_error import is_number
 from edge.inference.onnx_session import ModelSession
-from edge.result import Result, age_text
-from edge.runtime import Model, Runtime
+from edge.perception.result import Result, age_text
+from edge.perception.runtime import Model, Runtime
 from edge.sinks.base import Sink
 from firmware_bridge.schedule import Clock
 

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge.contact_patch import touched
+from edge.perception.contact_patch import touched
 
 _K1: Final = 0.01
 _K2: Final = 0.03

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from edge.event import Event
-from edge.runtime import Runtime
+from edge.perception.event import Event
+from edge.perception.runtime import Runtime
 from edge.sinks.base import Sink
 from edge.source import Source
 from edge.statistics import Statistics

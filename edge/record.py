@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.event import Event
-from edge.result import Result, mask_bits
-from edge.wrench import Wrench
+from edge.perception.event import Event
+from edge.perception.result import Result, mask_bits
+from edge.perception.wrench import Wrench
 from firmware_bridge.drift import Drift
 from firmware_bridge.scan import Scan
 

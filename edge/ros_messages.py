@@ -12,8 +12,8 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from firmware_bridge.cdr import STD_HEADER, TIME, MessageType, stamp
 
 IMAGE: Final = MessageType(

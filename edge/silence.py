@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from edge.event import Event
+from edge.perception.event import Event
 from firmware_bridge.scan import Scan
 
 SILENT_NS: Final = 500_000_000

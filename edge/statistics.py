@@ -5,8 +5,8 @@ from bisect import bisect_left
 from itertools import accumulate
 from typing import Final
 
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from firmware_bridge.drift import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32

@@ -10,9 +10,9 @@ from typing import Self
 from edge.asked import check_positive
 from edge.commands import Commands, obey
 from edge.deadline import Deadline
-from edge.event import Event
-from edge.result import Result
-from edge.runtime import Runtime
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.perception.runtime import Runtime
 from edge.silence import Silence
 from edge.source import POLL_S, Arrival, Source
 from edge.statistics import Statistics

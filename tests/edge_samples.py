@@ -20,7 +20,7 @@ from edge.inference.contract import (
     TRACTION_NAME,
     Contract,
 )
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.sinks.base import Sink
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import Link

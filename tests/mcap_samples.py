@@ -8,7 +8,7 @@ import numpy as np
 from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 from mcap.reader import make_reader
 
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
 from firmware_bridge.scan import ABSENT, Scan, VendorReading
 

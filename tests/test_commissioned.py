@@ -12,8 +12,8 @@ from edge.commissioned import references, settled
 from edge.doctor.keep import keep
 from edge.doctor.options import doctor_parser
 from edge.errors import UsageError
-from edge.runtime import Runtime
-from edge.taxels import TaxelWatch
+from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.links.ports import Port

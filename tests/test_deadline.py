@@ -8,7 +8,7 @@ from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from test_pump import run, scans
 
 from edge.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.statistics import Statistics
 
 MS = 1_000_000

@@ -9,7 +9,7 @@ from edge.demo import DemoScore, score_picture, score_table
 from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
 from edge.metrics import psnr_db, rmse_percent, ssim
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.source import Source
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ScanSeries

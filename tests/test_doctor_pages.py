@@ -9,7 +9,7 @@ from edge.doctor.line_checks import LATENCY_LIMIT_MS
 from edge.doctor.time_checks import USUAL_HZ
 from edge.doctor.verdicts import USUAL_COUNTS_PER_NEWTON
 from edge.doctor.watch import SILENCE_S
-from edge.taps import ON_COUNTS
+from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS
 
 PAGE = (ROOT / "docs" / "trouble.md").read_text()

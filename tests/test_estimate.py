@@ -9,14 +9,14 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, ma
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.metrics import psnr_db
-from edge.runtime import Runtime
+from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
+from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from edge.sinks.jsonl import record_line
-from edge.taxels import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ScanSeries
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from edge.estimate import load_estimator
 from edge.frozen import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.dead_taxel_fill import load_estimator
 from train.experiments import dead
 from train.experiments.workbench import thinned
 

@@ -5,7 +5,7 @@ from edge.classical import fitted_methods
 from edge.errors import EdgeError
 from edge.inference.bundled import BUNDLE_DIR
 from edge.judge import judge
-from edge.taps import ON_COUNTS
+from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.recording import load_recording
 from train.data.world import World, solve_pad
 from train.dataset import Sequences

@@ -15,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from mcap_samples import OFFSET_NS, make_results, odd_scans, record_into
 
 from edge.api import open_recording, open_sink
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.stream import Stream
 from firmware_bridge import mcap_recording
 from firmware_bridge.errors import RecordingError

@@ -33,7 +33,7 @@ def test_the_runtime_loads_no_training_library():
 
 def test_contract_and_cli_load_no_onnxruntime():
     assert "onnxruntime" not in loaded(
-        "edge.inference.contract", "edge.api", "edge.cli", "edge.runtime", "edge.pump", "edge.sinks.forms"
+        "edge.inference.contract", "edge.api", "edge.cli", "edge.perception.runtime", "edge.pump", "edge.sinks.forms"
     )
 
 

@@ -20,7 +20,7 @@ from edge.errors import ModelError
 from edge.inference import bundled as bundle
 from edge.inference.onnx_session import ModelSession
 from edge.ladder import Ladder, ModelSteps, candidate_sessions, open_ladder
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.sinks.jsonl import JsonLinesSink
 from edge.statistics import Statistics
 

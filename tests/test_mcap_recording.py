@@ -30,9 +30,9 @@ from edge import api, cli, mcap_file, ros_messages
 from edge.api import open_recording, open_runtime, open_source
 from edge.doctor.watch import Watch
 from edge.errors import SinkError
-from edge.event import Event
 from edge.mcap_file import CHUNK_S, McapFile
-from edge.runtime import Runtime
+from edge.perception.event import Event
+from edge.perception.runtime import Runtime
 from edge.sinks.forms import open_sink
 from edge.sinks.mcap import McapSink
 from edge.source import Arrival

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from edge.contact_patch import touched
 from edge.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global
+from edge.perception.contact_patch import touched
 
 
 def maps(seed, shape=(40, 40)):

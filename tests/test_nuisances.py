@@ -5,7 +5,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from edge.taps import ON_COUNTS
+from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.xela import USPA44_MAP
 from train.depth import Pose

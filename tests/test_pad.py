@@ -20,7 +20,7 @@ from edge_samples import (
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.pad import GAINS, PAD_RANGES, Pad
 

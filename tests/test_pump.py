@@ -8,8 +8,8 @@ from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_sca
 
 from edge.commands import RESET
 from edge.errors import SinkClosedError
+from edge.perception.runtime import Runtime
 from edge.pump import pump
-from edge.runtime import Runtime
 from edge.source import CAPACITY_SCANS, Source
 from edge.statistics import Statistics
 from firmware_bridge.baseline import Baseline

@@ -24,8 +24,8 @@ from hypothesis import strategies as st
 
 from edge import ros_messages
 from edge.errors import SinkError, UsageError
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.ros_names import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks import ros2_domain
 from edge.sinks.forms import open_sink

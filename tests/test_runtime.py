@@ -6,12 +6,12 @@ from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan, ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.contact_patch import touched, touched_patch
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
-from edge.result import mask_bits
-from edge.runtime import Runtime
-from edge.taxels import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
+from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.result import mask_bits
+from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.mounting import Mounting

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 
-from edge.runtime import Runtime
-from edge.scene import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
-from edge.taps import TapState
+from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
+from edge.perception.runtime import Runtime
+from edge.perception.tap_tracker import TapState
 
 SHAPE = (3, 4, 4)
 

@@ -3,7 +3,7 @@ import pytest
 from bridge_samples import REST_COUNTS, make_recording
 from server_samples import MS, UNIX_S, message, sensor_entry
 
-from edge.taxels import HOLD_SCANS, TaxelWatch
+from edge.perception.taxel_health import HOLD_SCANS, TaxelWatch
 from firmware_bridge.scan import Scan
 from firmware_bridge.server_scans import FARTHEST_BACK, MOST_MISSED, ServerScans
 from firmware_bridge.vendor_server import VendorServer

@@ -19,9 +19,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import SinkClosedError, SinkError, UsageError
-from edge.event import Event
-from edge.result import Result
-from edge.runtime import Runtime
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.perception.runtime import Runtime
 from edge.sinks import npz
 from edge.sinks.fan import Fan
 from edge.sinks.forms import FORMS, open_sink

@@ -123,9 +123,11 @@ def test_a_small_gamma_keeps_the_last_digits_of_distances():
 def test_nothing_is_made_of_saturated_chips(monkeypatch):
     saturated = [row for row in counts.cases() if row.case == "saturated"]
     assert len(saturated) == 2 and all(row.holds for row in saturated)
-    monkeypatch.setattr("edge.taxels.FROZEN_SENSOR_SCANS", 10**9)  # a second guard, or the first is not seen missing
+    monkeypatch.setattr(
+        "edge.perception.taxel_health.FROZEN_SENSOR_SCANS", 10**9
+    )  # a second guard, or the first is not seen missing
     assert all(row.holds for row in counts.cases() if row.case == "saturated")
-    monkeypatch.setattr("edge.taxels.RANGE_ENDS", (-2, -2))
+    monkeypatch.setattr("edge.perception.taxel_health.RANGE_ENDS", (-2, -2))
     assert not any(row.holds for row in counts.cases() if row.case == "saturated")
 
 
@@ -179,7 +181,7 @@ def test_a_network_that_says_nothing_is_broken(monkeypatch):
 
 
 def test_a_pad_that_rests_at_its_wrap_is_not_saturated(monkeypatch):
-    monkeypatch.setattr("edge.taxels.NEAR_END_COUNTS", -1.0)
+    monkeypatch.setattr("edge.perception.taxel_health.NEAR_END_COUNTS", -1.0)
     assert any(not row.holds for row in counts.cases() if "noise" in row.severity)
 
 

@@ -6,8 +6,8 @@ from edge_samples import BASELINE, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.statistics import Histogram, Statistics
 
 

@@ -9,7 +9,7 @@ from edge_samples import BASELINE, PERIOD_NS, REST, ROOT
 
 from edge.bench.fault_judge import HELD_US
 from edge.inference.bundled import demo_recording
-from edge.taxels import (
+from edge.perception.taxel_health import (
     BACK_SCANS,
     FAR_SCANS,
     FROZEN_SCANS,

@@ -13,7 +13,7 @@ from view_samples import CONTRACT, TIMEOUT_S, Press, wait_for
 
 from edge.commands import Command, obey
 from edge.errors import SinkError, UsageError
-from edge.event import Event
+from edge.perception.event import Event
 from edge.sinks.base import Sink
 from edge.sinks.forms import open_sink
 from edge.view.access import grant, is_loopback

@@ -9,8 +9,8 @@ import pytest
 from edge_samples import PERIOD_NS
 from view_samples import CONTRACT, Press
 
-from edge.event import Event
 from edge.packed import unpack
+from edge.perception.event import Event
 from edge.record import record
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
 from edge.view.heard import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard

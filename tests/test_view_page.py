@@ -26,10 +26,10 @@ from websockets.sync.client import connect
 from edge import view as edge_view
 from edge.inference.bundled import demo_recording
 from edge.packed import unpack
+from edge.perception.wrench import Wrench
 from edge.terminal.heatmap import colours
 from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
-from edge.wrench import Wrench
 from firmware_bridge.baseline import BaselineEstimator, save_baselines
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording

@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 
 from edge.commands import Command
 from edge.errors import SinkError
-from edge.event import Event
+from edge.perception.event import Event
 from edge.pump import uncollected
 from edge.view import attended, connections, server
 from edge.view.live import LiveView

@@ -12,6 +12,7 @@ from mcap_samples import messages_of
 
 from edge import ros_messages
 from edge.packed import unpack
+from edge.perception.wrench import LEAST_FORCE_N, wrench_of
 from edge.record import record
 from edge.ros_messages import force_and_torque
 from edge.sinks.forms import open_sink
@@ -21,7 +22,6 @@ from edge.sinks.ros2_diagnostics import diagnose
 from edge.view.frames import Frames, Run, hello
 from edge.view.heard import Heard
 from edge.view.viewer import Viewer
-from edge.wrench import LEAST_FORCE_N, wrench_of
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS

@@ -10,7 +10,7 @@ from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_sca
 from websockets.sync.client import connect
 
 from edge.packed import unpack
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from edge.sinks.forms import open_sink
 from edge.view.live import LiveView
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.inference.expected_error import doubt
-from edge.runtime import Model
+from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences
 from train.freeze import SEED, freeze

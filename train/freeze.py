@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
-from edge.estimate import load_estimator
 from edge.frozen import FrozenSet, load_frozen_set
+from edge.perception.dead_taxel_fill import load_estimator
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.in_place import write_in_place

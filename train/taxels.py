@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.estimate import Kinds, ridged
+from edge.perception.dead_taxel_fill import Kinds, ridged
 
 KINDS: Final = 16
 """RMS error of a hidden taxel's z on validation presses, over that of the scan: with 1 kind .61, with 16 .56. With more

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from edge.frozen import FrozenSet
 from edge.metrics import psnr_db
-from edge.runtime import Model, Runtime
-from edge.scene import NOISE_COUNTS
+from edge.perception.change_gate import NOISE_COUNTS
+from edge.perception.runtime import Model, Runtime
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import Scan, ScanSeries

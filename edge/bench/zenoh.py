@@ -35,8 +35,8 @@ from edge.frozen import load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.packed import unpack
-from edge.result import Result
-from edge.runtime import Runtime
+from edge.perception.result import Result
+from edge.perception.runtime import Runtime
 from edge.sinks.zenoh import ZenohSink
 from edge.source import Source
 from edge.stream import Stream

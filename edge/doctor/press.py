@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.turns import CORNER_PLACES, CORNERS, Press, corner_taxel
-from edge.taps import OFF_COUNTS, ON_COUNTS
+from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.geometry import USPA44
 
 HOLD_SCANS: Final = 20

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from edge.doctor.findings import Finding, Verdict
 from edge.doctor.samples import Samples, around_counts
-from edge.scene import NOISE_COUNTS
-from edge.taps import OFF_COUNTS
-from edge.taxels import RANGE_ENDS
+from edge.perception.change_gate import NOISE_COUNTS
+from edge.perception.tap_tracker import OFF_COUNTS
+from edge.perception.taxel_health import RANGE_ENDS
 from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 from firmware_bridge.geometry import AXES
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Protocol
 
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 
 
 class Sink(Protocol):

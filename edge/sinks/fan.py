@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from edge.errors import SinkClosedError, SinkError
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.sinks.base import Sink
 
 LOOK_NS: Final = 500_000_000

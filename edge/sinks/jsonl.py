@@ -14,9 +14,9 @@ import orjson
 from numpy.typing import NDArray
 
 from edge.errors import SinkClosedError, SinkError
-from edge.event import Event
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.record import event_record, record
-from edge.result import Result
 from edge.sinks.base import Sink
 from edge.sinks.room import has_room, widen
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Final
 
 from edge.errors import SinkError
-from edge.event import Event
 from edge.inference.contract import Contract
 from edge.mcap_file import McapFile
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.record import record
-from edge.result import Result
 from edge.ros_messages import (
     IMAGE,
     LOG,

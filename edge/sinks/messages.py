@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.sinks.base import Sink
 
 CLEAR_LINE: Final = "\r\x1b[K"

@@ -19,7 +19,7 @@ from numpy.lib import format as npy
 from numpy.typing import ArrayLike
 
 from edge.errors import SinkError
-from edge.result import Result
+from edge.perception.result import Result
 from edge.sinks.base import Sink
 from edge.terminal.forced_end import finishing
 from edge.terminal.progress_bar import Progress

@@ -17,9 +17,9 @@ from cyclonedds.topic import Topic
 from numpy.typing import NDArray
 
 from edge.errors import SinkError
-from edge.event import Event
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.record import event_record
-from edge.result import Result
 from edge.ros_messages import Vector, force_and_torque, frame_of
 from edge.ros_names import base_topic, sensor_topic
 from edge.sinks.base import Sink

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
-from edge.result import Result
+from edge.perception.result import Result
 
 SILENCE_S: Final = 1.0
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")

@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 
 from edge.errors import SinkError
-from edge.event import Event
 from edge.inference.contract import Contract
-from edge.result import Result, mask_bits
+from edge.perception.event import Event
+from edge.perception.result import Result, mask_bits
 from edge.shm_layout import (
     FIELDS,
     FILLED,

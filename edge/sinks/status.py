@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
+from edge.perception.result import Result
 from edge.rate import Rate
-from edge.result import Result
 from edge.sinks.base import Sink
 
 REFRESH_S: Final = 0.1

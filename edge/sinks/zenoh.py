@@ -16,10 +16,10 @@ from urllib.parse import quote
 import orjson
 
 from edge.errors import SinkError, UsageError
-from edge.event import Event
 from edge.packed import pack
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.record import event_record, record
-from edge.result import Result
 from edge.sinks.base import Sink
 from firmware_bridge.extras import how_to_install
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from edge.event import Event
 from edge.inference.contract import Contract
 from edge.packed import pack
+from edge.perception.event import Event
 from edge.record import encodable, event_record, record
 from edge.view.heard import Heard, Newest, Point, Told
 from firmware_bridge.geometry import USPA44

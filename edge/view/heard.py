@@ -9,11 +9,11 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
-from edge.event import Event
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.perception.runtime import TAPS_FORGOTTEN
+from edge.perception.zero_on_demand import GIVEN_UP, REFUSED, in_contact
 from edge.rate import Rate
-from edge.result import Result
-from edge.rezero import GIVEN_UP, REFUSED, in_contact
-from edge.runtime import TAPS_FORGOTTEN
 
 TRACE_S: Final = 60.0
 TRACE_POINTS: Final = 1200

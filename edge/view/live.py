@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final, Self
 
 from edge.commands import AllCommands, Commands
-from edge.event import Event
 from edge.inference.contract import Contract
+from edge.perception.event import Event
 from edge.sinks.base import Sink
 from edge.view.access import grant
 from edge.view.asked import Asked

@@ -9,8 +9,8 @@ from typing import Final
 
 from edge.commands import Command, Commands
 from edge.errors import SinkError
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.sinks.base import Sink
 
 FORM: Final = "mcap"

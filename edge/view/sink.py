@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from edge.event import Event
-from edge.result import Result
+from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.sinks.base import Sink
 from edge.view.frames import MAX_FPS
 from edge.view.heard import Heard

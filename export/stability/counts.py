@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.estimate import load_estimator
 from edge.inference.bundled import DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.result import Result
-from edge.runtime import Runtime
-from edge.taps import ON_COUNTS
+from edge.perception.dead_taxel_fill import load_estimator
+from edge.perception.result import Result
+from edge.perception.runtime import Runtime
+from edge.perception.tap_tracker import ON_COUNTS
 from export.stability.case import Case, timed
 from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.drift import COMMON_PER_S

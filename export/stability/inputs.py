@@ -8,7 +8,7 @@ import numpy as np
 from edge.errors import WindowError
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
-from edge.runtime import Runtime
+from edge.perception.runtime import Runtime
 from export.stability.case import Case, refused
 from firmware_bridge.scan import Scan
 

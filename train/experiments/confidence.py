@@ -17,7 +17,7 @@ from edge.inference.bundled import bundled_models
 from edge.inference.contract import Contract
 from edge.inference.expected_error import WORTH_A_TAP, expect_of
 from edge.inference.onnx_session import ModelSession
-from edge.runtime import Model
+from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.confidence import doubts_and_errors
 from train.errors import TrainError

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edge import metrics
 from edge.classical import fit_gain
-from edge.taps import TapTracker
+from edge.perception.tap_tracker import TapTracker
 from firmware_bridge.geometry import USPA44
 from train.dataset import Sequences, between_frames
 from train.freeze import SEED, TEST_FORCE_N

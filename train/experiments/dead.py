@@ -1,9 +1,9 @@
 """Dead taxels through the runtime's own road: what they cost found and unfound, how soon they are found, false alarms.
 
-Taxels of a free pad fail; then the taps of a frozen frame come, and its scan goes through `edge.runtime` with the
-bundled models: the pattern is the one that a robot would get. Unfound, faults are a few scans old, and what taxels send
-is fed in, as it was before there was a watch. On real recordings, which have no truth, a pattern with taxels hidden is
-compared with that of all.
+Taxels of a free pad fail; then the taps of a frozen frame come, and its scan goes through `edge.perception.runtime`
+with the bundled models: the pattern is the one that a robot would get. Unfound, faults are a few scans old, and what
+taxels send is fed in, as it was before there was a watch. On real recordings, which have no truth, a pattern with
+taxels hidden is compared with that of all.
 
 Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no scan of theirs goes into a report.
 """
@@ -18,14 +18,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.estimate import WIDENING, TaxelEstimator, load_estimator
 from edge.frozen import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.judge import judge
 from edge.metrics import interval_coverage
-from edge.runtime import Runtime
-from edge.taxels import STUCK_SCANS, TaxelWatch
+from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
+from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import STUCK_SCANS, TaxelWatch
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
@@ -76,7 +76,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     report = Report("dead", folder, quick=bench.quick)
     report.say(
         f"{len(frozen)} frames of {len(np.unique(frozen.tap))} taps of the frozen test set, one in {_FRAMES_APART}, "
-        f"through edge.runtime; seed {SEED}. Which taxels fail is drawn for each tap, those of fewer among those of "
+        f"through edge.perception.runtime; seed {SEED}. Which taxels fail is drawn for each tap, those of fewer "
+        f"among those of "
         "more; a scan has noise of 1 count over the set's own. `found`: as shipped, the fault has been seen before the "
         "taps. `unfound`: what the taxels send is fed in. A silent or saturated taxel unfound has no row: it is held "
         "for 5 scans, then there was no pattern at all. Eight silent ones are "

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.classical import fit_gain
-from edge.taps import ON_COUNTS
+from edge.perception.tap_tracker import ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, windows
 from train.experiments.course import (

@@ -1,9 +1,9 @@
 """Real grips along the shipped way: is a face over the whole pad drawn as one, and does a pattern explain the readings?
 
-Recordings go through edge.runtime with the default model and the baseline of a free pad. Nobody knows their true
-patterns, but both fingers hold a flat face that covers the pad: a pattern should cover it, evenly and without a hole.
-And it should read as the sensor did: it is degraded back to z by one linear operator, fitted on simulated presses, with
-no taxel hidden and with each in turn, which is silent then, as a broken one.
+Recordings go through edge.perception.runtime with the default model and the baseline of a free pad. Nobody knows their
+true patterns, but both fingers hold a flat face that covers the pad: a pattern should cover it, evenly and without a
+hole. And it should read as the sensor did: it is degraded back to z by one linear operator, fitted on simulated
+presses, with no taxel hidden and with each in turn, which is silent then, as a broken one.
 
 Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no reading of theirs goes into a report,
 patterns do.
@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
 from edge.classical import fit_linear_map, fitted_methods
-from edge.estimate import load_estimator
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.runtime import Runtime
+from edge.perception.dead_taxel_fill import load_estimator
+from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ABSENT, ScanSeries
@@ -246,7 +246,8 @@ def _method(whole: Sequence[Played], model: str) -> str:
     size = np.sqrt(np.mean(np.concatenate([z_of(one.zeroed) for one in whole]) ** 2))
     return (
         f"{scans} scans of {len(whole)} recordings in which some taxel is pressed, z RMS {size:.0f} counts, through "
-        f"edge.runtime with {model} and the baseline of the free pad; nothing is known of the pads, and nothing is "
+        f"edge.perception.runtime with {model} and the baseline of the free pad; nothing is known of the pads, and "
+        f"nothing is "
         "fitted on real readings but in the last two rows of the first table. Share: of the pad above half of the "
         "pattern's 95th percentile, wanted .9; std / mean: over the inner 80 %, wanted .25 at most; medians of scans. "
         "A hole: pixels below that level with others above it all round. Self-consistency: RMS error of z degraded "

@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.wrench import LEAST_FORCE_N, Wrench, wrench_of
 from edge.terminal.progress_bar import tracked
-from edge.wrench import LEAST_FORCE_N, Wrench, wrench_of
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import FrozenPresses
 from train.errors import TrainError

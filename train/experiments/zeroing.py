@@ -1,8 +1,8 @@
 """Drift of a free pad through the runtime's own road: what is left of it, and what of a hold is eaten.
 
-Scans of 100 Hz are played as fast as they are computed, through `edge.runtime` with a bundled model: an hour's hold
-takes less than half a minute. Beside it a baseline that stays as it was taken, and a high-pass of 0.01 Hz, which users
-of such sensors put over their readings. On real recordings the true drift is what is added to them.
+Scans of 100 Hz are played as fast as they are computed, through `edge.perception.runtime` with a bundled model: an
+hour's hold takes less than half a minute. Beside it a baseline that stays as it was taken, and a high-pass of 0.01 Hz,
+which users of such sensors put over their readings. On real recordings the true drift is what is added to them.
 
 Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no scan of theirs goes into a report.
 """
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from edge.frozen import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.runtime import Runtime
-from edge.taps import OFF_COUNTS, ON_COUNTS
+from edge.perception.runtime import Runtime
+from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44

@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.estimate import Filler, Readings, TaxelEstimator
 from edge.inference.contract import Contract
-from edge.result import Result, WrenchOrigin
-from edge.rezero import GIVEN_UP, Rezeroing, in_contact
-from edge.scene import LastReading, TapsThatMatter
-from edge.taps import TapTracker
-from edge.taxels import TaxelWatch
+from edge.perception.change_gate import LastReading, TapsThatMatter
+from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
+from edge.perception.result import Result, WrenchOrigin
+from edge.perception.tap_tracker import TapTracker
+from edge.perception.taxel_health import TaxelWatch
+from edge.perception.zero_on_demand import GIVEN_UP, Rezeroing, in_contact
 from firmware_bridge.baseline import Baseline, BaselineEstimator, deformation
 from firmware_bridge.drift import Drift, DriftTracker
 from firmware_bridge.errors import BaselineRefusedError

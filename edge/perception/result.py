@@ -7,7 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.wrench import Wrench
+from edge.perception.wrench import Wrench
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.drift import Drift
 from firmware_bridge.links.base import SourceKind
@@ -55,7 +55,7 @@ class Result:
             touched ones, in [mm]; None without a deviation.
         traction: (3, h, w) float32, force on the pad per area along x, y and z, z into the pad, over the same face as
             the pattern, in [kPa]; None without a pattern, or where the model gives none.
-        wrench: the traction summed up, see edge.wrench; None without.
+        wrench: the traction summed up, see edge.perception.wrench; None without.
         wrench_origin: "calibrated" where the model was told the sensor's counts per newton, else "nominal": in the
             sensitivity that it was trained for, which is not this sensor's own; None without a wrench.
         reused_from: number of the scan whose pattern this is, where nothing had changed beyond noise since; else None.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from edge.result import Filled
+from edge.perception.result import Filled
 from firmware_bridge.npz import read_npz
 
 RIDGE: Final = 2e-3

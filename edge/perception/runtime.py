@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.asked import check_baselines, check_pads, check_positive, check_whole
-from edge.contact_patch import touched, touched_patch
 from edge.errors import ModelError, WindowError
-from edge.estimate import WIDENING, TaxelEstimator
 from edge.inference.contract import MOST, Contract
 from edge.inference.expected_error import expect
-from edge.result import MADE, Result
-from edge.rezero import REFUSED
-from edge.sensor import Sensor
-from edge.taps import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
-from edge.wrench import wrench_of
+from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator
+from edge.perception.result import MADE, Result
+from edge.perception.sensor_state import Sensor
+from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
+from edge.perception.wrench import wrench_of
+from edge.perception.zero_on_demand import REFUSED
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind

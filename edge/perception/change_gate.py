@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.taps import TapState
+from edge.perception.tap_tracker import TapState
 
 NOISE_COUNTS: Final = 2.0
 """Standard deviation of a reading at rest: 1.7 to 2.6 on record."""
