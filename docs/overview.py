@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.metrics import psnr_db
 from edge.terminal.heatmap import colours
 
 SIDE_PX: Final = 180

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
 from edge.inference.contract import Contract
-from edge.metrics import psnr_db, rmse_percent, ssim
 from edge.perception.result import Result
 from edge.sinks.base import Sink
 from edge.terminal.heatmap import Palette, Panel, draw

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from edge.frozen import FrozenSet
-from edge.metrics import psnr_db
+from edge.evaluation.metrics import psnr_db
+from edge.evaluation.test_set import FrozenSet
 from export.graph import to_model
 from export.int8 import quantised
 from export.parity import GraphRun

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ParityError

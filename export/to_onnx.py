@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from edge.errors import EdgeError
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.terminal.progress_bar import tracked

@@ -22,10 +22,10 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError, ModelError
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.metrics import psnr_db
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
-from edge.metrics import psnr_db
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
 from export.graph import outputs

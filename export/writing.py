@@ -8,10 +8,10 @@ from typing import Any
 
 import onnx
 
-from edge.frozen import FrozenSet
+from edge.evaluation.evaluate import judge_model, mean_error
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession, load_session
-from edge.judge import judge_model, mean_error
 from edge.terminal.progress_bar import tracked
 from export.reference import origin
 from firmware_bridge.in_place import write_in_place

@@ -29,7 +29,7 @@ from edge.bench.record import read_record
 from edge.calibration_cache import CalibrationCache
 from edge.commands import LONGEST_LINE_BYTES, LineCommands
 from edge.errors import EdgeError, ModelError
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession

@@ -21,7 +21,7 @@ from edge.bench.plot import draw
 from edge.bench.subjects import Subject, bundled_subjects, classical_subjects
 from edge.cli import main
 from edge.errors import ModelError
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.onnx_session import ModelSession
 

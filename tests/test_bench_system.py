@@ -14,7 +14,7 @@ from edge.bench.system import Losses, StartUp, SystemRow, latencies_ns
 from edge.bench.timing import summary
 from edge.bench.verdicts import verdicts
 from edge.cli import main
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 
 QUICK = summary([800_000] * 1000)

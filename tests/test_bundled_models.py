@@ -8,11 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from edge.classical import fitted_methods
-from edge.frozen import load_frozen_set
+from edge.evaluation.classical_methods import fitted_methods
+from edge.evaluation.evaluate import by_surface, judge, judge_model, mean_error
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, bundled_models, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.judge import by_surface, judge, judge_model, mean_error
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import load_frozen_presses
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 from edge.errors import EdgeError
+from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 
 
 def test_bilinear_keeps_a_constant():
@@ -49,7 +49,7 @@ def test_bicubic_is_torchs_but_for_the_kernel(scale, monkeypatch):
     torch = pytest.importorskip("torch")
     taxels = np.random.default_rng(3).standard_normal((2, 1, 4, 5))
     other = torch.nn.functional.interpolate(torch.from_numpy(taxels), scale_factor=scale, mode="bicubic")
-    monkeypatch.setattr("edge.classical._CUBIC_A", -0.75)
+    monkeypatch.setattr("edge.evaluation.classical_methods._CUBIC_A", -0.75)
     assert np.allclose(bicubic(taxels, scale), other.numpy(), atol=1e-12)
 
 

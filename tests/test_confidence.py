@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from edge_samples import make_contract
 
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.expected_error import Expected, doubt, expect, is_confidence
 from edge.inference.onnx_session import ModelSession

@@ -7,8 +7,8 @@ from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_con
 from edge import cli, run
 from edge.demo import DemoScore, score_picture, score_table
 from edge.errors import UsageError
+from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
 from edge.inference.bundled import demo_recording
-from edge.metrics import psnr_db, rmse_percent, ssim
 from edge.perception.runtime import Runtime
 from edge.source import Source
 from firmware_bridge.geometry import USPA44

@@ -9,10 +9,10 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, ma
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from edge.frozen import load_frozen_set
+from edge.evaluation.metrics import psnr_db
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.metrics import psnr_db
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import load_estimator

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from train.errors import CheckpointError
 from train.experiments import unseen
 from train.experiments.intervals import Intervals, intervals

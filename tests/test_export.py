@@ -9,10 +9,10 @@ from onnx import numpy_helper
 from test_dataset import make_sequences
 
 from edge.errors import ModelError
-from edge.frozen import FrozenSet
+from edge.evaluation.evaluate import judge, judge_model, mean_error
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, Contract
 from edge.inference.onnx_session import ModelSession
-from edge.judge import judge, judge_model, mean_error
 from export import to_onnx
 from export.errors import ExportError, ParityError
 from export.graph import to_model

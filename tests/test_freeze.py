@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from edge.classical import fitted_methods
 from edge.errors import EdgeError
+from edge.evaluation.classical_methods import fitted_methods
+from edge.evaluation.evaluate import judge
 from edge.inference.bundled import BUNDLE_DIR
-from edge.judge import judge
 from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.recording import load_recording
 from train.data.world import World, solve_pad

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge.frozen import FrozenSet, FrozenSetError, load_frozen_set
+from edge.evaluation.test_set import FrozenSet, FrozenSetError, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 
 

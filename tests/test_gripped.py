@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge.metrics import contact_iou
+from edge.evaluation.metrics import contact_iou
 from firmware_bridge.geometry import USPA44
 from train.depth import Pose, Relief, footprints
 from train.families.shape import NOWHERE_MM

@@ -18,7 +18,7 @@ from edge.bench.errors import BenchError
 from edge.bench.record import read_record
 from edge.calibration_cache import CalibrationCache
 from edge.errors import EdgeError, ModelError
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain, read_model
 from edge.inference.onnx_session import ModelSession

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from edge.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global
+from edge.evaluation.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global
 from edge.perception.contact_patch import touched
 
 

@@ -11,11 +11,11 @@ import torch
 from onnx import numpy_helper
 
 from edge.errors import ModelError
-from edge.frozen import load_frozen_set
+from edge.evaluation.evaluate import judge_model
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
 from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
-from edge.judge import judge_model
 from export import verify as verify_module
 from export.errors import ExportError, ParityError
 from export.graph import outputs

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge.metrics import psnr_db
+from edge.evaluation.metrics import psnr_db
 from train.calibration import interval_coverage
 from train.errors import CheckpointError
 from train.fit import BUNDLED, given_taps, main

@@ -11,7 +11,7 @@ from math import log, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge import metrics
+from edge.evaluation import metrics
 
 LEVEL = 0.9
 

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.expected_error import doubt
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked

@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
-from edge.metrics import contact_iou, psnr_db, ssim
+from edge.evaluation.metrics import contact_iou, psnr_db, ssim
+from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.in_place import write_in_place
 from train.batches import Draw, WindowBatches, network_input
 from train.calibration import calibrate, interval_coverage

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.bench.subjects import Subject
-from edge.classical import CONTACT_LEVEL, fit_gain, fitted_methods
 from edge.errors import ModelError
-from edge.frozen import FrozenSet
+from edge.evaluation.classical_methods import CONTACT_LEVEL, fit_gain, fitted_methods
+from edge.evaluation.evaluate import by_surface, infer_with_intervals, judge, mean_error
+from edge.evaluation.metrics import volume_mm3
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.onnx_session import ModelSession
-from edge.judge import by_surface, infer_with_intervals, judge, mean_error
-from edge.metrics import volume_mm3
 from firmware_bridge.geometry import USPA44
 
 FORCE_RANGE_N: Final = 5.0

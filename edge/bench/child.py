@@ -82,7 +82,7 @@ JOBS: Final[dict[str, Callable[..., Any]]] = {
 
 def _run(subject: dict[str, Any], threads: int) -> Run:
     """Runs on the test set's windows in turn, with all taps that there are."""
-    from edge.frozen import load_frozen_set
+    from edge.evaluation.test_set import load_frozen_set
 
     frozen = load_frozen_set(FROZEN_FILE)
     windows = frozen.windows(1 + frozen.earlier.shape[1])

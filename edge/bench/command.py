@@ -21,9 +21,9 @@ from edge.bench.scene_section import show_savings
 from edge.bench.subjects import Subject
 from edge.bench.system_section import show_system
 from edge.bench.timing import Pace, Times
-from edge.classical import method_macs
 from edge.errors import EdgeError, UsageError
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.classical_methods import method_macs
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
 INTERRUPTED: Final = 130
 """What a shell calls ended by Ctrl-C: unlike a run that is stopped, a bench is then not whole."""

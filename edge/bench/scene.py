@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
-from edge.metrics import psnr_db
+from edge.evaluation.metrics import psnr_db
+from edge.evaluation.test_set import FrozenSet
 from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.runtime import Model, Runtime
 from firmware_bridge.baseline import Baseline

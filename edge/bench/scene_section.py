@@ -9,7 +9,7 @@ from edge.bench.record import Record
 from edge.bench.scene import Saving, savings
 from edge.bench.subjects import Subject
 from edge.bench.tables import head, line
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
 

@@ -8,8 +8,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import fitted_methods
 from edge.errors import ModelError, UsageError
+from edge.evaluation.classical_methods import fitted_methods
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ORT_ERRORS, ModelSession, load_session
 

@@ -31,7 +31,7 @@ from edge.bench.scene import REST, stream
 from edge.bench.subjects import FROZEN_FILE
 from edge.bench.tables import head, line
 from edge.errors import EdgeError
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.packed import unpack

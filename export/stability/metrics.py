@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge import metrics
+from edge.evaluation import metrics
 from export.stability.case import Case, refused, timed
 
 PART: Final = "metrics"

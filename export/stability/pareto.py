@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge.classical import CONTACT_LEVEL, fitted_methods
-from edge.frozen import load_frozen_set
+from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods
+from edge.evaluation.evaluate import judge, judge_model
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
-from edge.judge import judge, judge_model
 from export.stability.case import timed
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.pad import Pad
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from edge.judge import judge
+from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import at_angle, by_angle, compact, mixed, trained

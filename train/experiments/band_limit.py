@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.geometry import USPA44
 from train.experiments.workbench import Workbench
 from train.layer import Layer, inner_displacement, surface_compliance

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import Method, bilinear, fit_gain, fit_linear_map
-from edge.metrics import psnr_db
+from edge.evaluation.classical_methods import Method, bilinear, fit_gain, fit_linear_map
+from edge.evaluation.metrics import psnr_db
 from train.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import FrozenPresses
 from train.data.press_batches import read_presses

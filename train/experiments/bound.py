@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.metrics import psnr_db
+from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import AXES
 from train.experiments.report import Report, Row, with_interval

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.metrics import psnr_db
+from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.calibration import LEVEL

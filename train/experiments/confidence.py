@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import bundled_models
 from edge.inference.contract import Contract
 from edge.inference.expected_error import WORTH_A_TAP, expect_of

@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge import metrics
-from edge.classical import fit_gain
+from edge.evaluation import metrics
+from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import TapTracker
 from firmware_bridge.geometry import USPA44
 from train.dataset import Sequences, between_frames

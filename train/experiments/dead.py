@@ -18,11 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.evaluate import judge
+from edge.evaluation.metrics import interval_coverage
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.judge import judge
-from edge.metrics import interval_coverage
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import STUCK_SCANS, TaxelWatch

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.evaluate import judge
 from edge.inference.onnx_session import ModelSession
-from edge.judge import judge
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.world import World

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.metrics import contact_iou, psnr_db, ssim
+from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, windows
 from train.experiments.methods import Method, classical_methods, compact_methods

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.classical import fit_gain
+from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, windows

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import fit_linear_map
+from edge.evaluation.classical_methods import fit_linear_map
 from firmware_bridge.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import AXES, USPA44

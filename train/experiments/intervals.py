@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from train.calibration import LEVEL, half_width_mm
 from train.errors import CheckpointError
 from train.experiments.report import Row, with_interval

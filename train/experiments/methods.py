@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.classical import CONTACT_LEVEL, fitted_methods, method_macs
-from edge.frozen import FrozenSet
-from edge.judge import judge
+from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, method_macs
+from edge.evaluation.evaluate import judge
+from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.geometry import USPA44
 from train.dataset import Sequences
 from train.errors import TrainError
@@ -65,7 +65,7 @@ def compact_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -
 
 
 def classical_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -> list[Method]:
-    """Methods of edge.classical by name, fitted on windows of `data`."""
+    """Methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
     if not path.exists():
         fitted = fit_classical(data, _QUICK_WINDOWS if bench.quick else CLASSICAL_WINDOWS)

@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from edge.frozen import FrozenSet, load_frozen_set
+from edge.evaluation.evaluate import judge
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.onnx_session import ModelSession
-from edge.judge import judge
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad import GAINS, Pad
 from train.experiments.report import Row

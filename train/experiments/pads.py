@@ -13,8 +13,8 @@ import joblib
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.metrics import psnr_db
 from edge.inference.onnx_session import ModelSession
-from edge.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.presses import PressSet

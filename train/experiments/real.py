@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
-from edge.classical import fit_linear_map, fitted_methods
+from edge.evaluation.classical_methods import fit_linear_map, fitted_methods
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import load_estimator

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from train.dataset import Sequences
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, freeze

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
-from edge.judge import judge
+from edge.evaluation.evaluate import judge
+from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences
 from train.experiments.methods import classical_methods

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from edge.judge import judge
+from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row
 from train.experiments.trainings import at_scale, mixed, trained

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.judge import judge
+from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import alike, mixed, trained

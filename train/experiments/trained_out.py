@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.judge import judge
+from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.trainings import OUT, OUT_EPOCHS, OUT_EPOCHS_MORE, SEQUENCES, epochs, mixed, trained

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any, Final
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from train.dataset import Sequences, join
 from train.experiments.workbench import Workbench
 from train.fit import given_taps

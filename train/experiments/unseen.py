@@ -16,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
-from edge.judge import judge
+from edge.evaluation.evaluate import judge
+from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, join
 from train.experiments.intervals import intervals

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import FrozenPresses, load_frozen_presses
@@ -137,7 +137,7 @@ class Workbench:
 
 
 Figures = dict[str, NDArray[np.float64]]
-"""Every metric of every frame, (n,) each, as edge.judge gives them."""
+"""Every metric of every frame, (n,) each, as edge.evaluation.evaluate gives them."""
 
 
 def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge.frozen import load_frozen_set
+from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Runtime

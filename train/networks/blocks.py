@@ -89,7 +89,7 @@ def initialise(net: nn.Module) -> None:
 
 
 def upsample(window: Tensor, scale: int) -> Tensor:
-    """Bilinear, (n, C, rows, cols) to (n, C, rows*scale, cols*scale); aligned as `edge.classical.bilinear`."""
+    """Bilinear, (n, C, rows, cols) to (n, C, rows*scale, cols*scale); aligned as that of the classical methods."""
     return F.interpolate(window, scale_factor=scale, mode="bilinear", align_corners=False)
 
 

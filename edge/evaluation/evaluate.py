@@ -5,9 +5,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.frozen import FrozenSet
+from edge.evaluation.metrics import (
+    boundary_distance_mm,
+    contact_iou,
+    interval_coverage,
+    psnr_db,
+    rmse_percent,
+    ssim,
+    ssim_global,
+)
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import Contract
-from edge.metrics import boundary_distance_mm, contact_iou, interval_coverage, psnr_db, rmse_percent, ssim, ssim_global
 from edge.perception.runtime import Model
 from firmware_bridge.geometry import USPA44
 
