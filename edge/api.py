@@ -18,9 +18,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge.asked import check_positive, check_whole
-from edge.commands import Command, Commands
-from edge.commissioned import link_to, references, refuse_emulated, settled, with_recorded
 from edge.errors import (
     EdgeError,
     MessageError,
@@ -39,14 +36,17 @@ from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
 from edge.perception.wrench import Wrench
-from edge.pump import pump
+from edge.pipeline.baseline_capture import take_baselines
+from edge.pipeline.commands import Command, Commands
+from edge.pipeline.pump import pump
+from edge.pipeline.result_stream import Stream
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
+from edge.pipeline.source_setup import link_to, references, refuse_emulated, settled, with_recorded
 from edge.sinks import forms
-from edge.sinks.base import Sink
 from edge.sinks.fan import Fan
-from edge.source import Source
-from edge.statistics import Statistics
-from edge.stream import Stream
-from edge.zeroing import take_baselines
+from edge.validation import check_positive, check_whole
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import (
     BaselineRefusedError,
@@ -270,7 +270,7 @@ def open_recording(
         SourceError: its rate is not known, or cannot be.
         SensorFileError: the sensor file cannot be used.
     """
-    from edge import recordings
+    from edge.pipeline import replay_setup as recordings
 
     return recordings.open_recording(path, sensor=sensor, zero=zero, paced=paced, rate_hz=rate_hz)
 

@@ -124,7 +124,7 @@ def _record(arguments: Sequence[str]) -> int:
 
 def _replay(arguments: Sequence[str]) -> int:
     options = understood(replay_parser(), arguments)
-    from edge.recordings import open_recording
+    from edge.pipeline.replay_setup import open_recording
     from edge.run import run
 
     paced = options.paced or options.view is not None  # else it is over before a browser has come

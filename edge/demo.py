@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
 from edge.inference.contract import Contract
 from edge.perception.result import Result
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 from edge.terminal.heatmap import Palette, Panel, draw
 from firmware_bridge.baseline import deformation
 

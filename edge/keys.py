@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
-from edge.commands import RESET, ZERO, Command
+from edge.pipeline.commands import RESET, ZERO, Command
 from edge.terminal.forced_end import before_force
 
 KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}

@@ -17,7 +17,7 @@ from edge.inference.expected_error import is_number
 from edge.inference.onnx_session import ModelSession
 from edge.perception.result import Result, age_text
 from edge.perception.runtime import Model, Runtime
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 from firmware_bridge.schedule import Clock
 
 USUAL_RATE_HZ: Final = 100.0

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 from edge.errors import SinkError, UsageError
+from edge.pipeline.run_statistics import Statistics
 from edge.sinks.forms import check_apart
-from edge.statistics import Statistics
 
 _NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
 """Whose name says what is in them, which a recording is not."""

@@ -4,8 +4,8 @@ import contextlib
 import signal
 from collections.abc import Iterator
 
-from edge.commands import ZERO, AllCommands, Command, Commands, stdin_commands
 from edge.keys import terminal_keys
+from edge.pipeline.commands import ZERO, AllCommands, Command, Commands, stdin_commands
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ from edge.inference.contract import (
     Contract,
 )
 from edge.perception.runtime import Runtime
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import Link
 from firmware_bridge.scan import ABSENT, Scan

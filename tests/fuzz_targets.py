@@ -27,13 +27,13 @@ from edge.bench.compare import compared
 from edge.bench.errors import BenchError
 from edge.bench.record import read_record
 from edge.calibration_cache import CalibrationCache
-from edge.commands import LONGEST_LINE_BYTES, LineCommands
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
 from edge.mcap_file import McapFile
+from edge.pipeline.commands import LONGEST_LINE_BYTES, LineCommands
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count

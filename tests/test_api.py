@@ -33,7 +33,7 @@ from edge.api import (
     save_baselines,
     take_baselines,
 )
-from edge.source import Source
+from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
 
 FRONT = {
@@ -46,7 +46,11 @@ FRONT = {
         "edge.realtime",
     ),  # keys, lines, signals, ...: of a process
     *("edge.sinks.messages", "edge.devices", "edge.demo", "edge.terminal.heatmap"),  # what a person reads
-    *("edge.view.live", "edge.recordings", "edge.new_recording"),  # the page, and what is told of a recording
+    *(
+        "edge.view.live",
+        "edge.pipeline.replay_setup",
+        "edge.new_recording",
+    ),  # the page, and what is told of a recording
     *("edge.doctor.command", "edge.bench.command"),  # commands of their own
 }
 NAN = float("nan")

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from edge.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands
+from edge.pipeline.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands
 from edge.user_commands import user_commands, zero_on_signal
 
 

@@ -8,12 +8,12 @@ from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
 from test_cli import assert_refused, records, run, write_recording
 
 from edge.api import Stream, open_recording, open_runtime, open_source
-from edge.commissioned import references, settled
 from edge.doctor.keep import keep
 from edge.doctor.options import doctor_parser
 from edge.errors import UsageError
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import TaxelWatch
+from edge.pipeline.source_setup import references, settled
 from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.links.ports import Port

@@ -7,9 +7,9 @@ import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from test_pump import run, scans
 
-from edge.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
 from edge.perception.runtime import Runtime
-from edge.statistics import Statistics
+from edge.pipeline.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
+from edge.pipeline.run_statistics import Statistics
 
 MS = 1_000_000
 

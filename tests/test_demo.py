@@ -10,7 +10,7 @@ from edge.errors import UsageError
 from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
 from edge.inference.bundled import demo_recording
 from edge.perception.runtime import Runtime
-from edge.source import Source
+from edge.pipeline.scan_reader import Source
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ScanSeries
 

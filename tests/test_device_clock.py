@@ -8,7 +8,7 @@ from edge_samples import make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.silence import Silence
+from edge.pipeline.silence import Silence
 from firmware_bridge.device_clock import BACK_NS, WINDOW_NS, DeviceClock
 
 US, MS, S = 1_000, 1_000_000, 1_000_000_000

@@ -12,10 +12,10 @@ from test_doctor_command import doctor, recording
 
 from edge import cli
 from edge.api import open_source
-from edge.commissioned import refuse_emulated
 from edge.doctor import keep
 from edge.doctor.keep import check_writable
-from edge.source import Source
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.mounting import Mounting

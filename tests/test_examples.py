@@ -14,7 +14,7 @@ from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_m
 from test_cli import write_recording
 
 from edge.api import Result
-from edge.source import Source
+from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.sensor_file import SensorEntry, SensorFile

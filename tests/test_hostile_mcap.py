@@ -16,7 +16,7 @@ from mcap_samples import OFFSET_NS, make_results, odd_scans, record_into
 
 from edge.api import open_recording, open_sink
 from edge.perception.runtime import Runtime
-from edge.stream import Stream
+from edge.pipeline.result_stream import Stream
 from firmware_bridge import mcap_recording
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.mcap_recording import MOST_RECORD_BYTES

@@ -33,7 +33,12 @@ def test_the_runtime_loads_no_training_library():
 
 def test_contract_and_cli_load_no_onnxruntime():
     assert "onnxruntime" not in loaded(
-        "edge.inference.contract", "edge.api", "edge.cli", "edge.perception.runtime", "edge.pump", "edge.sinks.forms"
+        "edge.inference.contract",
+        "edge.api",
+        "edge.cli",
+        "edge.perception.runtime",
+        "edge.pipeline.pump",
+        "edge.sinks.forms",
     )
 
 
@@ -61,7 +66,8 @@ UNUSED_IN_A_REPLAY = {
 }
 RUN = """
 import sys, threading
-from edge import cli, source
+from edge import cli
+from edge.pipeline import scan_reader as source
 within = []
 taken = source.Source.take
 source.Source.take = lambda *a: within.append([t.name for t in threading.enumerate()]) or taken(*a)

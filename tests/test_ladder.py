@@ -21,8 +21,8 @@ from edge.inference import bundled as bundle
 from edge.inference.onnx_session import ModelSession
 from edge.ladder import Ladder, ModelSteps, candidate_sessions, open_ladder
 from edge.perception.runtime import Runtime
+from edge.pipeline.run_statistics import Statistics
 from edge.sinks.jsonl import JsonLinesSink
-from edge.statistics import Statistics
 
 
 def write(path, taps, psnr_db, /, **changes):

@@ -33,10 +33,10 @@ from edge.errors import SinkError
 from edge.mcap_file import CHUNK_S, McapFile
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
+from edge.pipeline.result_stream import Stream
+from edge.pipeline.scan_reader import Arrival
 from edge.sinks.forms import open_sink
 from edge.sinks.mcap import McapSink
-from edge.source import Arrival
-from edge.stream import Stream
 from firmware_bridge.baseline import save_baselines
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink

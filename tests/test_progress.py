@@ -19,8 +19,9 @@ import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, make_contract, write_model
 
-from edge import cli, recordings
+from edge import cli
 from edge.bench import view
+from edge.pipeline import replay_setup as recordings
 from edge.sinks import status
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
 from train import confidence

@@ -6,12 +6,12 @@ import time
 import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
 
-from edge.commands import RESET
 from edge.errors import SinkClosedError
 from edge.perception.runtime import Runtime
-from edge.pump import pump
-from edge.source import CAPACITY_SCANS, Source
-from edge.statistics import Statistics
+from edge.pipeline.commands import RESET
+from edge.pipeline.pump import pump
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Notice

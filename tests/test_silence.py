@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from edge_samples import make_scan
 
-from edge.deadline import Deadline
-from edge.silence import SETTLING_SCANS, SILENT_NS, Silence
+from edge.pipeline.deadline import Deadline
+from edge.pipeline.silence import SETTLING_SCANS, SILENT_NS, Silence
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS

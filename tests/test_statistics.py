@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.statistics import Histogram, Statistics
+from edge.pipeline.run_statistics import Histogram, Statistics
 
 
 def result(scan, state="idle", run_time_us=None, reused_from=None):

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from view_samples import CONTRACT, TIMEOUT_S, Press, wait_for
 
-from edge.commands import Command, obey
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
-from edge.sinks.base import Sink
+from edge.pipeline.commands import Command, obey
+from edge.pipeline.sink import Sink
 from edge.sinks.forms import open_sink
 from edge.view.access import grant, is_loopback
 from edge.view.asked import LONGEST_BYTES, WAITING, Asked

@@ -14,8 +14,8 @@ from view_samples import TIMEOUT_S, frame
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from edge import recordings
 from edge.cli import main
+from edge.pipeline import replay_setup as recordings
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording import load_recording
 

@@ -16,10 +16,10 @@ from view_samples import CONTRACT, HANDSHAKE, LONG_PING, TIMEOUT_S, Press, Swall
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from edge.commands import Command
 from edge.errors import SinkError
 from edge.perception.event import Event
-from edge.pump import uncollected
+from edge.pipeline.commands import Command
+from edge.pipeline.pump import uncollected
 from edge.view import attended, connections, server
 from edge.view.live import LiveView
 from edge.view.page import PAGE_FILE

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from edge_samples import REST, FakeLink, make_scan
 
-from edge.source import Arrival, Source
-from edge.zeroing import take_baselines
+from edge.pipeline.baseline_capture import take_baselines
+from edge.pipeline.scan_reader import Arrival, Source
 from firmware_bridge.errors import BaselineRefusedError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Notice
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.bench.errors import BenchError
-from edge.pump import uncollected
+from edge.pipeline.pump import uncollected
 from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
 

@@ -37,9 +37,9 @@ from edge.inference.onnx_session import ModelSession
 from edge.packed import unpack
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
+from edge.pipeline.result_stream import Stream
+from edge.pipeline.scan_reader import Source
 from edge.sinks.zenoh import ZenohSink
-from edge.source import Source
-from edge.stream import Stream
 from edge.terminal.argument_types import positive, whole
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.extras import how_to_install

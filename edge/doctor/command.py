@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from edge.commissioned import references, refuse_emulated, settled
 from edge.doctor.examine import examine
 from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.keep import check_writable, keep
 from edge.doctor.visit import Visit
 from edge.doctor.watch import Watch
+from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import LinkLostError, SensorFileError

@@ -5,12 +5,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from edge.asked import check_baselines, check_positive
-from edge.commissioned import link_to, with_recorded
 from edge.doctor.examine import Watched
 from edge.doctor.heard import HeardIds
 from edge.doctor.line_checks import line_facts
 from edge.errors import UsageError
+from edge.pipeline.source_setup import link_to, with_recorded
+from edge.validation import check_baselines, check_positive
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
@@ -43,7 +43,7 @@ class Watch:
         """Prepare to watch.
 
         Args:
-            texts: the source, as in edge.commissioned.link_to; one at most.
+            texts: the source, as in edge.pipeline.source_setup.link_to; one at most.
             known: of the sensors.
             references: what the free pads read before, by sensor.
             rate_hz: to be expected of each sensor, in [Hz].
@@ -51,7 +51,7 @@ class Watch:
             clock_s: the clock of the scans, monotonic, in [s].
 
         Raises:
-            BridgeError: as in edge.commissioned.link_to.
+            BridgeError: as in edge.pipeline.source_setup.link_to.
             UsageError: several sources; a rate or references that cannot be.
         """
         if len(texts) > 1:

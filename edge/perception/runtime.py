@@ -8,7 +8,6 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.asked import check_baselines, check_pads, check_positive, check_whole
 from edge.errors import ModelError, WindowError
 from edge.inference.contract import MOST, Contract
 from edge.inference.expected_error import expect
@@ -19,6 +18,7 @@ from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
 from edge.perception.wrench import wrench_of
 from edge.perception.zero_on_demand import REFUSED
+from edge.validation import check_baselines, check_pads, check_positive, check_whole
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind

@@ -8,7 +8,7 @@ from typing import Final
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 
 LOOK_NS: Final = 500_000_000
 """Between two looks at what sinks report: who reads them may need a moment to be found."""

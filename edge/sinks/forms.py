@@ -7,8 +7,8 @@ from typing import Final
 
 from edge.errors import UsageError
 from edge.inference.contract import Contract
+from edge.pipeline.sink import Sink
 from edge.ros_names import base_topic
-from edge.sinks.base import Sink
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.mounting import Mounting

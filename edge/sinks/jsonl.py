@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
+from edge.pipeline.sink import Sink
 from edge.record import event_record, record
-from edge.sinks.base import Sink
 from edge.sinks.room import has_room, widen
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE

@@ -13,6 +13,7 @@ from edge.inference.contract import Contract
 from edge.mcap_file import McapFile
 from edge.perception.event import Event
 from edge.perception.result import Result
+from edge.pipeline.sink import Sink
 from edge.record import record
 from edge.ros_messages import (
     IMAGE,
@@ -26,7 +27,6 @@ from edge.ros_messages import (
     wrench,
 )
 from edge.ros_names import sensor_path
-from edge.sinks.base import Sink
 from edge.terminal.forced_end import finishing
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.cdr import MessageType

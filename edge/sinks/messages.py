@@ -7,7 +7,7 @@ from typing import Final, TextIO
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 
 CLEAR_LINE: Final = "\r\x1b[K"
 FIRST_HINT_S: Final = 5.0

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from edge.errors import SinkError
 from edge.perception.result import Result
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 from edge.terminal.forced_end import finishing
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.base import SourceKind

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
+from edge.pipeline.sink import Sink
 from edge.record import event_record
 from edge.ros_messages import Vector, force_and_torque, frame_of
 from edge.ros_names import base_topic, sensor_topic
-from edge.sinks.base import Sink
 from edge.sinks.ros2_diagnostics import Diagnosis, Level, diagnose
 from edge.sinks.ros2_domain import join
 from edge.sinks.ros2_types import (

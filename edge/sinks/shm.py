@@ -18,6 +18,7 @@ from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
+from edge.pipeline.sink import Sink
 from edge.shm_layout import (
     FIELDS,
     FILLED,
@@ -36,7 +37,6 @@ from edge.shm_layout import (
     offsets_of,
     struct_of,
 )
-from edge.sinks.base import Sink
 
 _HEAD: Final = struct_of(FIELDS)
 _WRITER_PID_AT: Final = offsets_of(HEADER)["writer_pid"]

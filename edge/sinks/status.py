@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
 from edge.perception.result import Result
-from edge.rate import Rate
-from edge.sinks.base import Sink
+from edge.pipeline.scan_rate import Rate
+from edge.pipeline.sink import Sink
 
 REFRESH_S: Final = 0.1
 SILENCE_S: Final = 1.0

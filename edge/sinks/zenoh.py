@@ -19,8 +19,8 @@ from edge.errors import SinkError, UsageError
 from edge.packed import pack
 from edge.perception.event import Event
 from edge.perception.result import Result
+from edge.pipeline.sink import Sink
 from edge.record import event_record, record
-from edge.sinks.base import Sink
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:

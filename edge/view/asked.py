@@ -4,7 +4,7 @@ import json
 from collections import deque
 from typing import Any, Final
 
-from edge.commands import Command, runtime_command
+from edge.pipeline.commands import Command, runtime_command
 from edge.view.viewer import Viewer
 
 LONGEST_BYTES: Final = 4096

@@ -13,7 +13,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import TAPS_FORGOTTEN
 from edge.perception.zero_on_demand import GIVEN_UP, REFUSED, in_contact
-from edge.rate import Rate
+from edge.pipeline.scan_rate import Rate
 
 TRACE_S: Final = 60.0
 TRACE_POINTS: Final = 1200

@@ -9,10 +9,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, Self
 
-from edge.commands import AllCommands, Commands
 from edge.inference.contract import Contract
 from edge.perception.event import Event
-from edge.sinks.base import Sink
+from edge.pipeline.commands import AllCommands, Commands
+from edge.pipeline.sink import Sink
 from edge.view.access import grant
 from edge.view.asked import Asked
 from edge.view.frames import Run

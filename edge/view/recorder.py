@@ -7,11 +7,11 @@ from pathlib import Path
 from threading import get_native_id
 from typing import Final
 
-from edge.commands import Command, Commands
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.sinks.base import Sink
+from edge.pipeline.commands import Command, Commands
+from edge.pipeline.sink import Sink
 
 FORM: Final = "mcap"
 """Of the sink that is recorded into, and the ending of its files."""

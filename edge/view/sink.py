@@ -6,7 +6,7 @@ from typing import Final
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.sinks.base import Sink
+from edge.pipeline.sink import Sink
 from edge.view.frames import MAX_FPS
 from edge.view.heard import Heard
 

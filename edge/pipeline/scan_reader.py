@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from queue import Empty, SimpleQueue
 from typing import Final, NamedTuple, Self
 
-from edge.commissioned import refuse_emulated
 from edge.errors import UsageError
+from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.links.base import Link, Notice, SourceKind
 from firmware_bridge.scan import Scan
 from firmware_bridge.sensor_file import SensorFile

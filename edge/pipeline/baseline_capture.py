@@ -5,9 +5,9 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from edge.asked import check_whole
-from edge.source import Arrival, Source
+from edge.pipeline.scan_reader import Arrival, Source
 from edge.terminal.progress_bar import Progress
+from edge.validation import check_whole
 from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
 

@@ -4,8 +4,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from edge.commissioned import settled, with_recorded
-from edge.source import Source
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.source_setup import settled, with_recorded
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.changed import ChangedLink

@@ -7,10 +7,10 @@ from typing import Any
 
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
-from edge.sinks.base import Sink
-from edge.source import Source
-from edge.statistics import Statistics
-from edge.stream import Stream
+from edge.pipeline.result_stream import Stream
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
 
 
 @contextmanager

@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Self
 
-from edge.asked import check_positive
-from edge.commands import Commands, obey
-from edge.deadline import Deadline
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.silence import Silence
-from edge.source import POLL_S, Arrival, Source
-from edge.statistics import Statistics
+from edge.pipeline.commands import Commands, obey
+from edge.pipeline.deadline import Deadline
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import POLL_S, Arrival, Source
+from edge.pipeline.silence import Silence
+from edge.validation import check_positive
 from firmware_bridge.links.base import Notice
 
 
