@@ -67,9 +67,9 @@ from firmware_bridge.sensor_file import SensorFile, load_sensor_file
 from firmware_bridge.xela import ID_MAPS
 
 if TYPE_CHECKING:
+    from edge.budgeting.model_steps import Ladder
     from edge.doctor.findings import Finding
     from edge.inference.onnx_session import ModelSession
-    from edge.ladder import Ladder
     from firmware_bridge.links.devices import Found
 
 # What only some need, onnxruntime before all, is imported where it is needed: start-up time and memory are promises.
@@ -332,8 +332,8 @@ def open_ladder(
     check_positive("budget_us", budget_us)
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
-    from edge import ladder
-    from edge.calibration_cache import cache_path
+    from edge.budgeting import model_steps as ladder
+    from edge.budgeting.run_time_cache import cache_path
 
     return ladder.open_ladder(
         find_model(model),

@@ -26,7 +26,7 @@ from mcap.writer import MCAP0_MAGIC
 from edge.bench.compare import compared
 from edge.bench.errors import BenchError
 from edge.bench.record import read_record
-from edge.calibration_cache import CalibrationCache
+from edge.budgeting.run_time_cache import CalibrationCache
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract

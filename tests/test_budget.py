@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.budget import Candidate, choose, ladder_of
+from edge.budgeting.model_choice import Candidate, choose, ladder_of
 
 INT8 = Candidate("stsr-int8", 35.20, 813.0, 1119.0)
 FLOAT = Candidate("stsr", 35.27, 1056.0, 1398.0)

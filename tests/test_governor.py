@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.budget import Candidate
-from edge.governor import FIRST_WAIT_NS, LONGEST_STEP_NS, LONGEST_WAIT_NS, Governor
+from edge.budgeting.model_choice import Candidate
+from edge.budgeting.step_rule import FIRST_WAIT_NS, LONGEST_STEP_NS, LONGEST_WAIT_NS, Governor
 
 LADDER = (
     Candidate("int8", 35.20, 800.0, 1100.0),

@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from edge.bench.errors import BenchError
 from edge.bench.record import read_record
-from edge.calibration_cache import CalibrationCache
+from edge.budgeting.run_time_cache import CalibrationCache
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract

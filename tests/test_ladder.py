@@ -13,13 +13,13 @@ import pytest
 from edge_samples import BASELINE, ROOT, ListSink, make_contract, make_scan, write_model
 
 from edge import cli
-from edge.budget import Candidate, choose
-from edge.calibration import ROUND_TICKS, ROUNDS, RunTime
-from edge.calibration_cache import CalibrationCache, cache_path
+from edge.budgeting.model_choice import Candidate, choose
+from edge.budgeting.model_steps import Ladder, ModelSteps, candidate_sessions, open_ladder
+from edge.budgeting.run_time_cache import CalibrationCache, cache_path
+from edge.budgeting.run_times import ROUND_TICKS, ROUNDS, RunTime
 from edge.errors import ModelError
 from edge.inference import bundled as bundle
 from edge.inference.onnx_session import ModelSession
-from edge.ladder import Ladder, ModelSteps, candidate_sessions, open_ladder
 from edge.perception.runtime import Runtime
 from edge.pipeline.run_statistics import Statistics
 from edge.sinks.jsonl import JsonLinesSink
@@ -115,7 +115,7 @@ class TestOpening:
         return ladder, told
 
     def test_measured_once_then_kept_until_asked_for_anew(self, bundled, tmp_path, monkeypatch):
-        monkeypatch.setattr("edge.ladder.UNEVEN", math.inf)
+        monkeypatch.setattr("edge.budgeting.model_steps.UNEVEN", math.inf)
         model = bundle.find_model("mtsr4")
         first, told = self.open(model, tmp_path)
         assert first is not None and first.model.name == "mtsr4" and first.most_taps == 4
@@ -141,7 +141,7 @@ class TestOpening:
         def busy(models, rate_hz, stop):
             return [RunTime(800.0, 3000.0 if model.name == "stsr" else 1100.0) for model in models]
 
-        monkeypatch.setattr("edge.ladder.calibrate", busy)
+        monkeypatch.setattr("edge.budgeting.model_steps.calibrate", busy)
         for calibrated in ("stsr, stsr-int8", "stsr"):
             ladder, told = self.open(bundle.find_model("stsr"), tmp_path, budget_us=2000.0)
             assert ladder is not None
@@ -310,8 +310,8 @@ class TestCommandLine:
                 for name, model in ladder.models.items():
                     runtime.change_model(model, name)
 
-        monkeypatch.setattr("edge.ladder.calibrate", by_taps)
-        monkeypatch.setattr("edge.ladder.ModelSteps", Hurried)
+        monkeypatch.setattr("edge.budgeting.model_steps.calibrate", by_taps)
+        monkeypatch.setattr("edge.budgeting.model_steps.ModelSteps", Hurried)
         monkeypatch.setattr("sys.stdin", None)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         budget = ["--model", "mtsr4", "--budget-us", "300"]
@@ -323,7 +323,7 @@ class TestCommandLine:
         def stopped(*arguments, stop, **settings):
             stop.set()
 
-        monkeypatch.setattr("edge.ladder.calibrate", stopped)
+        monkeypatch.setattr("edge.budgeting.model_steps.calibrate", stopped)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         assert (
             cli.main(["--source", f"replay:{rest}", "--rate-hz", "100", "--budget-us", "1000", "--sink", "jsonl:-"])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from edge_samples import FakeModel, make_contract
 
-from edge.calibration import LEAST_RATE_HZ, ROUND_TICKS, ROUNDS, RunTime, calibrate
-from edge.calibration_cache import FILE_NAME, CalibrationCache, cache_path, machine
+from edge.budgeting.run_time_cache import FILE_NAME, CalibrationCache, cache_path, machine
+from edge.budgeting.run_times import LEAST_RATE_HZ, ROUND_TICKS, ROUNDS, RunTime, calibrate
 from firmware_bridge.schedule import Ticker
 
 TICKS = ROUNDS * ROUND_TICKS
@@ -124,7 +124,7 @@ class TestCache:
         assert cache(tmp_path, rate_hz=50.0).find(models[0]) is None
         facts = machine()
         for fact in facts:
-            monkeypatch.setattr("edge.calibration_cache.machine", lambda fact=fact: facts | {fact: "another"})
+            monkeypatch.setattr("edge.budgeting.run_time_cache.machine", lambda fact=fact: facts | {fact: "another"})
             assert cache(tmp_path).find(models[0]) is None, fact
 
     def test_nothing_to_keep_writes_nothing(self, tmp_path):

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from edge.budget import Candidate
+from edge.budgeting.model_choice import Candidate
 from firmware_bridge.schedule import NS_PER_S
 
 WINDOW_NS: Final = NS_PER_S

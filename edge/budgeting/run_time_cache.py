@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import onnxruntime
 
-from edge.calibration import ROUND_TICKS, ROUNDS, RunTime
+from edge.budgeting.run_times import ROUND_TICKS, ROUNDS, RunTime
 from firmware_bridge.bounded import read_bounded
 from firmware_bridge.in_place import write_in_place
 

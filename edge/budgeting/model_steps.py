@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from edge.budget import Candidate, Choice, choose
-from edge.calibration import ROUND_TICKS, ROUNDS, RunTime, calibrate
-from edge.calibration_cache import CalibrationCache
+from edge.budgeting.model_choice import Candidate, Choice, choose
+from edge.budgeting.run_time_cache import CalibrationCache
+from edge.budgeting.run_times import ROUND_TICKS, ROUNDS, RunTime, calibrate
+from edge.budgeting.step_rule import Governor
 from edge.errors import ModelError
-from edge.governor import Governor
 from edge.inference.bundled import alternatives, bundled_models
 from edge.inference.expected_error import is_number
 from edge.inference.onnx_session import ModelSession
