@@ -44,8 +44,8 @@ from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import link_to, references, refuse_emulated, settled, with_recorded
-from edge.sinks import forms
-from edge.sinks.fan import Fan
+from edge.sinks import registry as forms
+from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import (

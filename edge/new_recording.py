@@ -9,7 +9,7 @@ from typing import Final
 
 from edge.errors import SinkError, UsageError
 from edge.pipeline.run_statistics import Statistics
-from edge.sinks.forms import check_apart
+from edge.sinks.registry import check_apart
 
 _NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
 """Whose name says what is in them, which a recording is not."""

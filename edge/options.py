@@ -11,7 +11,7 @@ from typing import Final
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, check_thresholds
 from edge.pipeline.baseline_capture import FEWEST_RECORDED
-from edge.sinks.forms import check_apart, check_sink
+from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole
 from firmware_bridge.baseline import FEWEST_SCANS
 

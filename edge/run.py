@@ -34,7 +34,7 @@ from edge.api import (
     open_sink,
     pump,
 )
-from edge.sinks.messages import MessageSink
+from edge.sinks.event_printer import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
 from edge.user_commands import user_commands
 

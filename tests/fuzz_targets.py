@@ -32,8 +32,8 @@ from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
-from edge.mcap_file import McapFile
 from edge.pipeline.commands import LONGEST_LINE_BYTES, LineCommands
+from edge.sinks.mcap_writer import McapFile
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count

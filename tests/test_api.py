@@ -45,7 +45,7 @@ FRONT = {
         "edge.streams",
         "edge.realtime",
     ),  # keys, lines, signals, ...: of a process
-    *("edge.sinks.messages", "edge.devices", "edge.demo", "edge.terminal.heatmap"),  # what a person reads
+    *("edge.sinks.event_printer", "edge.devices", "edge.demo", "edge.terminal.heatmap"),  # what a person reads
     *(
         "edge.view.live",
         "edge.pipeline.replay_setup",

@@ -19,7 +19,7 @@ from view_samples import HANDSHAKE, LONG_PING, Swallowing, wait_for
 from websockets.sync.client import connect
 
 from edge import cli
-from edge.packed import unpack
+from edge.sinks.binary_message import unpack
 from edge.terminal.forced_end import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}

@@ -38,14 +38,14 @@ def test_contract_and_cli_load_no_onnxruntime():
         "edge.cli",
         "edge.perception.runtime",
         "edge.pipeline.pump",
-        "edge.sinks.forms",
+        "edge.sinks.registry",
     )
 
 
 UNUSED_IN_A_REPLAY = {
     "edge.sinks.jsonl",
     "edge.sinks.npz",
-    "edge.sinks.ros2",
+    "edge.sinks.ros2.sink",
     "cyclonedds",
     "tqdm",
     "edge.bench",
@@ -92,4 +92,4 @@ def test_a_run_loads_what_it_uses_and_starts_two_threads(tmp_path):
     assert code == "0", done.stderr
     assert ast.literal_eval(threads) == ["MainThread", "ending", "scan-reader_0"]
     assert not set(ast.literal_eval(modules)) & (UNUSED_IN_A_REPLAY | FORBIDDEN)
-    assert "edge.sinks.status" in ast.literal_eval(modules)
+    assert "edge.sinks.status_line" in ast.literal_eval(modules)

@@ -26,17 +26,19 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_samples import OFFSET_NS, make_results, messages_of, odd_scans, record_into, same_scan
 
-from edge import api, cli, mcap_file, ros_messages
+from edge import api, cli
 from edge.api import open_recording, open_runtime, open_source
 from edge.doctor.watch import Watch
 from edge.errors import SinkError
-from edge.mcap_file import CHUNK_S, McapFile
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Arrival
-from edge.sinks.forms import open_sink
+from edge.sinks import mcap_writer as mcap_file
 from edge.sinks.mcap import McapSink
+from edge.sinks.mcap_writer import CHUNK_S, McapFile
+from edge.sinks.registry import open_sink
+from edge.sinks.ros2 import cdr_messages as ros_messages
 from firmware_bridge.baseline import save_baselines
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink

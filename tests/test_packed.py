@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.errors import MessageError
-from edge.packed import pack, unpack
+from edge.sinks.binary_message import pack, unpack
 
 NAMES = st.text(max_size=8)
 SHAPES = st.lists(st.integers(0, 4), max_size=3).map(tuple)

@@ -22,7 +22,7 @@ from edge_samples import ROOT, make_contract, write_model
 from edge import cli
 from edge.bench import view
 from edge.pipeline import replay_setup as recordings
-from edge.sinks import status
+from edge.sinks import status_line as status
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
 from train import confidence
 

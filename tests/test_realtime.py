@@ -19,9 +19,9 @@ from functools import partial
 from pathlib import Path
 sys.path.insert(0, "tests")
 from edge_samples import make_contract
-from edge.mcap_file import McapFile
+from edge.sinks.mcap_writer import McapFile
 from edge.realtime import realtime
-from edge.sinks.forms import open_sink
+from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
 
 def state():

@@ -9,10 +9,10 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, ma
 
 from edge.perception.runtime import Runtime
 from edge.perception.zero_on_demand import GIVE_UP_NS
+from edge.sinks.event_printer import MessageSink
 from edge.sinks.jsonl import record_line
-from edge.sinks.messages import MessageSink
 from edge.sinks.npz import NpzSink
-from edge.sinks.status import StatusSink
+from edge.sinks.status_line import StatusSink
 from firmware_bridge.baseline import deformation
 from firmware_bridge.scan import Scan
 

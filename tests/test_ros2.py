@@ -22,16 +22,16 @@ from edge_samples import BASELINE, ROOT, make_contract, make_scan, make_wrench_r
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge import ros_messages
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.ros_names import LONGEST_TOPIC, base_topic, sensor_topic
-from edge.sinks import ros2_domain
-from edge.sinks.forms import open_sink
-from edge.sinks.ros2 import Ros2Sink
-from edge.sinks.ros2_diagnostics import Level, diagnose
-from edge.sinks.ros2_types import TYPE_HASHES, DiagnosticArray
+from edge.sinks.registry import open_sink
+from edge.sinks.ros2 import cdr_messages as ros_messages
+from edge.sinks.ros2 import dds_domain as ros2_domain
+from edge.sinks.ros2.dds_types import TYPE_HASHES, DiagnosticArray
+from edge.sinks.ros2.diagnostics import Level, diagnose
+from edge.sinks.ros2.sink import Ros2Sink
+from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
 from firmware_bridge.scan import VendorReading
 
 TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
@@ -475,7 +475,7 @@ def test_a_configuration_that_is_none_is_told(capfd):
 def test_without_the_package_one_line_says_how_to_get_it():
     script = (
         "import sys; sys.modules['cyclonedds'] = None\n"
-        "from edge.sinks.forms import open_sink\n"
+        "from edge.sinks.registry import open_sink\n"
         "try: open_sink('ros2:skin', None)\n"
         "except ValueError as error: print(error)"
     )

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import OFFSET_NS, make_results, odd_scans
 
-from edge import ros_messages
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.record import record
+from edge.sinks.json_record import record
+from edge.sinks.ros2 import cdr_messages as ros_messages
 from firmware_bridge.cdr import HEADER, MessageType, stamp
 from firmware_bridge.errors import CdrError
 from firmware_bridge.scan import VendorReading

@@ -30,9 +30,9 @@ from edge_samples import (
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
-from edge.shm_layout import FIELDS, HEADER, HEARTBEAT_AT, SLOTS, Layout, offsets_of, struct_of
-from edge.sinks.forms import open_sink
+from edge.sinks.registry import open_sink
 from edge.sinks.shm import SharedMemorySink
+from edge.sinks.shm_layout import FIELDS, HEADER, HEARTBEAT_AT, SLOTS, Layout, offsets_of, struct_of
 
 sys.path.append(str(ROOT / "examples"))
 import shm_read

@@ -23,13 +23,13 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.sinks import npz
-from edge.sinks.fan import Fan
-from edge.sinks.forms import FORMS, open_sink
+from edge.sinks.event_printer import MessageSink
+from edge.sinks.fan_out import Fan
 from edge.sinks.jsonl import JsonLinesSink, record_line
-from edge.sinks.messages import MessageSink
 from edge.sinks.npz import NpzSink, gather, parts_dir
-from edge.sinks.room import has_room
-from edge.sinks.status import StatusSink
+from edge.sinks.pipe_capacity import has_room
+from edge.sinks.registry import FORMS, open_sink
+from edge.sinks.status_line import StatusSink
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.recording import load_recording
 from firmware_bridge.scan import ABSENT, VendorReading

@@ -15,7 +15,7 @@ from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.pipeline.commands import Command, obey
 from edge.pipeline.sink import Sink
-from edge.sinks.forms import open_sink
+from edge.sinks.registry import open_sink
 from edge.view.access import grant, is_loopback
 from edge.view.asked import LONGEST_BYTES, WAITING, Asked
 from edge.view.recorder import RecordCommands, Recorder

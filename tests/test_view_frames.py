@@ -9,9 +9,9 @@ import pytest
 from edge_samples import PERIOD_NS
 from view_samples import CONTRACT, Press
 
-from edge.packed import unpack
 from edge.perception.event import Event
-from edge.record import record
+from edge.sinks.binary_message import unpack
+from edge.sinks.json_record import record
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
 from edge.view.heard import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard
 from edge.view.sink import ViewSink

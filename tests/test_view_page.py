@@ -25,8 +25,8 @@ from websockets.sync.client import connect
 
 from edge import view as edge_view
 from edge.inference.bundled import demo_recording
-from edge.packed import unpack
 from edge.perception.wrench import Wrench
+from edge.sinks.binary_message import unpack
 from edge.terminal.heatmap import colours
 from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS

@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import messages_of
 
-from edge import ros_messages
-from edge.packed import unpack
 from edge.perception.wrench import LEAST_FORCE_N, wrench_of
-from edge.record import record
-from edge.ros_messages import force_and_torque
-from edge.sinks.forms import open_sink
+from edge.sinks.binary_message import unpack
+from edge.sinks.json_record import record
 from edge.sinks.jsonl import record_line
 from edge.sinks.mcap import McapSink
-from edge.sinks.ros2_diagnostics import diagnose
+from edge.sinks.registry import open_sink
+from edge.sinks.ros2 import cdr_messages as ros_messages
+from edge.sinks.ros2.cdr_messages import force_and_torque
+from edge.sinks.ros2.diagnostics import diagnose
 from edge.view.frames import Frames, Run, hello
 from edge.view.heard import Heard
 from edge.view.viewer import Viewer

@@ -27,11 +27,11 @@ from edge import api
 from edge.bench.zenoh import PacedLink
 from edge.bench.zenoh import _figures as figures_of
 from edge.errors import SinkError, UsageError
-from edge.packed import unpack
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
-from edge.record import event_record, record
-from edge.sinks.forms import open_sink
+from edge.sinks.binary_message import unpack
+from edge.sinks.json_record import event_record, record
+from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 
 zenoh = pytest.importorskip("zenoh")

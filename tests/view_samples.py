@@ -9,9 +9,9 @@ from functools import partial
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
 from websockets.sync.client import connect
 
-from edge.packed import unpack
 from edge.perception.runtime import Runtime
-from edge.sinks.forms import open_sink
+from edge.sinks.binary_message import unpack
+from edge.sinks.registry import open_sink
 from edge.view.live import LiveView
 
 CONTRACT = make_contract(interval_factor=1.6)

@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from edge.sinks.room import PIPE_BYTES
+from edge.sinks.pipe_capacity import PIPE_BYTES
 from firmware_bridge.truth_files import Told
 
 

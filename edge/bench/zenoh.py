@@ -34,11 +34,11 @@ from edge.errors import EdgeError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.packed import unpack
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
+from edge.sinks.binary_message import unpack
 from edge.sinks.zenoh import ZenohSink
 from edge.terminal.argument_types import positive, whole
 from firmware_bridge.baseline import Baseline

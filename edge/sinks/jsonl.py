@@ -17,8 +17,8 @@ from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.record import event_record, record
-from edge.sinks.room import has_room, widen
+from edge.sinks.json_record import event_record, record
+from edge.sinks.pipe_capacity import has_room, widen
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _DECIMALS: Final = 7

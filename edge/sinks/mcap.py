@@ -10,12 +10,12 @@ from typing import Final
 
 from edge.errors import SinkError
 from edge.inference.contract import Contract
-from edge.mcap_file import McapFile
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.record import record
-from edge.ros_messages import (
+from edge.sinks.json_record import record
+from edge.sinks.mcap_writer import McapFile
+from edge.sinks.ros2.cdr_messages import (
     IMAGE,
     LOG,
     RESULT,
@@ -26,7 +26,7 @@ from edge.ros_messages import (
     result_message,
     wrench,
 )
-from edge.ros_names import sensor_path
+from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.forced_end import finishing
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.cdr import MessageType

@@ -19,7 +19,7 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.pipeline.sink import Sink
-from edge.shm_layout import (
+from edge.sinks.shm_layout import (
     FIELDS,
     FILLED,
     FOLDER,
@@ -45,7 +45,7 @@ _WORD: Final = 8
 
 
 class SharedMemorySink(Sink):
-    """Writes what `edge.shm_layout` describes; readers cost it nothing, however many and slow they are."""
+    """Writes what `edge.sinks.shm_layout` describes; readers cost it nothing, however many and slow they are."""
 
     def __init__(
         self,

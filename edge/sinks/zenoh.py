@@ -16,11 +16,11 @@ from urllib.parse import quote
 import orjson
 
 from edge.errors import SinkError, UsageError
-from edge.packed import pack
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.record import event_record, record
+from edge.sinks.binary_message import pack
+from edge.sinks.json_record import event_record, record
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:

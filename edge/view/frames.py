@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from edge.inference.contract import Contract
-from edge.packed import pack
 from edge.perception.event import Event
-from edge.record import encodable, event_record, record
+from edge.sinks.binary_message import pack
+from edge.sinks.json_record import encodable, event_record, record
 from edge.view.heard import Heard, Newest, Point, Told
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind

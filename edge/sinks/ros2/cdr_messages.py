@@ -139,7 +139,7 @@ def wrench(result: Result, unix_ns: int) -> bytes | None:
 
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
-    """A result without its maps; `record` is what edge.record says of it."""
+    """A result without its maps; `record` is what edge.sinks.json_record says of it."""
     x_mm, y_mm = result.centroid_mm or (math.nan, math.nan)
     numbers = {name: math.nan if (value := getattr(result, name)) is None else value for name in _NUMBERS}
     return RESULT.encode(

@@ -8,7 +8,7 @@ from typing import Final
 from edge.errors import UsageError
 from edge.inference.contract import Contract
 from edge.pipeline.sink import Sink
-from edge.ros_names import base_topic
+from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.mounting import Mounting
@@ -82,7 +82,7 @@ def open_sink(
     # Each loaded only where it is used: start-up time and memory are for what runs.
     form, target = check_sink(text)
     if form == "status":
-        from edge.sinks.status import StatusSink
+        from edge.sinks.status_line import StatusSink
 
         return StatusSink()
     if form == "jsonl":
@@ -120,7 +120,7 @@ def open_sink(
 
         return ZenohSink(target, patient=patient, source=source)
     try:
-        from edge.sinks.ros2 import Ros2Sink
+        from edge.sinks.ros2.sink import Ros2Sink
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "cyclonedds":
             raise

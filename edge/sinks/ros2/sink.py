@@ -20,12 +20,10 @@ from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.record import event_record
-from edge.ros_messages import Vector, force_and_torque, frame_of
-from edge.ros_names import base_topic, sensor_topic
-from edge.sinks.ros2_diagnostics import Diagnosis, Level, diagnose
-from edge.sinks.ros2_domain import join
-from edge.sinks.ros2_types import (
+from edge.sinks.json_record import event_record
+from edge.sinks.ros2.cdr_messages import Vector, force_and_torque, frame_of
+from edge.sinks.ros2.dds_domain import join
+from edge.sinks.ros2.dds_types import (
     TYPE_HASHES,
     DiagnosticArray,
     DiagnosticStatus,
@@ -38,6 +36,8 @@ from edge.sinks.ros2_types import (
     Wrench,
     WrenchStamped,
 )
+from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose
+from edge.sinks.ros2.topic_names import base_topic, sensor_topic
 
 DIAGNOSTICS_S: Final = 1.0
 _DIAGNOSTICS_TOPIC: Final = "diagnostics"

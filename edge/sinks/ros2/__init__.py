@@ -1,0 +1,1 @@
+"""ROS 2: its messages, names and types, and the sink."""
