@@ -40,7 +40,7 @@ from edge.user_commands import user_commands
 
 if TYPE_CHECKING:
     from edge.demo import DemoScore
-    from edge.view.live import LiveView
+    from edge.view.live_view import LiveView
 
 DEMO_HZ: Final = 100.0
 DEMO_REST_SCANS: Final = 100
@@ -156,7 +156,7 @@ def _open_view(options: argparse.Namespace, contract: Contract) -> "contextlib.A
                 option = f"--{name.replace('_', '-')}"
                 raise UsageError(f"{option} is of the live page, which was not asked for: add --view")
         return contextlib.nullcontext()
-    from edge.view.live import LOOPBACK, LiveView
+    from edge.view.live_view import LOOPBACK, LiveView
 
     directory = options.view_record_dir or Path()
     if options.view_record_dir is not None and not os.access(f"{directory}/", os.W_OK | os.X_OK):

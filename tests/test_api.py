@@ -47,7 +47,7 @@ FRONT = {
     ),  # keys, lines, signals, ...: of a process
     *("edge.sinks.event_printer", "edge.devices", "edge.demo", "edge.terminal.heatmap"),  # what a person reads
     *(
-        "edge.view.live",
+        "edge.view.live_view",
         "edge.pipeline.replay_setup",
         "edge.new_recording",
     ),  # the page, and what is told of a recording

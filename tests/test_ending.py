@@ -31,7 +31,8 @@ EDGE_SR = (sys.executable, "-m", "edge.cli")
 NARROW = """
 import socket, sys
 from edge import cli
-from edge.view import attended, server
+from edge.view import server
+from edge.view import viewer_connection as attended
 
 def listen(host, port, listen=server._listen):
     listening = listen(host, port)

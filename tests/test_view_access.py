@@ -17,9 +17,9 @@ from edge.pipeline.commands import Command, obey
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
 from edge.view.access import grant, is_loopback
-from edge.view.asked import LONGEST_BYTES, WAITING, Asked
 from edge.view.recorder import RecordCommands, Recorder
-from edge.view.viewer import Viewer
+from edge.view.viewer_commands import LONGEST_BYTES, WAITING, Asked
+from edge.view.viewer_state import Viewer
 from firmware_bridge.recording import load_recording
 
 TOKEN = "correct-horse-battery"

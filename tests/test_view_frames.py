@@ -13,9 +13,9 @@ from edge.perception.event import Event
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_record import record
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
-from edge.view.heard import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard
+from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard
 from edge.view.sink import ViewSink
-from edge.view.viewer import Viewer
+from edge.view.viewer_state import Viewer
 
 
 class Clock:

@@ -20,9 +20,11 @@ from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.pipeline.commands import Command
 from edge.pipeline.pump import uncollected
-from edge.view import attended, connections, server
-from edge.view.live import LiveView
-from edge.view.page import PAGE_FILE
+from edge.view import connection_limits as connections
+from edge.view import server
+from edge.view import viewer_connection as attended
+from edge.view.live_view import LiveView
+from edge.view.static_page import PAGE_FILE
 from firmware_bridge.recording import load_recording
 
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"

@@ -20,8 +20,8 @@ from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.cdr_messages import force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
 from edge.view.frames import Frames, Run, hello
-from edge.view.heard import Heard
-from edge.view.viewer import Viewer
+from edge.view.run_snapshot import Heard
+from edge.view.viewer_state import Viewer
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS

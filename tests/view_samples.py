@@ -12,7 +12,7 @@ from websockets.sync.client import connect
 from edge.perception.runtime import Runtime
 from edge.sinks.binary_message import unpack
 from edge.sinks.registry import open_sink
-from edge.view.live import LiveView
+from edge.view.live_view import LiveView
 
 CONTRACT = make_contract(interval_factor=1.6)
 TIMEOUT_S = 60.0

@@ -8,7 +8,7 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
 from edge.sinks.json_record import encodable, event_record, record
-from edge.view.heard import Heard, Newest, Point, Told
+from edge.view.run_snapshot import Heard, Newest, Point, Told
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
 

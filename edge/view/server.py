@@ -26,12 +26,12 @@ from websockets.protocol import State
 
 from edge.errors import SinkError
 from edge.view.access import SOCKET, Access
-from edge.view.asked import LONGEST_BYTES, Asked
-from edge.view.attended import Attended
-from edge.view.connections import MOST_VIEWERS, Connection, Connections
+from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
-from edge.view.heard import Heard
-from edge.view.page import load_page
+from edge.view.run_snapshot import Heard
+from edge.view.static_page import load_page
+from edge.view.viewer_commands import LONGEST_BYTES, Asked
+from edge.view.viewer_connection import Attended
 from firmware_bridge.links.base import SourceKind
 
 PERIOD_S: Final = 1 / MAX_FPS

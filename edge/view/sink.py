@@ -8,7 +8,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.view.frames import MAX_FPS
-from edge.view.heard import Heard
+from edge.view.run_snapshot import Heard
 
 PERIOD_NS: Final = round(1e9 / MAX_FPS)
 

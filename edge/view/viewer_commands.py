@@ -5,7 +5,7 @@ from collections import deque
 from typing import Any, Final
 
 from edge.pipeline.commands import Command, runtime_command
-from edge.view.viewer import Viewer
+from edge.view.viewer_state import Viewer
 
 LONGEST_BYTES: Final = 4096
 WAITING: Final = 64

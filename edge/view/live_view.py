@@ -14,12 +14,12 @@ from edge.perception.event import Event
 from edge.pipeline.commands import AllCommands, Commands
 from edge.pipeline.sink import Sink
 from edge.view.access import grant
-from edge.view.asked import Asked
 from edge.view.frames import Run
-from edge.view.heard import Heard
 from edge.view.recorder import FORM, RecordCommands, Recorder
+from edge.view.run_snapshot import Heard
 from edge.view.server import Server
 from edge.view.sink import ViewSink
+from edge.view.viewer_commands import Asked
 from firmware_bridge.links.base import SourceKind
 
 LOOPBACK: Final = "127.0.0.1"

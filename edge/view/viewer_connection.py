@@ -9,7 +9,7 @@ from websockets.asyncio.server import ServerConnection, broadcast
 from websockets.exceptions import ConnectionClosed
 
 from edge.view.frames import Frames
-from edge.view.viewer import Viewer
+from edge.view.viewer_state import Viewer
 
 PING_S: Final = 0.25
 LATE_S: Final = 0.5
