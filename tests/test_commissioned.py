@@ -8,8 +8,8 @@ from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
 from test_cli import assert_refused, records, run, write_recording
 
 from edge.api import Stream, open_recording, open_runtime, open_source
-from edge.doctor.keep import keep
 from edge.doctor.options import doctor_parser
+from edge.doctor.write_sensor_file import keep
 from edge.errors import UsageError
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import TaxelWatch

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
 
+from edge.doctor.can_id_monitor import HeardIds, check_id_map
 from edge.doctor.examine import Watched, examine
 from edge.doctor.findings import Finding, page, worst
-from edge.doctor.heard import HeardIds, check_id_map
-from edge.doctor.line_checks import (
+from edge.doctor.link_checks import (
     LineFacts,
     capacity_hz,
     check_baud,
@@ -15,7 +15,7 @@ from edge.doctor.line_checks import (
     check_link,
     latency_timer_ms,
 )
-from edge.doctor.samples import Samples
+from edge.doctor.scan_statistics import Samples
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.slcan import CanFrame, encode_frame

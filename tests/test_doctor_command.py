@@ -17,9 +17,11 @@ from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
 from edge_samples import ROOT, FakeLink
 
 from edge import cli
-from edge.doctor import command, keep, visit, watch
+from edge.doctor import command, watch
+from edge.doctor import session as visit
+from edge.doctor import write_sensor_file as keep
 from edge.doctor.options import doctor_parser
-from edge.doctor.turns import CORNER_PLACES, CORNERS, orders
+from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, orders
 from firmware_bridge import pseudo_port
 from firmware_bridge.links.ports import Port
 from firmware_bridge.mounting import Mounting

@@ -12,8 +12,8 @@ from test_doctor_command import doctor, recording
 
 from edge import cli
 from edge.api import open_source
-from edge.doctor import keep
-from edge.doctor.keep import check_writable
+from edge.doctor import write_sensor_file as keep
+from edge.doctor.write_sensor_file import check_writable
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.baseline import Baseline

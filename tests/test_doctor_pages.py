@@ -5,9 +5,9 @@ import ast
 import pytest
 from edge_samples import ROOT
 
-from edge.doctor.line_checks import LATENCY_LIMIT_MS
-from edge.doctor.time_checks import USUAL_HZ
-from edge.doctor.verdicts import USUAL_COUNTS_PER_NEWTON
+from edge.doctor.link_checks import LATENCY_LIMIT_MS
+from edge.doctor.press_findings import USUAL_COUNTS_PER_NEWTON
+from edge.doctor.timing_checks import USUAL_HZ
 from edge.doctor.watch import SILENCE_S
 from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS

@@ -9,9 +9,9 @@ from bridge_samples import read_until_lost
 from doctor_samples import finger, healthy_counts, visit
 
 from edge.doctor.examine import check_baseline
-from edge.doctor.press import PATIENCE_S, Answer, GuidedPress
-from edge.doctor.turns import CORNER_PLACES, Press, corner_taxel, find_axes, find_order, orders, z_sign
-from edge.doctor.verdicts import judge_press
+from edge.doctor.pad_orientation import CORNER_PLACES, Press, corner_taxel, find_axes, find_order, orders, z_sign
+from edge.doctor.press_findings import judge_press
+from edge.doctor.press_guide import PATIENCE_S, Answer, GuidedPress
 from firmware_bridge.baseline import deformation
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.mounting import Mounting

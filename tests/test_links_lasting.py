@@ -7,7 +7,7 @@ from queue import SimpleQueue
 import pytest
 from edge_samples import FakeLink, make_scan
 
-from edge.doctor.line_checks import LineFacts, line_facts
+from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links.base import Link, Notice
 from firmware_bridge.links.lasting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink

@@ -8,9 +8,9 @@ from typing import Final, TextIO
 
 from edge.doctor.examine import examine
 from edge.doctor.findings import Finding, page, summary, worst
-from edge.doctor.keep import check_writable, keep
-from edge.doctor.visit import Visit
+from edge.doctor.session import Visit
 from edge.doctor.watch import Watch
+from edge.doctor.write_sensor_file import check_writable, keep
 from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.doctor.can_id_monitor import check_id_map
 from edge.doctor.findings import Finding
-from edge.doctor.heard import check_id_map
-from edge.doctor.line_checks import LineFacts, check_baud, check_latency, check_link
-from edge.doctor.samples import FEWEST_SCANS, Samples
+from edge.doctor.link_checks import LineFacts, check_baud, check_latency, check_link
+from edge.doctor.scan_statistics import FEWEST_SCANS, Samples
 from edge.doctor.taxel_checks import check_drift, check_noise, check_rest, check_silent, check_stuck
-from edge.doctor.time_checks import check_lost, check_rate, check_torn
+from edge.doctor.timing_checks import check_lost, check_rate, check_torn
 from firmware_bridge.baseline import (
     COUNTS_ON_CIRCLE,
     LOAD_LIMIT_COUNTS,

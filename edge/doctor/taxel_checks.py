@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.findings import Finding, Verdict
-from edge.doctor.samples import Samples, around_counts
+from edge.doctor.scan_statistics import Samples, around_counts
 from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.tap_tracker import OFF_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS

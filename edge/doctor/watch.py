@@ -5,9 +5,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+from edge.doctor.can_id_monitor import HeardIds
 from edge.doctor.examine import Watched
-from edge.doctor.heard import HeardIds
-from edge.doctor.line_checks import line_facts
+from edge.doctor.link_checks import line_facts
 from edge.errors import UsageError
 from edge.pipeline.source_setup import link_to, with_recorded
 from edge.validation import check_baselines, check_positive

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from edge.doctor.findings import Finding, Verdict
-from edge.doctor.samples import Samples
+from edge.doctor.scan_statistics import Samples
 
 USUAL_HZ: Final = (70.0, 120.0)
 """Sensors of sixteen taxels were seen at 74 to 113 scans a second."""

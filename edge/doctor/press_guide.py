@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.turns import CORNER_PLACES, CORNERS, Press, corner_taxel
+from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, Press, corner_taxel
 from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.geometry import USPA44
 

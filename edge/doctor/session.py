@@ -8,8 +8,8 @@ from typing import TextIO
 
 from edge.doctor.examine import Examined
 from edge.doctor.findings import Finding
-from edge.doctor.press import GuidedPress
-from edge.doctor.verdicts import judge_press
+from edge.doctor.press_findings import judge_press
+from edge.doctor.press_guide import GuidedPress
 from edge.doctor.watch import READ_TIMEOUT_S, SILENCE_S, Watch
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.text_wrap import columns, wrapped
