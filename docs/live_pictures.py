@@ -61,7 +61,7 @@ def emulator(folder: Path, *tracks: NDArray[np.int32]) -> Emulator:
 def live_page(port: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`edge-sr --view` on a bus, and its address."""
     arguments = ["--source", f"slcan:{port}", "--model", "mtsr4-int8", "--counts-per-newton", "1180", "--every-tap"]
-    command = [sys.executable, "-m", "edge.cli", "--view", "0", *arguments]
+    command = [sys.executable, "-m", "edge.cli.main", "--view", "0", *arguments]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
         try:
             for line in run.stderr or []:

@@ -22,7 +22,7 @@ def loss_ms(folder: Path, after_s: float) -> float:
     """Kill one recorder of the demo so long after its first record."""
     path, told = folder / "killed.mcap", folder / "told.jsonl"
     process = subprocess.Popen(
-        [sys.executable, "-m", "edge.cli", "record", path, "--source", "demo:loop", "--sink", f"jsonl:{told}"],
+        [sys.executable, "-m", "edge.cli.main", "record", path, "--source", "demo:loop", "--sink", f"jsonl:{told}"],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,

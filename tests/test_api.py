@@ -37,19 +37,29 @@ from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
 
 FRONT = {
-    *("edge.api", "edge.run"),
-    *("edge.terminal.argument_types", "edge.options", "edge.doctor.options", "edge.bench.options"),  # what may be asked
+    *("edge.api", "edge.cli.run_command"),
     *(
-        "edge.user_commands",
+        "edge.terminal.argument_types",
+        "edge.cli.run_options",
+        "edge.doctor.options",
+        "edge.bench.options",
+    ),  # what may be asked
+    *(
+        "edge.cli.user_commands",
         "edge.terminal.stop_signals",
-        "edge.streams",
-        "edge.realtime",
+        "edge.cli.standard_streams",
+        "edge.cli.realtime",
     ),  # keys, lines, signals, ...: of a process
-    *("edge.sinks.event_printer", "edge.devices", "edge.demo", "edge.terminal.heatmap"),  # what a person reads
+    *(
+        "edge.sinks.event_printer",
+        "edge.cli.devices_command",
+        "edge.cli.demo_score",
+        "edge.terminal.heatmap",
+    ),  # what a person reads
     *(
         "edge.view.live_view",
         "edge.pipeline.replay_setup",
-        "edge.new_recording",
+        "edge.cli.new_recording",
     ),  # the page, and what is told of a recording
     *("edge.doctor.command", "edge.bench.command"),  # commands of their own
 }
@@ -58,7 +68,7 @@ OURS = ("edge", "firmware_bridge", "train", "export")
 OF_THE_MOMENT = ("time_ns", "run_time_us", "latency_us", "baseline_age_s", "device_time_ns")
 
 
-@pytest.mark.parametrize("module", ["edge/cli.py", "edge/run.py"])
+@pytest.mark.parametrize("module", ["edge/cli/main.py", "edge/cli/run_command.py"])
 def test_the_command_line_imports_nothing_of_the_inside(module):
     imported = set()
     for node in ast.walk(ast.parse((ROOT / module).read_text())):

@@ -19,7 +19,7 @@ from edge.bench.command import Settings, run
 from edge.bench.errors import BenchError
 from edge.bench.plot import draw
 from edge.bench.subjects import Subject, bundled_subjects, classical_subjects
-from edge.cli import main
+from edge.cli.main import main
 from edge.errors import ModelError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, find_model
@@ -178,7 +178,7 @@ def test_without_matplotlib_the_picture_alone_is_missing(bench, tmp_path, monkey
 def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
     arguments = ["bench", "--only", "linear map", "--ticks", "100000", "--threads", "1", "--out", str(tmp_path)]
     with subprocess.Popen(
-        [sys.executable, "-m", "edge.cli", *arguments],
+        [sys.executable, "-m", "edge.cli.main", *arguments],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -13,7 +13,7 @@ from edge.bench.soak import Soak, Window
 from edge.bench.system import Losses, StartUp, SystemRow, latencies_ns
 from edge.bench.timing import summary
 from edge.bench.verdicts import verdicts
-from edge.cli import main
+from edge.cli.main import main
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 

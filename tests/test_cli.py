@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 
-from edge import cli
+from edge.cli import main as cli
 from edge.inference import bundled as bundle
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.links import source
@@ -26,7 +26,7 @@ from firmware_bridge.links.ports import Port
 from firmware_bridge.recording import load_recording
 from firmware_bridge.slcan_emulator import Emulator
 
-EDGE_SR = [sys.executable, "-m", "edge.cli"]
+EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
 TIMEOUT_S = 60
 
 
@@ -116,7 +116,7 @@ class TestHelp:
 
     def test_help_loads_no_onnxruntime(self):
         script = (
-            "import sys\nfrom edge.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+            "import sys\nfrom edge.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
             "sys.exit('onnxruntime' in sys.modules)"
         )
         subprocess.run(

@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
+from edge.cli.user_commands import user_commands, zero_on_signal
 from edge.pipeline.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands
-from edge.user_commands import user_commands, zero_on_signal
 
 
 @pytest.fixture

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_contract, make_scan
 
-from edge import cli, run
-from edge.demo import DemoScore, score_picture, score_table
+from edge.cli import main as cli
+from edge.cli import run_command as run
+from edge.cli.demo_score import DemoScore, score_picture, score_table
 from edge.errors import UsageError
 from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
 from edge.inference.bundled import demo_recording

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from edge import cli
-from edge.devices import NOTHING, SERVER_HINT, page
+from edge.cli import main as cli
+from edge.cli.devices_command import NOTHING, SERVER_HINT, page
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import devices, gs_usb_devices
 from firmware_bridge.links.devices import Found, can_interfaces, serial_devices

@@ -16,7 +16,7 @@ import pytest
 from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
 from edge_samples import ROOT, FakeLink
 
-from edge import cli
+from edge.cli import main as cli
 from edge.doctor import command, watch
 from edge.doctor import session as visit
 from edge.doctor import write_sensor_file as keep
@@ -265,7 +265,16 @@ def test_a_cable_pulled_out_is_3_after_what_was_found(monkeypatch, tmp_path):
 def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
         process = subprocess.Popen(
-            [sys.executable, "-m", "edge.cli", "doctor", "--source", f"slcan:{emulator.port}", "--out", tmp_path / "s"],
+            [
+                sys.executable,
+                "-m",
+                "edge.cli.main",
+                "doctor",
+                "--source",
+                f"slcan:{emulator.port}",
+                "--out",
+                tmp_path / "s",
+            ],
             cwd=ROOT,
             env=os.environ | {"PYTHONPATH": str(ROOT)},
             stdout=subprocess.PIPE,

@@ -10,8 +10,8 @@ from doctor_samples import healthy_counts
 from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, recording
 
-from edge import cli
 from edge.api import open_source
+from edge.cli import main as cli
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.write_sensor_file import check_writable
 from edge.pipeline.scan_reader import Source

@@ -18,19 +18,19 @@ from edge_samples import ROOT, write_model
 from view_samples import HANDSHAKE, LONG_PING, Swallowing, wait_for
 from websockets.sync.client import connect
 
-from edge import cli
+from edge.cli import main as cli
 from edge.sinks.binary_message import unpack
 from edge.terminal.forced_end import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
 LONG_S = 12.0
 """Two seconds are promised; a busy machine may take longer, and what is mended here took a minute or for ever."""
-EDGE_SR = (sys.executable, "-m", "edge.cli")
+EDGE_SR = (sys.executable, "-m", "edge.cli.main")
 # The page over a network that takes little at a time, where over loopback the system would take megabytes in; and what
 # ends a viewer that does not read comes much later than the signal.
 NARROW = """
 import socket, sys
-from edge import cli
+from edge.cli import main as cli
 from edge.view import server
 from edge.view import viewer_connection as attended
 
@@ -49,7 +49,7 @@ ENDLESS = """
 import onnxruntime, numpy as np, sys
 from onnx import TensorProto as Type, helper
 from edge.terminal.stop_signals import stop_on_signals
-from edge.keys import terminal_keys
+from edge.cli.keyboard import terminal_keys
 
 def value(name, kind, shape):
     return helper.make_tensor_value_info(name, kind, shape)

@@ -354,7 +354,7 @@ def test_the_command_refuses_what_cannot_be(capsys):
 def test_kill_9_leaves_whole_records(tmp_path):
     """Of a file of records all but the last line, of an npz every row that was begun and ended."""
     recording = write_recording(tmp_path / "played.csv", make_recording(200).tracks[0].counts, rate_hz=400)
-    command = [sys.executable, "-m", "edge.cli", "--source", f"replay:{recording}", "--rate-hz", "400"]
+    command = [sys.executable, "-m", "edge.cli.main", "--source", f"replay:{recording}", "--rate-hz", "400"]
     command += ["--sink", f"jsonl:{tmp_path}/out.jsonl", "--sink", f"npz:{tmp_path}/out.npz", "--sink", "jsonl:-"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(

@@ -27,7 +27,9 @@ def test_the_runtime_loads_no_training_library():
         for path in sorted((ROOT / package).rglob("*.py"))
         if path.stem != "__init__" and (find_spec("cyclonedds") or "ros2" not in path.parts)
     ]
-    assert {"edge.cli", "edge.inference.onnx_session", "edge.demo", "firmware_bridge.emulator"} <= set(modules)
+    assert {"edge.cli.main", "edge.inference.onnx_session", "edge.cli.demo_score", "firmware_bridge.emulator"} <= set(
+        modules
+    )
     assert not loaded(*modules) & FORBIDDEN
 
 
@@ -35,7 +37,7 @@ def test_contract_and_cli_load_no_onnxruntime():
     assert "onnxruntime" not in loaded(
         "edge.inference.contract",
         "edge.api",
-        "edge.cli",
+        "edge.cli.main",
         "edge.perception.runtime",
         "edge.pipeline.pump",
         "edge.sinks.registry",
@@ -49,9 +51,9 @@ UNUSED_IN_A_REPLAY = {
     "cyclonedds",
     "tqdm",
     "edge.bench",
-    "edge.demo",
+    "edge.cli.demo_score",
     "edge.terminal.heatmap",
-    "edge.realtime",
+    "edge.cli.realtime",
     "firmware_bridge.emulator",
     "firmware_bridge.slcan_emulator",
     "firmware_bridge.links.demo",
@@ -66,7 +68,7 @@ UNUSED_IN_A_REPLAY = {
 }
 RUN = """
 import sys, threading
-from edge import cli
+from edge.cli import main as cli
 from edge.pipeline import scan_reader as source
 within = []
 taken = source.Source.take

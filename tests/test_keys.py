@@ -67,7 +67,7 @@ class Terminal:
             counts=np.stack([scan.counts for scan in scans]),
         )
         self.records = folder / "out.jsonl"
-        command = ["-m", "edge.cli", "--model", folder / "tiny.onnx", "--sink", f"jsonl:{self.records}"]
+        command = ["-m", "edge.cli.main", "--model", folder / "tiny.onnx", "--sink", f"jsonl:{self.records}"]
         command += ["--source", f"replay:{folder / 'rest.npz'}", "--baseline", folder / "zero.json"]
         self.shown = b""
         self._process, self.leader = pty.fork()

@@ -12,11 +12,11 @@ from dataclasses import replace
 import pytest
 from edge_samples import BASELINE, ROOT, ListSink, make_contract, make_scan, write_model
 
-from edge import cli
 from edge.budgeting.model_choice import Candidate, choose
 from edge.budgeting.model_steps import Ladder, ModelSteps, candidate_sessions, open_ladder
 from edge.budgeting.run_time_cache import CalibrationCache, cache_path
 from edge.budgeting.run_times import ROUND_TICKS, ROUNDS, RunTime
+from edge.cli import main as cli
 from edge.errors import ModelError
 from edge.inference import bundled as bundle
 from edge.inference.onnx_session import ModelSession
@@ -265,7 +265,7 @@ def rest(tmp_path_factory):
 
 class TestCommandLine:
     def run(self, rest, cache, *arguments):
-        command = [sys.executable, "-m", "edge.cli", "--source", f"replay:{rest}", "--rate-hz", "1000"]
+        command = [sys.executable, "-m", "edge.cli.main", "--source", f"replay:{rest}", "--rate-hz", "1000"]
         return subprocess.run(
             [*command, "--sink", "jsonl:-", *arguments],
             cwd=ROOT,

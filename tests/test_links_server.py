@@ -23,7 +23,7 @@ from bridge_samples import (
 from edge_samples import ROOT
 from websockets.protocol import State
 
-from edge import cli
+from edge.cli import main as cli
 from firmware_bridge import server_emulator
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server

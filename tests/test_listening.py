@@ -13,7 +13,7 @@ LOOPBACK = ("0100007F", "00000000000000000000000001000000")
 ANY_PEER = {"00000000:0000", "00000000000000000000000000000000:0000"}
 RUN = """
 import socket, sys
-from edge import cli
+from edge.cli import main as cli
 if len(sys.argv) > 1:
     kind = socket.SOCK_DGRAM if sys.argv[1] == "udp" else socket.SOCK_STREAM
     family = socket.AF_INET6 if ":" in sys.argv[2] else socket.AF_INET

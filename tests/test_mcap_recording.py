@@ -26,8 +26,9 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_samples import OFFSET_NS, make_results, messages_of, odd_scans, record_into, same_scan
 
-from edge import api, cli
+from edge import api
 from edge.api import open_recording, open_runtime, open_source
+from edge.cli import main as cli
 from edge.doctor.watch import Watch
 from edge.errors import SinkError
 from edge.perception.event import Event
@@ -48,7 +49,7 @@ from firmware_bridge.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.sensor_file import SensorEntry, SensorFile
 from firmware_bridge.sensor_file_text import save_sensor_file
 
-EDGE_SR = [sys.executable, "-m", "edge.cli"]
+EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
 SURE = make_contract(interval_factor=1.6)
 TURNED = Mounting(order=tuple(reversed(range(16))), swap_xy=True, signs=(1, -1, 1))
 

@@ -12,7 +12,7 @@ import pytest
 from edge_samples import ROOT, ended, make_contract, write_model
 from onnx import helper, numpy_helper
 
-from edge import cli
+from edge.cli import main as cli
 from edge.errors import ModelError
 from edge.inference import onnx_session as session
 from edge.inference.bundled import bundled_models
@@ -154,7 +154,7 @@ def hours_of_work() -> onnx.ModelProto:
 
 PROGRAM = """
 import sys
-from edge import cli
+from edge.cli import main as cli
 from edge.inference import timed_loading as loading
 from edge.inference import onnx_session as session
 loading.LOAD_LIMIT_S = {limit_s}

@@ -19,8 +19,8 @@ import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, make_contract, write_model
 
-from edge import cli
 from edge.bench import view
+from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
@@ -215,7 +215,7 @@ def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeyp
 
 AT_ONCE = """
 import sys
-from edge import cli
+from edge.cli import main as cli
 from edge.terminal import progress_bar as progress
 progress.Progress.__init__.__kwdefaults__["delay_s"] = 0.0
 sys.exit(cli.main(sys.argv[1:]))

@@ -48,7 +48,7 @@ def play(trial, folder) -> Played:
         options = ["--model", folder / "tiny.onnx", "--baseline", folder / f"{trial}.json", "--sink", "jsonl:-"]
         options += ["--give-up-s", "0"]
         done = subprocess.run(
-            [sys.executable, "-m", "edge.cli", "--source", f"slcan:{emulator.port}", *map(str, options)],
+            [sys.executable, "-m", "edge.cli.main", "--source", f"slcan:{emulator.port}", *map(str, options)],
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
             capture_output=True,

@@ -7,8 +7,8 @@ import sys
 import pytest
 from edge_samples import ROOT
 
-from edge import realtime as module
-from edge.realtime import PRIORITY, realtime
+from edge.cli import realtime as module
+from edge.cli.realtime import PRIORITY, realtime
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="these calls are Linux's")
 
@@ -20,7 +20,7 @@ from pathlib import Path
 sys.path.insert(0, "tests")
 from edge_samples import make_contract
 from edge.sinks.mcap_writer import McapFile
-from edge.realtime import realtime
+from edge.cli.realtime import realtime
 from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
 

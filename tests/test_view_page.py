@@ -108,7 +108,7 @@ def open_page(browser):
 def edge_sr(*arguments):
     """`edge-sr --view 0`, and the address that it tells."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "edge.cli", "--view", "0", *map(str, arguments)],
+        [sys.executable, "-m", "edge.cli.main", "--view", "0", *map(str, arguments)],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
         stdin=subprocess.DEVNULL,

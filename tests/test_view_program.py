@@ -14,12 +14,12 @@ from view_samples import TIMEOUT_S, frame
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from edge.cli import main
+from edge.cli.main import main
 from edge.pipeline import replay_setup as recordings
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording import load_recording
 
-DEMO = (sys.executable, "-m", "edge.cli", "--source", "demo")
+DEMO = (sys.executable, "-m", "edge.cli.main", "--source", "demo")
 
 
 @pytest.fixture(scope="module")

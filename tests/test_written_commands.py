@@ -24,7 +24,8 @@ from bridge_samples import write_recording
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT, ListSink
 
-from edge import cli, run
+from edge.cli import main as cli
+from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
 from firmware_bridge.baseline import save_baselines
 from firmware_bridge.links import devices, source

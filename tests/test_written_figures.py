@@ -10,7 +10,7 @@ import numpy as np
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
 
-from edge import cli
+from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import ADDED, Contract
 from firmware_bridge.baseline import save_baselines

@@ -196,7 +196,16 @@ class TestMessages:
             [make_scan(n, press_counts=z).counts + rng.integers(-2, 3, (3, 4, 4)) for n, z in enumerate(presses)]
         )
         write_recording(tmp_path / "taps.csv", counts)
-        command = [sys.executable, "-m", "edge.cli", "replay", f"{tmp_path}/taps.csv", "--zero", "--model", str(model)]
+        command = [
+            sys.executable,
+            "-m",
+            "edge.cli.main",
+            "replay",
+            f"{tmp_path}/taps.csv",
+            "--zero",
+            "--model",
+            str(model),
+        ]
         sinks = ["--sink", f"zenoh:grip?connect={endpoint}", "--sink", f"jsonl:{tmp_path}/out.jsonl"]
         consumer = consume(endpoint)
         done = subprocess.run(

@@ -96,7 +96,15 @@ def _program(folder: Path, port: str, options: Sequence[str]) -> Iterator[subpro
     (folder / "clock" / "sitecustomize.py").write_text(_CLOCK)
     clocked = environment()
     clocked["PYTHONPATH"] = os.pathsep.join([str(folder / "clock"), clocked["PYTHONPATH"]])
-    command = [sys.executable, "-m", "edge.cli", "--source", f"slcan:{port}", "--baseline", str(folder / "zero.json")]
+    command = [
+        sys.executable,
+        "-m",
+        "edge.cli.main",
+        "--source",
+        f"slcan:{port}",
+        "--baseline",
+        str(folder / "zero.json"),
+    ]
     for sink in ("jsonl:-", *failing_sinks(folder)):
         command += ["--sink", sink]
     with subprocess.Popen(

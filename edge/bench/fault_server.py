@@ -83,7 +83,7 @@ def run_against_server(seconds: float, seed: int, folder: Path) -> ServerRan:
     rest[2] += 37 * np.arange(16).reshape(4, 4)
     save_baselines(folder / "zero1.json", [Baseline.of(SENSOR, rest, time.time(), 100, "file")])
     with ServerEmulator(Telling([recording], loop=True), garbage_every=GARBAGE_EVERY) as server:
-        command = [sys.executable, "-m", "edge.cli", "--source", f"xela-server:{server.url}", "--sink", "jsonl:-"]
+        command = [sys.executable, "-m", "edge.cli.main", "--source", f"xela-server:{server.url}", "--sink", "jsonl:-"]
         with subprocess.Popen(
             [*command, "--baseline", str(folder / "zero1.json")],
             stdin=subprocess.DEVNULL,

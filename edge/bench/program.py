@@ -145,7 +145,7 @@ def plain_loop(folder: Path, play: Play) -> Iterator[Program]:
 def edge_sr(folder: Path, play: Play, *options: str, sink: str = "jsonl:-") -> Iterator[Program]:
     """`edge-sr` with stored baselines; files lie in `folder` meanwhile."""
     with _emulator(folder, play) as (port, stamps):
-        command = ["-m", "edge.cli", "--source", f"slcan:{port}", "--baseline", str(folder / "zero.json")]
+        command = ["-m", "edge.cli.main", "--source", f"slcan:{port}", "--baseline", str(folder / "zero.json")]
         with _process([*command, "--sink", sink, *options], stamps) as program:
             yield program
 

@@ -21,7 +21,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     """Have a run recorded, and tell at its end, however it came, what there is.
 
     Args:
-        options: of edge.options.record_parser; a sink is added.
+        options: of edge.cli.run_options.record_parser; a sink is added.
 
     Raises:
         UsageError: a file of another kind is asked for, or a sink writes into it as well.

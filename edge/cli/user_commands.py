@@ -4,7 +4,7 @@ import contextlib
 import signal
 from collections.abc import Iterator
 
-from edge.keys import terminal_keys
+from edge.cli.keyboard import terminal_keys
 from edge.pipeline.commands import ZERO, AllCommands, Command, Commands, stdin_commands
 
 

@@ -34,12 +34,12 @@ from edge.api import (
     open_sink,
     pump,
 )
+from edge.cli.user_commands import user_commands
 from edge.sinks.event_printer import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
-from edge.user_commands import user_commands
 
 if TYPE_CHECKING:
-    from edge.demo import DemoScore
+    from edge.cli.demo_score import DemoScore
     from edge.view.live_view import LiveView
 
 DEMO_HZ: Final = 100.0
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
     """Do what `edge-sr` without a command is asked for.
 
     Args:
-        options: of edge.options.run_parser.
+        options: of edge.cli.run_options.run_parser.
         source: not open yet.
         statistics: filled on the way, so that they are there however the run ends.
 
@@ -130,7 +130,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             if view is not None:
                 sinks += view.sinks
             if options.realtime:  # last: what the page and the sinks have started has no part in it
-                from edge.realtime import realtime
+                from edge.cli.realtime import realtime
 
                 closing.enter_context(realtime(_tell, source.thread_ids))
             pump(
@@ -166,7 +166,7 @@ def _open_view(options: argparse.Namespace, contract: Contract) -> "contextlib.A
 
 
 def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]") -> "DemoScore":
-    from edge.demo import DemoScore
+    from edge.cli.demo_score import DemoScore
 
     score = DemoScore(demo_recording(), contract, on_complete)
     print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
@@ -210,7 +210,7 @@ def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
 
 
 def _print_score(score: "DemoScore", stream: TextIO) -> None:
-    from edge.demo import score_picture, score_table
+    from edge.cli.demo_score import score_picture, score_table
     from edge.terminal.heatmap import choose_palette
 
     scores = score.scores()

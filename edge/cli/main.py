@@ -28,7 +28,7 @@ from edge.api import (
     take_baselines,
     unfinished_load,
 )
-from edge.options import (
+from edge.cli.run_options import (
     baseline_parser,
     devices_parser,
     models_parser,
@@ -37,7 +37,7 @@ from edge.options import (
     run_parser,
     understood,
 )
-from edge.streams import guarded_streams, open_closed_streams
+from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 
 EXIT_DEVICE: Final = 3
@@ -108,14 +108,14 @@ def _follow(options: argparse.Namespace, statistics: Statistics | None = None) -
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate measures for --budget-us, which is not there: add it, or leave both")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
-    from edge.run import run
+    from edge.cli.run_command import run
 
     run(options, source, statistics)
 
 
 def _record(arguments: Sequence[str]) -> int:
     options = understood(record_parser(), arguments)
-    from edge.new_recording import new_recording
+    from edge.cli.new_recording import new_recording
 
     with new_recording(options) as statistics:
         _follow(options, statistics)
@@ -124,8 +124,8 @@ def _record(arguments: Sequence[str]) -> int:
 
 def _replay(arguments: Sequence[str]) -> int:
     options = understood(replay_parser(), arguments)
+    from edge.cli.run_command import run
     from edge.pipeline.replay_setup import open_recording
-    from edge.run import run
 
     paced = options.paced or options.view is not None  # else it is over before a browser has come
     source = open_recording(
@@ -202,7 +202,7 @@ def _bench(arguments: Sequence[str]) -> int:
 
 def _devices(arguments: Sequence[str]) -> int:
     options = devices_parser().parse_args(arguments)
-    from edge.devices import run
+    from edge.cli.devices_command import run
 
     return run(as_json=options.json, stdout=sys.stdout)
 
