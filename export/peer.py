@@ -14,7 +14,7 @@ from typing import Final
 
 import torch
 
-from edge.bench.subjects import WEIGHTS_KEY
+from edge.bench.contenders import WEIGHTS_KEY
 from edge.inference.onnx_session import load_session
 from export.errors import ExportError
 from export.graph import to_model

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from edge_samples import ROOT, make_contract, write_model
 
-from edge.bench import against, command, processes
+from edge.bench import command, processes
+from edge.bench import peer_ratios as against
 from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
 from edge.bench.command import Settings, run
+from edge.bench.contenders import Subject, bundled_subjects, classical_subjects
 from edge.bench.errors import BenchError
 from edge.bench.plot import draw
-from edge.bench.subjects import Subject, bundled_subjects, classical_subjects
 from edge.cli.main import main
 from edge.errors import ModelError
 from edge.evaluation.test_set import load_frozen_set

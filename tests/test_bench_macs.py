@@ -6,9 +6,9 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
+from edge.bench.contenders import peer_weights
 from edge.bench.macs import counted, macs_of
 from edge.bench.peak import peak_gmac_s, product_model
-from edge.bench.subjects import peer_weights
 from edge.errors import ModelError
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession

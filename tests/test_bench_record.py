@@ -12,7 +12,7 @@ from edge.bench.compare import compared
 from edge.bench.errors import BenchError
 from edge.bench.machine import this_machine
 from edge.bench.record import Facts, Record, RunTimeRow, read_record
-from edge.bench.tables import about, compare_text, run_time_columns, run_time_line
+from edge.bench.report import about, compare_text, run_time_columns, run_time_line
 from edge.bench.timing import Pace, Times
 
 

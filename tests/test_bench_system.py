@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 from edge_samples import FakeModel, make_contract
 
-from edge.bench import scene, system, system_section
+from edge.bench import gate_savings as scene
+from edge.bench import system, system_section
 from edge.bench.program import Line, Play, edge_sr, plain_loop
 from edge.bench.soak import Soak, Window
 from edge.bench.system import Losses, StartUp, SystemRow, latencies_ns
+from edge.bench.targets import verdicts
 from edge.bench.timing import summary
-from edge.bench.verdicts import verdicts
 from edge.cli.main import main
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR

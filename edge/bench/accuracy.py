@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bench.subjects import Subject
+from edge.bench.contenders import Subject
 from edge.errors import ModelError
 from edge.evaluation.classical_methods import CONTACT_LEVEL, fit_gain, fitted_methods
 from edge.evaluation.evaluate import by_surface, infer_with_intervals, judge, mean_error

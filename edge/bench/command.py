@@ -7,18 +7,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-from edge.bench import against, intervals, peak, subjects, tables
+from edge.bench import contenders as subjects
+from edge.bench import peak
+from edge.bench import peer_ratios as against
+from edge.bench import ratios as intervals
+from edge.bench import report as tables
 from edge.bench.accuracy import error_rows, force_floor_percent
 from edge.bench.compare import compared
+from edge.bench.contenders import Subject
 from edge.bench.errors import BenchError
+from edge.bench.gate_section import show_savings
+from edge.bench.live_report import Page
 from edge.bench.machine import this_machine
 from edge.bench.macs import macs_of
-from edge.bench.page import Page
 from edge.bench.plot import draw
 from edge.bench.processes import busy_core, measured, start_up
 from edge.bench.record import Facts, Record, RunTimeRow, read_record
-from edge.bench.scene_section import show_savings
-from edge.bench.subjects import Subject
 from edge.bench.system_section import show_system
 from edge.bench.timing import Pace, Times
 from edge.errors import EdgeError, UsageError

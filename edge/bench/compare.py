@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.bench.errors import BenchError
-from edge.bench.intervals import Ratio, ratio_of
+from edge.bench.ratios import Ratio, ratio_of
 from edge.bench.record import Record, RunTimeRow
 
 _DECIDING = ("cpu", "architecture", "usable_cores", "numpy", "onnxruntime")

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from edge.bench.program import Play, Program, edge_sr
-from edge.bench.tables import head, line
+from edge.bench.report import head, line
 from edge.bench.view import free_port
 from edge.terminal.argument_types import whole
 

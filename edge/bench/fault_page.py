@@ -12,8 +12,8 @@ from edge.bench.fault_outages import LONGEST_BACK_S, seconds_to_use
 from edge.bench.fault_records import Ran
 from edge.bench.fault_run import CALM_S
 from edge.bench.fault_server import GARBAGE_EVERY, ServerFound, ServerRan
+from edge.bench.report import head, line
 from edge.bench.soak import slope
-from edge.bench.tables import head, line
 from firmware_bridge.faults.stretches import LINK_FAULTS
 from firmware_bridge.truth_files import Told
 

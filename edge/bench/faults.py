@@ -18,8 +18,8 @@ from edge.bench.fault_judge import judge
 from edge.bench.fault_page import show, show_server
 from edge.bench.fault_run import CALM_S, run_among_faults
 from edge.bench.fault_server import judge_server, run_against_server
+from edge.bench.live_report import Page
 from edge.bench.machine import this_machine
-from edge.bench.page import Page
 
 SETTLE_S: Final = 2.0
 SERVER_S: Final = 20.0

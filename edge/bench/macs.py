@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import onnxruntime
 
-from edge.bench.subjects import random_feeds
+from edge.bench.contenders import random_feeds
 from edge.errors import ModelError
 from edge.inference.onnx_guard import read_model
 from edge.inference.onnx_session import ORT_ERRORS, session_options

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.bench.errors import BenchError
-from edge.bench.front import front
+from edge.bench.pareto import front
 from edge.bench.record import FrontRow
 from firmware_bridge.extras import how_to_install
 

@@ -26,7 +26,7 @@ STARTS: Final = 5
 
 
 def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
-    """What a child says of a job of `edge.bench.child`, numpy's BLAS on as many threads.
+    """What a child says of a job of `edge.bench.worker`, numpy's BLAS on as many threads.
 
     Raises:
         BenchError: it failed; the last line that it said is in it.
@@ -88,7 +88,7 @@ def usable_cores() -> list[int]:
 @contextlib.contextmanager
 def _child(threads: int) -> Iterator[subprocess.Popen[str]]:
     # The same modules as here, whichever way this process came to find them.
-    script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.child import main; sys.exit(main())"
+    script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.worker import main; sys.exit(main())"
     with subprocess.Popen(
         [sys.executable, "-c", script],
         stdin=subprocess.PIPE,

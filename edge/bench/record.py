@@ -10,14 +10,14 @@ from typing import Any, Final
 
 from edge.bench.accuracy import ErrorRow
 from edge.bench.errors import BenchError
-from edge.bench.front import front
-from edge.bench.intervals import Ratio
+from edge.bench.gate_savings import Saving
 from edge.bench.machine import Machine
-from edge.bench.scene import Saving
+from edge.bench.pareto import front
+from edge.bench.ratios import Ratio
 from edge.bench.soak import Soak
 from edge.bench.system import StartUp, SystemRow
+from edge.bench.targets import Verdict
 from edge.bench.timing import Pace, Times
-from edge.bench.verdicts import Verdict
 from firmware_bridge.bounded import read_bounded
 
 FORMAT: Final = "tactile bench"

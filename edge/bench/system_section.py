@@ -2,13 +2,13 @@
 
 from typing import Final
 
-from edge.bench.page import Page
+from edge.bench.live_report import Page
 from edge.bench.record import Record, SystemRecord
+from edge.bench.report import head, line
 from edge.bench.soak import Soak, soak
 from edge.bench.system import ROWS, SystemRow, rows, start_up
-from edge.bench.tables import head, line
+from edge.bench.targets import Verdict, verdicts
 from edge.bench.timing import Times
-from edge.bench.verdicts import Verdict, verdicts
 
 COLUMNS: Final = (
     *("played", "scans", "CPU %", "by threads", "MB"),

@@ -24,12 +24,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from edge.bench.contenders import FROZEN_FILE
 from edge.bench.errors import BenchError
+from edge.bench.gate_savings import REST, stream
+from edge.bench.live_report import Page
 from edge.bench.machine import this_machine
-from edge.bench.page import Page
-from edge.bench.scene import REST, stream
-from edge.bench.subjects import FROZEN_FILE
-from edge.bench.tables import head, line
+from edge.bench.report import head, line
 from edge.errors import EdgeError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from edge.bench.page import Page
+from edge.bench.contenders import Subject
+from edge.bench.gate_savings import Saving, savings
+from edge.bench.live_report import Page
 from edge.bench.record import Record
-from edge.bench.scene import Saving, savings
-from edge.bench.subjects import Subject
-from edge.bench.tables import head, line
+from edge.bench.report import head, line
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession

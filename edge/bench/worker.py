@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge.bench.subjects import FROZEN_FILE, Subject, opened
+from edge.bench.contenders import FROZEN_FILE, Subject, opened
 from edge.bench.timing import Run
 from edge.errors import EdgeError
 
@@ -45,7 +45,7 @@ def _time(subject: dict[str, Any], threads: int, rate_hz: float, ticks: int) -> 
 
 
 def _against(subject: dict[str, Any], peer: dict[str, Any], rounds: int) -> dict[str, Any]:
-    from edge.bench.against import alternated
+    from edge.bench.peer_ratios import alternated
 
     ours_us, peers_us = alternated(_run(subject, 1), _run(peer, 1), rounds)
     return {"subject_us": ours_us, "peer_us": peers_us}

@@ -5,7 +5,7 @@ from typing import Final
 
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow
 from edge.bench.compare import Compared, Comparison, told
-from edge.bench.intervals import Ratio
+from edge.bench.ratios import Ratio
 from edge.bench.record import Facts, FrontRow, Record, RunTimeRow
 from edge.bench.timing import Times
 
