@@ -20,9 +20,10 @@ def in_shell(redirection, *arguments, unbuffered):
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     environment |= {"PYTHONUNBUFFERED": "1"} if unbuffered else {}
     return subprocess.run(
-        ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-m", "edge.cli.main", *map(str,
-        arguments)], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL,
-    env=environment, )  # fmt: skip
+        ["/bin/sh", "-c", f'exec "$@" {redirection}', "sh",
+         sys.executable, "-m", "edge.cli.main", *map(str, arguments)],
+        cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, stdin=subprocess.DEVNULL, env=environment,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("unbuffered", [False, True])

@@ -1,4 +1,4 @@
-"""What every sink offers; adding a sink is one file with this interface and its form in `forms`."""
+"""What every sink offers; adding a sink is one file with this interface and its form in `edge.sinks.registry`."""
 
 from collections.abc import Mapping
 from typing import Protocol
