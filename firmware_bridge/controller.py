@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, CanFrame, encode_frame
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scan import ABSENT
-from firmware_bridge.slcan import LAST_TIMESTAMP_MS, CanFrame, encode_frame
 from firmware_bridge.tracks import Recording, Track
 from firmware_bridge.xela import USPA44_MAP
 

@@ -1,9 +1,9 @@
 """CAN frames to scans, for links that hand out frames. No I/O, no clock."""
 
 from firmware_bridge.assembler import ScanAssembler
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.device_clock import DeviceTime
 from firmware_bridge.scan import Scan
-from firmware_bridge.slcan import CanFrame
 from firmware_bridge.xela import USPA44_MAP, ModelMap, decode
 
 

@@ -12,9 +12,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from firmware_bridge import gs_usb
-from firmware_bridge.gs_usb import BitTiming, BitTimingLimits
-from firmware_bridge.slcan import CanFrame
+from firmware_bridge.can import gs_usb
+from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits
+from firmware_bridge.can.slcan import CanFrame
 
 QUEUE_FRAMES: Final = 64
 CANDLELIGHT: Final = BitTimingLimits(

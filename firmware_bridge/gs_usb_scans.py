@@ -2,10 +2,10 @@
 
 from typing import Final
 
-from firmware_bridge.bus_errors import BusErrors
+from firmware_bridge.can.bus_errors import BusErrors
+from firmware_bridge.can.gs_usb import GsUsbDecoder
 from firmware_bridge.device_clock import DeviceClock
 from firmware_bridge.frame_scans import FrameScans
-from firmware_bridge.gs_usb import GsUsbDecoder
 from firmware_bridge.scan import Scan
 from firmware_bridge.xela import USPA44_MAP, ModelMap
 

@@ -12,11 +12,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, Self
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.faults.injector import Injector
 from firmware_bridge.faults.lines import Piece
 from firmware_bridge.pseudo_port import COUNTED_LATE_NS, PseudoPort
-from firmware_bridge.slcan import CanFrame
 from firmware_bridge.tracks import Recording
 from firmware_bridge.xela import USPA44_MAP
 

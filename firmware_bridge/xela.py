@@ -20,8 +20,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.can.slcan import PACKED_BYTES, CanFrame
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from firmware_bridge.slcan import PACKED_BYTES, CanFrame
 
 PAYLOAD_BYTES: Final = 8
 BOARDS: Final = range(1, 8)

@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from firmware_bridge import gs_usb
+from firmware_bridge.can import gs_usb
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.controller import FRAME_S, Controller, bus_timeline
 from firmware_bridge.gs_usb_scans import GsUsbScans
 from firmware_bridge.scan import Scan
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.tracks import Recording, Track
 from firmware_bridge.xela import USPA44_MAP, ModelMap

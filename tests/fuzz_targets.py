@@ -35,8 +35,9 @@ from edge.inference.onnx_session import ModelSession
 from edge.pipeline.commands import LONGEST_LINE_BYTES, LineCommands
 from edge.sinks.mcap_writer import McapFile
 from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
+from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
+from firmware_bridge.can.slcan import LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.gs_usb_scans import GsUsbScans
 from firmware_bridge.mounting import Mounting
 from firmware_bridge.pad import GAINS, Pad
@@ -46,7 +47,6 @@ from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encod
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.server_scans import ServerScans
-from firmware_bridge.slcan import LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.tracks import HIGHEST_COUNT
 from firmware_bridge.xela import USPA44_MAP

@@ -17,8 +17,8 @@ from edge.doctor.link_checks import (
 )
 from edge.doctor.scan_statistics import Samples
 from firmware_bridge.baseline import Baseline
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.mounting import Mounting
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.xela import ID_MAPS, LAYOUT_A_MAP, USPA44_MAP, XR1944_MAP, trigger_frame
 

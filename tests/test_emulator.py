@@ -14,12 +14,12 @@ import pytest
 import serial
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
 from firmware_bridge.emulator import main
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scan import ABSENT
-from firmware_bridge.slcan import CanFrame
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.tracks import Track

@@ -10,6 +10,7 @@ from bridge_samples import make_counts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.controller import Controller, bus_timeline
 from firmware_bridge.faults.frames import FRAME_FAULTS, READ, BusFrame
 from firmware_bridge.faults.injector import BURST_S, Injector
@@ -17,7 +18,6 @@ from firmware_bridge.faults.lines import LINE_FAULTS, Piece
 from firmware_bridge.faults.stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
 from firmware_bridge.faults.truth import FATES, ROW, Truth
 from firmware_bridge.pseudo_port import PseudoPort
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.tracks import Track
 from firmware_bridge.xela import USPA44_MAP

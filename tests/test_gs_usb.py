@@ -8,13 +8,13 @@ from bridge_samples import make_counts
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from firmware_bridge import gs_usb
-from firmware_bridge.bus_errors import LOST_RECENTLY_NS, BusErrors
+from firmware_bridge.can import gs_usb
+from firmware_bridge.can.bus_errors import LOST_RECENTLY_NS, BusErrors
+from firmware_bridge.can.gs_usb import BitTimingLimits, GsUsbDecoder, HostFrame, bit_timing
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.controller import scan_frames
-from firmware_bridge.gs_usb import BitTimingLimits, GsUsbDecoder, HostFrame, bit_timing
 from firmware_bridge.gs_usb_adapter import CANDLELIGHT
 from firmware_bridge.gs_usb_scans import GsUsbScans
-from firmware_bridge.slcan import CanFrame
 
 SCAN = scan_frames(make_counts(1)[0], 4, random.Random(0))
 

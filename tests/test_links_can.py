@@ -11,6 +11,7 @@ import can
 import pytest
 from bridge_samples import make_counts, read_scans
 
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.controller import scan_frames
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
@@ -18,7 +19,6 @@ from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.can_networks import can_networks
 from firmware_bridge.links.devices import can_interfaces
 from firmware_bridge.links.lasting import LastingLink
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.xela import LAYOUT_A_MAP, trigger_frame, trigger_frames
 

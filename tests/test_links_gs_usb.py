@@ -11,6 +11,7 @@ from bridge_samples import make_counts, read_scans
 from usb.backend import libusb1
 
 from firmware_bridge import gs_usb_emulator
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.controller import scan_frames
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
@@ -19,7 +20,6 @@ from firmware_bridge.links import gs_usb_devices, gs_usb_link
 from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.lasting import LastingLink
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.xela import LAYOUT_A_MAP, trigger_frame, trigger_frames
 

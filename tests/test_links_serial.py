@@ -13,11 +13,11 @@ import pytest
 import serial
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
 
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import bursts, slcan_serial
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scan import Scan
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.tracks import Recording, Track
 from firmware_bridge.xela import LAYOUT_A_MAP, USPA44_MAP, trigger_frame

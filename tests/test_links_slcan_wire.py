@@ -10,15 +10,15 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 from test_links_serial import SilentDevice, wait_for
 
-from firmware_bridge import slcan_status
+from firmware_bridge.can import slcan_status
+from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.can.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.ports import PluggedAdapter, Port
 from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.slcan_scans import SlcanScans
-from firmware_bridge.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
 from firmware_bridge.xela import USPA44_MAP
 
 MS = 1_000_000

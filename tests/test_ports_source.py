@@ -9,6 +9,7 @@ from bridge_samples import make_counts, write_recording
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
 from firmware_bridge.links import source
 from firmware_bridge.links.can_bus import CanBusLink
@@ -18,7 +19,6 @@ from firmware_bridge.links.ports import Port, find_adapter, find_by_serial, seri
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.source import FORMS, open_source
-from firmware_bridge.slcan import CanFrame, encode_frame
 from firmware_bridge.xela import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.slcan import (
+from firmware_bridge.can.slcan import (
     BITRATE_1M,
     CLOSE,
     LINES_TO_LEARN,

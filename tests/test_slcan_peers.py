@@ -11,9 +11,9 @@ from bridge_samples import make_recording, read_scans
 from can.interfaces.slcan import slcanBus
 from test_links_serial import SilentDevice
 
+from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
 from firmware_bridge.controller import SlcanAdapter, scan_frames
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.slcan import CanFrame, SlcanDecoder
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.xela import USPA44_MAP
 

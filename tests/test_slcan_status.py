@@ -1,6 +1,6 @@
 import pytest
 
-from firmware_bridge.slcan_status import (
+from firmware_bridge.can.slcan_status import (
     BUS_ERRORS,
     BUS_OFF,
     FLAGS,

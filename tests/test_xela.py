@@ -1,6 +1,6 @@
 import pytest
 
-from firmware_bridge.slcan import CanFrame, encode_frame
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.xela import (
     LAYOUT_A_MAP,
     LAYOUT_B_MAP,

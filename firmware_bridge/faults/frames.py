@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from firmware_bridge.slcan import CanFrame
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.xela import USPA44_MAP
 
 INTACT: Final = "intact"

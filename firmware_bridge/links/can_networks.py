@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from firmware_bridge.gs_usb import BITRATE_BIT_S
+from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 
 SYS_ROOT: Final = Path("/sys")
 _CAN_TYPE: Final = "280"

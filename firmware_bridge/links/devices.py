@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
+from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
-from firmware_bridge.gs_usb import BITRATE_BIT_S
 from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
 from firmware_bridge.links.ports import NO_PERMISSION, Port, serial_ports
 

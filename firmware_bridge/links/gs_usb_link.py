@@ -12,14 +12,14 @@ import usb.core
 import usb.util
 from usb.backend import IBackend
 
-from firmware_bridge import gs_usb
+from firmware_bridge.can import gs_usb
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.gs_usb_scans import GsUsbScans
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
 from firmware_bridge.links.unread import Unread
 from firmware_bridge.scan import Scan
-from firmware_bridge.slcan import CanFrame
 from firmware_bridge.xela import USPA44_MAP, ModelMap
 
 INTERFACE: Final = 0

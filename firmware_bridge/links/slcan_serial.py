@@ -15,15 +15,15 @@ try:
 except ImportError:
     termios = None
 
+from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
+from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.bursts import BurstReader
 from firmware_bridge.links.ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
 from firmware_bridge.scan import Scan
-from firmware_bridge.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.slcan_scans import SlcanScans
-from firmware_bridge.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.xela import USPA44_MAP, ModelMap
 
 DEFAULT_BAUD: Final = 3_000_000

@@ -24,7 +24,7 @@ import struct
 from binascii import hexlify, unhexlify
 from typing import Final, NamedTuple
 
-from firmware_bridge.slcan_status import AdapterStatus
+from firmware_bridge.can.slcan_status import AdapterStatus
 
 CLOSE: Final = b"C\r"
 BITRATE_1M: Final = b"S8\r"

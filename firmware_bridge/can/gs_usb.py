@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from firmware_bridge.slcan import CanFrame
+from firmware_bridge.can.slcan import CanFrame
 
 BITRATE_BIT_S: Final = 1_000_000
 
