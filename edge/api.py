@@ -61,10 +61,10 @@ from firmware_bridge.errors import (
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.source import DEMO_LOOP
-from firmware_bridge.pad import Pad
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.can_id_maps import ID_MAPS
+from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file import SensorFile, load_sensor_file
-from firmware_bridge.xela import ID_MAPS
 
 if TYPE_CHECKING:
     from edge.budgeting.model_steps import Ladder

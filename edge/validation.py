@@ -8,7 +8,7 @@ from typing import Any
 from edge.errors import UsageError
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import SensorGeometry
-from firmware_bridge.pad import Pad
+from firmware_bridge.scans.pad import Pad
 
 
 def check_positive(name: str, number: Any) -> None:

@@ -16,8 +16,8 @@ from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.geometry import AXES
 from firmware_bridge.in_place import write_in_place
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100

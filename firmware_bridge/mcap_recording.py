@@ -27,9 +27,9 @@ from firmware_bridge.baseline import Baseline
 from firmware_bridge.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.scan import VendorReading, is_sensor_name
 from firmware_bridge.scan_messages import BASELINE, SCAN, decode_baseline, decode_scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import VendorReading, is_sensor_name
 from firmware_bridge.tracks import MOST_SENSORS, MOUNTING_METADATA, SOURCE_METADATA, Recording, Track, origin_of
 
 MOST_RECORD_BYTES: Final = 1 << 25

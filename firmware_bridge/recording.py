@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.npz import read_npz
-from firmware_bridge.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 

@@ -9,10 +9,10 @@ from firmware_bridge.baseline import LAST_UNIX_S, Baseline
 from firmware_bridge.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.errors import CdrError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ABSENT, Scan, VendorReading, is_sensor_name
+from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
+from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.tracks import HIGHEST_COUNT, LAST_TIME_NS
-from firmware_bridge.xela_server import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
 
 _ALL: Final = (1 << USPA44.taxel_count) - 1
 

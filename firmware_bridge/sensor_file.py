@@ -17,9 +17,10 @@ from firmware_bridge.baseline import COUNTS_ON_CIRCLE, Baseline
 from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.pad import GAIN_RANGE, GAINS, PAD_RANGES, Pad
-from firmware_bridge.scan import LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import GAIN_RANGE, GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.sensor_file_table import (
     REMEDY,
     Table,
@@ -34,7 +35,6 @@ from firmware_bridge.sensor_file_table import (
     truth,
     whole,
 )
-from firmware_bridge.xela import ID_MAPS, USPA44_MAP, ModelMap
 
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1

@@ -12,7 +12,7 @@ import numpy as np
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
 from firmware_bridge.recording import CSV_HEADER
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.tracks import Recording, Track
 
 REAL_RECORDINGS = Path(

@@ -4,7 +4,7 @@ import numpy as np
 
 from edge.doctor.examine import Watched
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ABSENT, Scan, ScanSeries
+from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 
 REST = np.array([32_700, 32_900, 37_300])[:, None, None] + np.arange(16).reshape(4, 4) * 37
 COUNTERS = {"received_bytes": 22 * 16 * 400, "frames": 16 * 400, "bad_lines": 0, "refusals": 0}

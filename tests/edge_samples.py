@@ -24,7 +24,7 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import Link
-from firmware_bridge.scan import ABSENT, Scan
+from firmware_bridge.scans.scan import ABSENT, Scan
 
 ROOT = Path(__file__).parent.parent
 PERIOD_NS = 10_000_000

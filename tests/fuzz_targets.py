@@ -38,18 +38,18 @@ from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.can.slcan import LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.gs_usb_scans import GsUsbScans
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.pad import GAINS, Pad
 from firmware_bridge.recording import CSV_HEADER, load_recording
-from firmware_bridge.scan import ABSENT, Scan
 from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import GAINS, Pad
+from firmware_bridge.scans.scan import ABSENT, Scan
+from firmware_bridge.scans.slcan_scans import SlcanScans
+from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
-from firmware_bridge.server_scans import ServerScans
-from firmware_bridge.slcan_scans import SlcanScans
 from firmware_bridge.tracks import HIGHEST_COUNT
-from firmware_bridge.xela import USPA44_MAP
 from train.authors_files import load_authors_taps
 from train.dataset import Sequences, load_sequences
 from train.errors import DatasetError

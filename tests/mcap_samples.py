@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
-from firmware_bridge.scan import ABSENT, Scan, VendorReading
+from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
 
 OFFSET_NS = 1_700_000_000_000_000_000
 

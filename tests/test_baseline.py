@@ -18,7 +18,7 @@ from firmware_bridge.baseline import (
 )
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ABSENT, Scan, ScanSeries
+from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 
 REST = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
 NOISE_COUNTS = np.array([2.6, 2.6, 3.9])[:, None, None]

@@ -13,7 +13,7 @@ from edge.inference.bundled import demo_recording
 from edge.perception.runtime import Runtime
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ScanSeries
+from firmware_bridge.scans.scan import ScanSeries
 
 PRESSES = [0, 0, 2000, 3000, 3500, 0, 2100, 4000, 0]
 TAPS = [-1, -1, 0, 0, -1, -1, 1, 1, -1]

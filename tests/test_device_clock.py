@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.pipeline.silence import Silence
-from firmware_bridge.device_clock import BACK_NS, WINDOW_NS, DeviceClock
+from firmware_bridge.scans.device_clock import BACK_NS, WINDOW_NS, DeviceClock
 
 US, MS, S = 1_000, 1_000_000, 1_000_000_000
 WRAP_US = 1 << 32  # 71.6 minutes

@@ -18,8 +18,8 @@ from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.pad import Pad
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import Pad
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.slcan_emulator import Emulator

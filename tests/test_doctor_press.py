@@ -14,7 +14,7 @@ from edge.doctor.press_findings import judge_press
 from edge.doctor.press_guide import PATIENCE_S, Answer, GuidedPress
 from firmware_bridge.baseline import deformation
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.tracks import Recording, Track
 

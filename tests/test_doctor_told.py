@@ -12,7 +12,7 @@ from edge.doctor import command, watch
 from edge.doctor.findings import Finding, summary
 from edge.doctor.options import doctor_parser
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 

@@ -18,7 +18,7 @@ from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from edge.sinks.jsonl import record_line
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ScanSeries
+from firmware_bridge.scans.scan import ScanSeries
 
 GRID = (4, 4)
 PRESS = 3000

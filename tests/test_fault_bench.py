@@ -30,9 +30,9 @@ from firmware_bridge.faults.injector import Injector
 from firmware_bridge.faults.stretches import LINK_FAULTS, parse_stretches
 from firmware_bridge.faults.truth import FATES, ROW, Truth
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.truth_files import Told
-from firmware_bridge.xela import USPA44_MAP
 
 PERIOD_NS = 10_000_000
 COUNTERS = ("frames", "foreign", "bad_lines", "skipped_bytes", "duplicates")

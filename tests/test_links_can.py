@@ -19,8 +19,8 @@ from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.can_networks import can_networks
 from firmware_bridge.links.devices import can_interfaces
 from firmware_bridge.links.lasting import LastingLink
-from firmware_bridge.slcan_scans import SlcanScans
-from firmware_bridge.xela import LAYOUT_A_MAP, trigger_frame, trigger_frames
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
+from firmware_bridge.scans.slcan_scans import SlcanScans
 
 
 def frames_of(scans, controller=4, seed=0):

@@ -4,7 +4,7 @@ from bridge_samples import make_counts, write_recording
 
 from firmware_bridge.errors import RecordingError, SourceError
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.scan import ABSENT
+from firmware_bridge.scans.scan import ABSENT
 
 START_NS = 7_000_000_000
 

@@ -17,9 +17,9 @@ from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.ports import PluggedAdapter, Port
 from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.slcan_scans import SlcanScans
-from firmware_bridge.xela import USPA44_MAP
 
 MS = 1_000_000
 

@@ -7,7 +7,7 @@ import pytest
 
 from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.xela import USPA44_MAP
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from train.depth import Pose
 from train.hysteresis import frame_weights, maxwell
 from train.nuisances import (

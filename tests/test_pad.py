@@ -21,8 +21,8 @@ from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Runtime
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.pad import GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import GAINS, PAD_RANGES, Pad
 
 GAINED = tuple(np.linspace(0.5, 2, GAINS).tolist())
 PAD = Pad(thickness_mm=5.0, gains=GAINED)

@@ -19,7 +19,7 @@ from firmware_bridge.links.ports import Port, find_adapter, find_by_serial, seri
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.source import FORMS, open_source
-from firmware_bridge.xela import ID_MAPS
+from firmware_bridge.scans.can_id_maps import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
 SECOND_VSCOM = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30XXXXX", "USB-CAN Plus")

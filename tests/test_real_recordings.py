@@ -10,7 +10,7 @@ from bridge_samples import REAL_RECORDINGS, read_until_lost, undisturbed
 
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording import load_recording
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.tracks import Recording
 

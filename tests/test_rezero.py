@@ -14,7 +14,7 @@ from edge.sinks.jsonl import record_line
 from edge.sinks.npz import NpzSink
 from edge.sinks.status_line import StatusSink
 from firmware_bridge.baseline import deformation
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 DAY_S = 86_400.0
 

@@ -32,7 +32,7 @@ from edge.sinks.ros2.dds_types import TYPE_HASHES, DiagnosticArray
 from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import Ros2Sink
 from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
-from firmware_bridge.scan import VendorReading
+from firmware_bridge.scans.scan import VendorReading
 
 TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
 """Whoever else tests on this machine is not heard."""

@@ -19,8 +19,8 @@ from edge.sinks.json_record import record
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from firmware_bridge.cdr import HEADER, MessageType, stamp
 from firmware_bridge.errors import CdrError
-from firmware_bridge.scan import VendorReading
 from firmware_bridge.scan_messages import SCAN, decode_scan, encode_scan
+from firmware_bridge.scans.scan import VendorReading
 
 
 @dataclass

@@ -14,7 +14,7 @@ from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 
 PRESS = 3000
 

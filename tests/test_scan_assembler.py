@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.assembler import LONGEST_SCAN_NS, ScanAssembler, _Sensor
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.device_clock import DeviceClock, DeviceTime
-from firmware_bridge.scan import ABSENT, Scan
-from firmware_bridge.slcan_scans import SlcanScans
-from firmware_bridge.wire_cycle import LONGEST_PAUSE_NS
-from firmware_bridge.xela import USPA44_MAP, XR1944_MAP, Reading
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP, Reading
+from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.scan import ABSENT, Scan
+from firmware_bridge.scans.scan_assembler import LONGEST_SCAN_NS, ScanAssembler, _Sensor
+from firmware_bridge.scans.slcan_scans import SlcanScans
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
 ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
 

@@ -32,7 +32,7 @@ from edge.sinks.registry import FORMS, open_sink
 from edge.sinks.status_line import StatusSink
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.recording import load_recording
-from firmware_bridge.scan import ABSENT, VendorReading
+from firmware_bridge.scans.scan import ABSENT, VendorReading
 
 SHAPES = ((3, 4, 4), (40, 40))
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}

@@ -14,8 +14,8 @@ from test_links_serial import SilentDevice
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
 from firmware_bridge.controller import SlcanAdapter, scan_frames
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.xela import USPA44_MAP
 
 
 def open_peer(port: str) -> slcanBus:

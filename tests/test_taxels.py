@@ -25,8 +25,8 @@ from edge.perception.taxel_health import (
 from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
-from firmware_bridge.scan import ABSENT, ScanSeries
-from firmware_bridge.wire_cycle import LONGEST_PAUSE_NS
+from firmware_bridge.scans.scan import ABSENT, ScanSeries
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
 RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
 NOISE_COUNTS = 2.0

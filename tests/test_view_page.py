@@ -33,7 +33,7 @@ from edge.view.server import MOST_VIEWERS
 from firmware_bridge.baseline import BaselineEstimator, save_baselines
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
-from firmware_bridge.scan import ScanSeries
+from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.slcan_emulator import Emulator
 
 CHROMIUM = shutil.which("chromium")

@@ -1,7 +1,7 @@
 import pytest
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.xela import (
+from firmware_bridge.scans.can_id_maps import (
     LAYOUT_A_MAP,
     LAYOUT_B_MAP,
     USPA44_MAP,

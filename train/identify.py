@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.pad import Pad
+from firmware_bridge.scans.pad import Pad
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from train.data.presses import load_presses

@@ -19,7 +19,7 @@ from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.runtime import Model, Runtime
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import Scan, ScanSeries
+from firmware_bridge.scans.scan import Scan, ScanSeries
 
 SEED: Final = 1
 HELD_SCANS: Final = 100

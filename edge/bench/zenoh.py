@@ -44,7 +44,7 @@ from edge.terminal.argument_types import positive, whole
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import Link
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 PERIOD_NS: Final = 10_000_000
 APART_SCANS: Final = 97

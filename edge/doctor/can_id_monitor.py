@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from edge.doctor.findings import Finding
-from firmware_bridge.xela import ID_MAPS, ModelMap
+from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
 
 _SHOWN = 8
 

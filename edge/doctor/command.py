@@ -15,7 +15,7 @@ from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import LinkLostError, SensorFileError
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file import SensorFile
 
 EXIT_WRONG: Final = 1

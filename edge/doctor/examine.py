@@ -24,10 +24,10 @@ from firmware_bridge.baseline import (
     FEWEST_SCANS as BASELINE_SCANS,
 )
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.xela import USPA44_MAP, ModelMap
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Final
 from edge.doctor.findings import Finding, Verdict
 from edge.doctor.pad_orientation import FEWEST_CORNERS, find_axes, find_order, orders, why_no_order, z_sign
 from edge.doctor.press_guide import Answer
-from firmware_bridge.mounting import AS_MAPPED, Mounting
+from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
 
 USUAL_COUNTS_PER_NEWTON: Final = (900.0, 1700.0)
 """Data sheets and a fit give 1150 to 1370."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.baseline import COUNTS_ON_CIRCLE
-from firmware_bridge.scan import ABSENT, Scan
+from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.schedule import NS_PER_S
 
 PERIODS_TOGETHER: Final = 100

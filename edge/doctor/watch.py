@@ -12,7 +12,7 @@ from edge.errors import UsageError
 from edge.pipeline.source_setup import link_to, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.baseline import Baseline
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file import SensorFile
 

@@ -8,7 +8,7 @@ from firmware_bridge import in_place
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.ports import serial_ports
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 

@@ -11,7 +11,7 @@ from edge.perception.wrench import Wrench
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.drift import Drift
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 MADE: Final = (
     *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),

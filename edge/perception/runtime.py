@@ -22,9 +22,9 @@ from edge.validation import check_baselines, check_pads, check_positive, check_w
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.pad import Pad
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.scan import Scan
 
 OLD_NS: Final = 50_000_000
 """Later by the device's own time stamps than its fastest reading of late: three times what a slow adapter keeps."""

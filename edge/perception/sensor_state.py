@@ -19,9 +19,9 @@ from firmware_bridge.baseline import Baseline, BaselineEstimator, deformation
 from firmware_bridge.drift import Drift, DriftTracker
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.geometry import AXES, SensorGeometry
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.pad import Pad
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.scan import Scan
 
 LONGEST_GAP_NS: Final = 1_000_000_000
 """Between two scans of one sensor: a tap is over within, and the slowest sensor on record gives four."""

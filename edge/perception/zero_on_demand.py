@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 REFUSED: Final = "zeroing refused"
 GIVEN_UP: Final = "zeroing given up"

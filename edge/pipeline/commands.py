@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
-from firmware_bridge.scan import is_sensor_name
+from firmware_bridge.scans.scan import is_sensor_name
 
 READ_BYTES: Final = 4096
 LONGEST_LINE_BYTES: Final = 4096

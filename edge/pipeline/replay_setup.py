@@ -11,9 +11,9 @@ from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.source import place_recordings, recording_paths
-from firmware_bridge.mounting import Mounting
 from firmware_bridge.recording import npz_baselines
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file import SensorEntry
 from firmware_bridge.tracks import Recording
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, Self
 from edge.errors import UsageError
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.links.base import Link, Notice, SourceKind
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file import SensorFile
 
 CAPACITY_SCANS: Final = 1024

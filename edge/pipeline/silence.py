@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from edge.perception.event import Event
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 SILENT_NS: Final = 500_000_000
 """Twice the period of the slowest sensor on record."""

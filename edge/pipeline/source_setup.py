@@ -11,8 +11,8 @@ from firmware_bridge.baseline import Baseline, load_baselines
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.source import DEMO_LOOP, open_sources
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file import PARTS, SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.xela import ID_MAPS, USPA44_MAP, ModelMap
 
 
 def settled(sensor: str | Path | None, id_map: str | None) -> SensorFile:

@@ -10,7 +10,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.perception.wrench import Wrench
 from firmware_bridge.drift import Drift
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 
 def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:

@@ -32,8 +32,8 @@ from firmware_bridge.baseline import Baseline
 from firmware_bridge.cdr import MessageType
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.mounting import Mounting
 from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.tracks import MOUNTING_METADATA, SOURCE_METADATA
 
 EVENTS_TOPIC: Final = "/events"

@@ -11,7 +11,7 @@ from edge.pipeline.sink import Sink
 from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 
 FORMS: Final = (
     *("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz", "mcap:FILE.mcap"),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from firmware_bridge.xela import ID_MAPS, USPA44_MAP
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 
 EXIT_USAGE: Final = 2
 MOST_PORT: Final = 65535

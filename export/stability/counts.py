@@ -17,7 +17,7 @@ from export.stability.case import Case, timed
 from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.drift import COMMON_PER_S
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ScanSeries
+from firmware_bridge.scans.scan import ScanSeries
 
 PART: Final = "counts"
 RATE_HZ: Final = 100.0

@@ -10,7 +10,7 @@ from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Runtime
 from export.stability.case import Case, refused
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 PART: Final = "inputs"
 

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.xela import USPA44_MAP
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 INTACT: Final = "intact"
 READ: Final = (INTACT, "reordered", "repeated", "stuck", "foreign", "flipped")

@@ -15,7 +15,7 @@ import numpy as np
 
 from firmware_bridge.faults.frames import READ, BusFrame
 from firmware_bridge.faults.lines import LINE_ENDS, Piece
-from firmware_bridge.xela import USPA44_MAP
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 FATES: Final = (
     *READ,

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
 
 SourceKind = Literal["device", "replay", "emulated"]
 NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]

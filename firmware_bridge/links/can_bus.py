@@ -11,15 +11,15 @@ from typing import Any, Final, Self
 from firmware_bridge.can.bus_errors import BusErrors
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.device_clock import DeviceClock
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.frame_scans import FrameScans
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.can_networks import can_networks, is_pretended
 from firmware_bridge.links.unread import Unread
-from firmware_bridge.scan import Scan
-from firmware_bridge.xela import USPA44_MAP, ModelMap
+from firmware_bridge.scans.can_frame_scans import FrameScans
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
+from firmware_bridge.scans.device_clock import DeviceClock
+from firmware_bridge.scans.scan import Scan
 
 SEND_TIMEOUT_S: Final = 1.0
 TICK_NS: Final = 1_000

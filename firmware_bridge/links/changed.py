@@ -4,7 +4,7 @@ from abc import abstractmethod
 from typing import Self
 
 from firmware_bridge.links.base import Link, Notice, SourceKind
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 
 class ChangedLink(Link):

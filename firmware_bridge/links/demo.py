@@ -9,7 +9,7 @@ from typing import Final, Self
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 START_TIMEOUT_S: Final = 20.0
 END_TIMEOUT_S: Final = 5.0

@@ -7,7 +7,7 @@ from typing import Final
 
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Notice, NoticeKind, SourceKind
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 FIRST_RETRY_S: Final = 0.1
 SOON_RETRY_S: Final = 0.5

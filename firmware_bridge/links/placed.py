@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.changed import ChangedLink
-from firmware_bridge.mounting import Mounting
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
 
 
 class PlacedLink(ChangedLink):

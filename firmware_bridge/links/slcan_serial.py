@@ -22,9 +22,9 @@ from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.bursts import BurstReader
 from firmware_bridge.links.ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
-from firmware_bridge.scan import Scan
-from firmware_bridge.slcan_scans import SlcanScans
-from firmware_bridge.xela import USPA44_MAP, ModelMap
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.slcan_scans import SlcanScans
 
 DEFAULT_BAUD: Final = 3_000_000
 WRITE_TIMEOUT_S: Final = 1.0

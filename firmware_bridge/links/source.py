@@ -12,8 +12,8 @@ from firmware_bridge.links.base import Link
 from firmware_bridge.links.lasting import LastingLink
 from firmware_bridge.links.ports import find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.several import NamedLink, SeveralLinks
-from firmware_bridge.mounting import Mounting, placed_map
-from firmware_bridge.xela import USPA44_MAP, ModelMap, trigger_frames
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_frames
+from firmware_bridge.scans.mounting import Mounting, placed_map
 
 if TYPE_CHECKING:
     from firmware_bridge.links.slcan_serial import SlcanSerialLink

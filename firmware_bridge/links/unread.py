@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
 
 LONG_UNREAD_NS: Final = 50_000_000
 """More than twice what a link waits for at once: whoever was away for longer did not run."""

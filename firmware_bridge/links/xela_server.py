@@ -20,10 +20,10 @@ from websockets.sync.client import ClientConnection, connect
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import Link, SourceKind
-from firmware_bridge.scan import Scan
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
+from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.server_scans import ServerScans
-from firmware_bridge.xela_server import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
 
 DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0

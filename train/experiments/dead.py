@@ -30,7 +30,7 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
-from firmware_bridge.scan import ABSENT, ScanSeries
+from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from train.experiments.hidden_taxel import recorded_sets, recording_paths, recordings_folder
 from train.experiments.report import Report, Row, with_interval
 from train.experiments.workbench import Workbench, thinned

@@ -28,7 +28,7 @@ from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan import ABSENT, ScanSeries
+from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
 from train.data.world import World, solve_pad

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.mounting import Mounting
+from firmware_bridge.scans.mounting import Mounting
 
 PAD_RANGES: Final = MappingProxyType(
     {

@@ -15,11 +15,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.device_clock import DeviceTime
 from firmware_bridge.geometry import SensorGeometry
-from firmware_bridge.scan import ABSENT, Scan, ScanSeries
-from firmware_bridge.wire_cycle import SHORTEST_PAUSE_NS, WireCycle
-from firmware_bridge.xela import Cycle, ModelMap, Reading
+from firmware_bridge.scans.can_id_maps import Cycle, ModelMap, Reading
+from firmware_bridge.scans.device_clock import DeviceTime
+from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
+from firmware_bridge.scans.wire_cycle import SHORTEST_PAUSE_NS, WireCycle
 
 LONGEST_SCAN_NS: Final = 1_000_000_000
 """The slowest sensor on record renews a taxel four times a second; older readings are another scan's."""

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from firmware_bridge.xela import Cycle
+from firmware_bridge.scans.can_id_maps import Cycle
 
 LONGEST_PAUSE_NS: Final = 60_000_000
 """Between two readings of one scan, whatever the period: the slowest sensor on record has 17 ms there, and an FTDI chip

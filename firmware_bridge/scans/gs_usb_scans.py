@@ -4,10 +4,10 @@ from typing import Final
 
 from firmware_bridge.can.bus_errors import BusErrors
 from firmware_bridge.can.gs_usb import GsUsbDecoder
-from firmware_bridge.device_clock import DeviceClock
-from firmware_bridge.frame_scans import FrameScans
-from firmware_bridge.scan import Scan
-from firmware_bridge.xela import USPA44_MAP, ModelMap
+from firmware_bridge.scans.can_frame_scans import FrameScans
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
+from firmware_bridge.scans.device_clock import DeviceClock
+from firmware_bridge.scans.scan import Scan
 
 TICK_NS: Final = 1_000
 WRAP_TICKS: Final = 1 << 32

@@ -2,12 +2,12 @@
 
 from typing import Final
 
-from firmware_bridge.assembler import ScanAssembler
 from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, CanFrame, SlcanDecoder
 from firmware_bridge.can.slcan_status import AdapterStatus
-from firmware_bridge.device_clock import DeviceClock, DeviceTime
-from firmware_bridge.scan import Scan
-from firmware_bridge.xela import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
+from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 _MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000

@@ -1,10 +1,10 @@
 """CAN frames to scans, for links that hand out frames. No I/O, no clock."""
 
-from firmware_bridge.assembler import ScanAssembler
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.device_clock import DeviceTime
-from firmware_bridge.scan import Scan
-from firmware_bridge.xela import USPA44_MAP, ModelMap, decode
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, decode
+from firmware_bridge.scans.device_clock import DeviceTime
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 
 class FrameScans:

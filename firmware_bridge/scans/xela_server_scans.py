@@ -20,11 +20,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.device_clock import DeviceClock
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from firmware_bridge.scan import ABSENT, Scan, ScanSeries, VendorReading
+from firmware_bridge.scans.device_clock import DeviceClock
+from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
+from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.xela_server import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 
 USUAL_UPS_HZ: Final = 83.0
 """By the vendor's data sheet; for a server that does not tell."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.scan import Scan, VendorReading
-from firmware_bridge.xela import ModelMap
+from firmware_bridge.scans.can_id_maps import ModelMap
+from firmware_bridge.scans.scan import Scan, VendorReading
 
 AS_MAPPED: Final = tuple(range(USPA44.taxel_count))
 _EVEN_GAINS: Final = (1.0,) * (len(AXES) * USPA44.taxel_count)

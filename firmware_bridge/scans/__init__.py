@@ -1,0 +1,1 @@
+"""Frames to taxel readings, readings to scans. No I/O, no clock."""
