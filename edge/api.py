@@ -47,7 +47,6 @@ from edge.pipeline.source_setup import link_to, references, refuse_emulated, set
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
-from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.errors import (
     BaselineRefusedError,
     BridgeError,
@@ -65,6 +64,7 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file import SensorFile, load_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:
     from edge.budgeting.model_steps import Ladder

@@ -6,9 +6,9 @@ from numbers import Integral, Real
 from typing import Any
 
 from edge.errors import UsageError
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import SensorGeometry
 from firmware_bridge.scans.pad import Pad
+from firmware_bridge.zeroing.baseline import Baseline
 
 
 def check_positive(name: str, number: Any) -> None:

@@ -34,7 +34,7 @@ Both compute in float32 and add in another order. Measured from x4 to x20: compa
 FULL_TRACTION_KPA: Final = 100.0
 """Traction of 40 N evenly on the pad: what differences of tractions are a share of, where none is larger."""
 FULL_RANGE_COUNTS: Final = 32768
-"""No zeroed reading is further from rest: `firmware_bridge.baseline.deformation` goes the short way round."""
+"""No zeroed reading is further from rest: `firmware_bridge.zeroing.baseline.deformation` goes the short way round."""
 _DENORMAL_BITS: Final = 0x000116C2
 """Of 1e-40 in float32: written as a number it would be zero wherever onnxruntime has made denormals so."""
 PARITY_WINDOWS: Final = 100

@@ -23,7 +23,6 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.geometry import USPA44
@@ -31,6 +30,7 @@ from firmware_bridge.scan_messages import BASELINE, SCAN, decode_baseline, decod
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import VendorReading, is_sensor_name
 from firmware_bridge.tracks import MOST_SENSORS, MOUNTING_METADATA, SOURCE_METADATA, Recording, Track, origin_of
+from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_RECORD_BYTES: Final = 1 << 25
 """Of one record, and of what a chunk unpacks to: writers make chunks of one to a few megabytes."""

@@ -21,7 +21,7 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 
 if TYPE_CHECKING:
-    from firmware_bridge.baseline import Baseline
+    from firmware_bridge.zeroing.baseline import Baseline
 
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
@@ -201,7 +201,10 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
     Raises:
         RecordingError: what stands there cannot be a baseline.
     """
-    from firmware_bridge.baseline import LAST_UNIX_S, Baseline  # which most who read a recording have no need of
+    from firmware_bridge.zeroing.baseline import (  # which most who read a recording have no need of
+        LAST_UNIX_S,
+        Baseline,
+    )
 
     path = recording.path
     try:

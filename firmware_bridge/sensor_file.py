@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.baseline import COUNTS_ON_CIRCLE, Baseline
 from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
@@ -35,6 +34,7 @@ from firmware_bridge.sensor_file_table import (
     truth,
     whole,
 )
+from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, Baseline
 
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import PAD_RANGES, Pad
 from firmware_bridge.sensor_file import FILE_FORMAT, FILE_VERSION, PARTS, SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline
 
 
 def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:

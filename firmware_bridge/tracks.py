@@ -12,8 +12,8 @@ from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.schedule import NS_PER_S
 
 if TYPE_CHECKING:
-    from firmware_bridge.baseline import Baseline
     from firmware_bridge.scans.mounting import Mounting
+    from firmware_bridge.zeroing.baseline import Baseline
 
 MOUNTING_METADATA: Final = "mounting"
 """Of an MCAP file: one a sensor."""

@@ -22,9 +22,9 @@ from edge.inference.contract import (
 )
 from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.base import Link
 from firmware_bridge.scans.scan import ABSENT, Scan
+from firmware_bridge.zeroing.baseline import Baseline
 
 ROOT = Path(__file__).parent.parent
 PERIOD_NS = 10_000_000

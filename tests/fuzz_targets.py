@@ -34,7 +34,6 @@ from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
 from edge.pipeline.commands import LONGEST_LINE_BYTES, LineCommands
 from edge.sinks.mcap_writer import McapFile
-from firmware_bridge.baseline import Baseline, load_baselines, save_baselines
 from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.can.slcan import LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.errors import RecordingError, SensorFileError
@@ -50,6 +49,7 @@ from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
 from firmware_bridge.tracks import HIGHEST_COUNT
+from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 from train.authors_files import load_authors_taps
 from train.dataset import Sequences, load_sequences
 from train.errors import DatasetError

@@ -8,7 +8,10 @@ from edge_samples import make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.baseline import (
+from firmware_bridge.errors import BaselineRefusedError, RecordingError
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
+from firmware_bridge.zeroing.baseline import (
     LOAD_LIMIT_COUNTS,
     Baseline,
     BaselineEstimator,
@@ -16,9 +19,6 @@ from firmware_bridge.baseline import (
     load_baselines,
     save_baselines,
 )
-from firmware_bridge.errors import BaselineRefusedError, RecordingError
-from firmware_bridge.geometry import USPA44
-from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 
 REST = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
 NOISE_COUNTS = np.array([2.6, 2.6, 3.9])[:, None, None]

@@ -14,7 +14,6 @@ from edge.errors import UsageError
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import TaxelWatch
 from edge.pipeline.source_setup import references, settled
-from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.links.ports import Port
 from firmware_bridge.links.source import open_sources
@@ -23,6 +22,7 @@ from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, -1))
 

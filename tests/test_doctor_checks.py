@@ -16,11 +16,11 @@ from edge.doctor.link_checks import (
     latency_timer_ms,
 )
 from edge.doctor.scan_statistics import Samples
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, USPA44_MAP, XR1944_MAP, trigger_frame
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.slcan_scans import SlcanScans
+from firmware_bridge.zeroing.baseline import Baseline
 
 FULL = {"rate": "not known", "baud rate": "wrong", "latency timer": "not known"}
 FREE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")

@@ -10,7 +10,7 @@ from edge.doctor.press_findings import USUAL_COUNTS_PER_NEWTON
 from edge.doctor.timing_checks import USUAL_HZ
 from edge.doctor.watch import SILENCE_S
 from edge.perception.tap_tracker import ON_COUNTS
-from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS
+from firmware_bridge.zeroing.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS
 
 PAGE = (ROOT / "docs" / "trouble.md").read_text()
 REMEDIES = {"remedy", "off", "busy", "_LOSS_REMEDY", "_OVERLOADED", "_AGAIN"}

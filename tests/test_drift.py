@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, REST
 
-from firmware_bridge.baseline import Baseline, deformation
-from firmware_bridge.drift import COMMON_COUNTS, GAP_NS, OWN_PER_S, STEP_COUNTS, DriftTracker
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
+from firmware_bridge.zeroing.baseline import Baseline, deformation
+from firmware_bridge.zeroing.drift_tracker import COMMON_COUNTS, GAP_NS, OWN_PER_S, STEP_COUNTS, DriftTracker
 
 RATE_HZ = 40
 """Enough for every block, no more than they take."""

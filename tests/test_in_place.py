@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from edge_samples import BASELINE
 
-from firmware_bridge.baseline import load_baselines, save_baselines
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.in_place import check_writable, write_in_place
+from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
 
 
 def listing(folder: Path) -> list[str]:
@@ -77,7 +77,7 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path):
 def test_baselines_that_would_not_load_again_do_not_replace_those_that_do(tmp_path, monkeypatch):
     path = tmp_path / "zero.json"
     save_baselines(path, [BASELINE])
-    monkeypatch.setattr("firmware_bridge.baseline.MOST_FILE_BYTES", len(path.read_bytes()) + 10)
+    monkeypatch.setattr("firmware_bridge.zeroing.baseline.MOST_FILE_BYTES", len(path.read_bytes()) + 10)
     with pytest.raises(RecordingError, match="cannot be read: larger than"):
         save_baselines(path, [BASELINE, type(BASELINE).of("6", BASELINE.counts, 1.7e9, 100, "file")])
     assert list(load_baselines(path)) == ["4"] and len(json.loads(path.read_text())["baselines"]) == 1

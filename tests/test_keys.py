@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_scan, write_model
 
-from firmware_bridge.baseline import save_baselines
+from firmware_bridge.zeroing.baseline import save_baselines
 
 TIMEOUT_S = 60.0
 SCANS = 5000

@@ -40,7 +40,6 @@ from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
-from firmware_bridge.baseline import save_baselines
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording import load_recording
@@ -48,6 +47,7 @@ from firmware_bridge.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file import SensorEntry, SensorFile
 from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.zeroing.baseline import save_baselines
 
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
 SURE = make_contract(interval_factor=1.6)

@@ -12,9 +12,9 @@ from edge.pipeline.commands import RESET
 from edge.pipeline.pump import pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Notice
+from firmware_bridge.zeroing.baseline import Baseline
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
 

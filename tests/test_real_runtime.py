@@ -13,9 +13,9 @@ import pytest
 from bridge_samples import undisturbed
 from edge_samples import ROOT, write_model
 
-from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.recording import load_recording
 from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
 TRIALS = sorted(path.name for path in RECORDINGS.glob("data_sample_*")) if RECORDINGS.is_dir() else []

@@ -13,8 +13,8 @@ from edge.sinks.event_printer import MessageSink
 from edge.sinks.jsonl import record_line
 from edge.sinks.npz import NpzSink
 from edge.sinks.status_line import StatusSink
-from firmware_bridge.baseline import deformation
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import deformation
 
 DAY_S = 86_400.0
 

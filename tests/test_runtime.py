@@ -12,9 +12,9 @@ from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.result import mask_bits
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.zeroing.baseline import Baseline
 
 PRESS = 3000
 

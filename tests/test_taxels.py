@@ -22,11 +22,11 @@ from edge.perception.taxel_health import (
     STUCK_SCANS,
     TaxelWatch,
 )
-from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
+from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
 NOISE_COUNTS = 2.0

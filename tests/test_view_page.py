@@ -30,11 +30,11 @@ from edge.sinks.binary_message import unpack
 from edge.terminal.heatmap import colours
 from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
-from firmware_bridge.baseline import BaselineEstimator, save_baselines
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.slcan_emulator import Emulator
+from firmware_bridge.zeroing.baseline import BaselineEstimator, save_baselines
 
 CHROMIUM = shutil.which("chromium")
 if os.environ.get("EDGE_BROWSER") != "1":  # whoever says 1 has both, and that one is missing is no reason to skip

@@ -27,7 +27,6 @@ from edge_samples import BASELINE, ROOT, ListSink
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
-from firmware_bridge.baseline import save_baselines
 from firmware_bridge.links import devices, source
 from firmware_bridge.links.ports import Port
 from firmware_bridge.sensor_file import SensorEntry, SensorFile
@@ -36,6 +35,7 @@ from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.tracks import Recording, Track
 from firmware_bridge.vendor_server import VendorServer
 from firmware_bridge.xela_server_emulator import ServerEmulator
+from firmware_bridge.zeroing.baseline import save_baselines
 
 COMMANDS = written_samples.commands()
 RATE_HZ = 500

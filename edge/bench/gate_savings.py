@@ -17,9 +17,9 @@ from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet
 from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.runtime import Model, Runtime
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import Scan, ScanSeries
+from firmware_bridge.zeroing.baseline import Baseline
 
 SEED: Final = 1
 HELD_SCANS: Final = 100

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from edge.bench.errors import BenchError
 from edge.pipeline.pump import uncollected
-from firmware_bridge.baseline import Baseline, save_baselines
 from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 SEED: Final = 0
 CONTROLLERS: Final = ("4", "6")

@@ -41,10 +41,10 @@ from edge.pipeline.scan_reader import Source
 from edge.sinks.binary_message import unpack
 from edge.sinks.zenoh import ZenohSink
 from edge.terminal.argument_types import positive, whole
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import Link
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import Baseline
 
 PERIOD_NS: Final = 10_000_000
 APART_SCANS: Final = 97

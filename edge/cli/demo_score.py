@@ -13,7 +13,7 @@ from edge.inference.contract import Contract
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.terminal.heatmap import Palette, Panel, draw
-from firmware_bridge.baseline import deformation
+from firmware_bridge.zeroing.baseline import deformation
 
 
 @dataclass(frozen=True, slots=True)

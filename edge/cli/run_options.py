@@ -13,7 +13,7 @@ from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, c
 from edge.pipeline.baseline_capture import FEWEST_RECORDED
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole
-from firmware_bridge.baseline import FEWEST_SCANS
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS
 
 VIEW_PORT: Final = 8077
 

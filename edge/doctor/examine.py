@@ -12,7 +12,12 @@ from edge.doctor.link_checks import LineFacts, check_baud, check_latency, check_
 from edge.doctor.scan_statistics import FEWEST_SCANS, Samples
 from edge.doctor.taxel_checks import check_drift, check_noise, check_rest, check_silent, check_stuck
 from edge.doctor.timing_checks import check_lost, check_rate, check_torn
-from firmware_bridge.baseline import (
+from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.zeroing.baseline import (
     COUNTS_ON_CIRCLE,
     LOAD_LIMIT_COUNTS,
     SPREAD_LIMIT_COUNTS,
@@ -20,14 +25,9 @@ from firmware_bridge.baseline import (
     BaselineEstimator,
     deformation,
 )
-from firmware_bridge.baseline import (
+from firmware_bridge.zeroing.baseline import (
     FEWEST_SCANS as BASELINE_SCANS,
 )
-from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
-from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.scan import Scan
-from firmware_bridge.schedule import NS_PER_S
 
 
 @dataclass(frozen=True)

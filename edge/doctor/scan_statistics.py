@@ -6,9 +6,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.baseline import COUNTS_ON_CIRCLE
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE
 
 PERIODS_TOGETHER: Final = 100
 """A period is told from so many at once: an adapter that hands on in bunches makes single ones meaningless."""

@@ -13,9 +13,9 @@ from edge.doctor.press_guide import GuidedPress
 from edge.doctor.watch import READ_TIMEOUT_S, SILENCE_S, Watch
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.text_wrap import columns, wrapped
-from firmware_bridge.baseline import deformation
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.zeroing.baseline import deformation
 
 
 class Visit:

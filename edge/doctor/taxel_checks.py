@@ -10,8 +10,8 @@ from edge.doctor.scan_statistics import Samples, around_counts
 from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.tap_tracker import OFF_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
-from firmware_bridge.baseline import CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 from firmware_bridge.geometry import AXES
+from firmware_bridge.zeroing.baseline import CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 
 NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))
 """Of x, y, z: to look at, and wrong. 1.1 to 2.8 and 2 to 4.7 are on record; four taps need under eight."""

@@ -11,10 +11,10 @@ from edge.doctor.link_checks import line_facts
 from edge.errors import UsageError
 from edge.pipeline.source_setup import link_to, with_recorded
 from edge.validation import check_baselines, check_positive
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file import SensorFile
+from firmware_bridge.zeroing.baseline import Baseline
 
 READ_TIMEOUT_S: Final = 0.1
 SILENCE_S: Final = 10.0

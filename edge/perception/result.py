@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.wrench import Wrench
-from firmware_bridge.baseline import Baseline
-from firmware_bridge.drift import Drift
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import Baseline
+from firmware_bridge.zeroing.drift_tracker import Drift
 
 MADE: Final = (
     *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),

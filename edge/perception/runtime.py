@@ -19,12 +19,12 @@ from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, T
 from edge.perception.wrench import wrench_of
 from edge.perception.zero_on_demand import REFUSED
 from edge.validation import check_baselines, check_pads, check_positive, check_whole
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import Baseline
 
 OLD_NS: Final = 50_000_000
 """Later by the device's own time stamps than its fastest reading of late: three times what a slow adapter keeps."""

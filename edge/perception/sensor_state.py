@@ -15,13 +15,13 @@ from edge.perception.result import Result, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from edge.perception.zero_on_demand import GIVEN_UP, Rezeroing, in_contact
-from firmware_bridge.baseline import Baseline, BaselineEstimator, deformation
-from firmware_bridge.drift import Drift, DriftTracker
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.geometry import AXES, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import Baseline, BaselineEstimator, deformation
+from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
 
 LONGEST_GAP_NS: Final = 1_000_000_000
 """Between two scans of one sensor: a tap is over within, and the slowest sensor on record gives four."""

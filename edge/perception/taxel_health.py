@@ -5,9 +5,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 HOLD_SCANS: Final = 5
 """A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""

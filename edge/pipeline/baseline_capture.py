@@ -8,8 +8,8 @@ from typing import Final
 from edge.pipeline.scan_reader import Arrival, Source
 from edge.terminal.progress_bar import Progress
 from edge.validation import check_whole
-from firmware_bridge.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
 READ_TIMEOUT_S: Final = 0.1
 SILENCE_S: Final = 10.0

@@ -7,7 +7,6 @@ from pathlib import Path
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import settled, with_recorded
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.source import place_recordings, recording_paths
@@ -16,6 +15,7 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file import SensorEntry
 from firmware_bridge.tracks import Recording
+from firmware_bridge.zeroing.baseline import Baseline
 
 
 def open_recording(

@@ -7,7 +7,7 @@ from typing import Final
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from firmware_bridge.drift import Drift
+from firmware_bridge.zeroing.drift_tracker import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32
 """Of the run-time histogram: a quantile is at most 2.2 % too high."""

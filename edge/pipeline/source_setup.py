@@ -7,12 +7,12 @@ from pathlib import Path
 
 from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
-from firmware_bridge.baseline import Baseline, load_baselines
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.source import DEMO_LOOP, open_sources
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file import PARTS, SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
 
 def settled(sensor: str | Path | None, id_map: str | None) -> SensorFile:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.perception.wrench import Wrench
-from firmware_bridge.drift import Drift
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.drift_tracker import Drift
 
 
 def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:

@@ -14,10 +14,10 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import ON_COUNTS
 from export.stability.case import Case, timed
-from firmware_bridge.baseline import Baseline, deformation
-from firmware_bridge.drift import COMMON_PER_S
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
+from firmware_bridge.zeroing.baseline import Baseline, deformation
+from firmware_bridge.zeroing.drift_tracker import COMMON_PER_S
 
 PART: Final = "counts"
 RATE_HZ: Final = 100.0

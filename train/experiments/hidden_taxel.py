@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import fit_linear_map
-from firmware_bridge.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.recording import load_recording
+from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError
 
 REST_SCANS: Final = 20

@@ -24,10 +24,10 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.baseline import Baseline
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording import load_recording
 from firmware_bridge.scans.scan import ScanSeries
+from firmware_bridge.zeroing.baseline import Baseline
 from train.experiments.hidden_taxel import REST_SCANS, recording_paths, recordings_folder
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench

@@ -20,9 +20,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.baseline import Baseline, deformation
 from firmware_bridge.geometry import AXES
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 BLOCK_NS: Final = 500_000_000
 SAMPLE_NS: Final = 25_000_000

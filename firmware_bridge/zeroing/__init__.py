@@ -1,0 +1,1 @@
+"""Baselines of free pads, and their drift."""
