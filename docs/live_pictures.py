@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 from edge.inference.bundled import demo_recording
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.slcan_emulator import Emulator
 
 PICTURES: Final = Path(__file__).with_name("pictures")

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, CanFrame, encode_frame
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.scan import ABSENT
-from firmware_bridge.tracks import Recording, Track
 
 FRAME_S: Final = 0.000_13
 """A frame of eight bytes on a 1 Mbit/s bus, with stuffed bits."""

@@ -19,7 +19,7 @@ from firmware_bridge.errors import BridgeError
 from firmware_bridge.faults.injector import Injector
 from firmware_bridge.faults.stretches import parse_stretches
 from firmware_bridge.faults.truth import Truth
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.truth_files import TruthFiles
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from firmware_bridge.errors import BridgeError
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.vendor_server import VERSIONS, VendorServer, sim_recording
 from firmware_bridge.xela_server_emulator import DEFAULT_MESSAGE_HZ, ServerEmulator
 

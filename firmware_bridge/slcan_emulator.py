@@ -17,8 +17,8 @@ from firmware_bridge.controller import FRAME_S, SlcanAdapter, bus_timeline, cont
 from firmware_bridge.faults.injector import Injector
 from firmware_bridge.faults.lines import Piece
 from firmware_bridge.pseudo_port import COUNTED_LATE_NS, PseudoPort
+from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.tracks import Recording
 
 _STOP_POLL_S: Final = 0.05
 _DRAIN_POLL_S: Final = 0.01

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.scans.xela_server_messages import PRETENDED_VERSION, WELCOME
-from firmware_bridge.tracks import Recording, Track
 
 VERSIONS: Final = ("1.7.6", "1.7.7", "1.8.0")
 NEWTONS_PER_COUNT: Final = np.array([0.0007, 0.0007, 0.00085])[:, None, None]

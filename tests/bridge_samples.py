@@ -11,9 +11,9 @@ import numpy as np
 
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
-from firmware_bridge.recording import CSV_HEADER
+from firmware_bridge.recording.formats import CSV_HEADER
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.tracks import Recording, Track
 
 REAL_RECORDINGS = Path(
     os.environ.get("TACTILE_RECORDINGS", Path(__file__).parents[2] / "shared" / "recordings" / "imanlab")

@@ -37,8 +37,9 @@ from edge.sinks.mcap_writer import McapFile
 from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.can.slcan import LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.recording import CSV_HEADER, load_recording
-from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.recording.formats import CSV_HEADER, load_recording
+from firmware_bridge.recording.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.recording.tracks import HIGHEST_COUNT
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans
 from firmware_bridge.scans.mounting import Mounting
@@ -48,7 +49,6 @@ from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file_text import save_sensor_file
-from firmware_bridge.tracks import HIGHEST_COUNT
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 from train.authors_files import load_authors_taps
 from train.dataset import Sequences, load_sequences

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 

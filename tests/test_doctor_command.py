@@ -24,10 +24,10 @@ from edge.doctor.options import doctor_parser
 from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, orders
 from firmware_bridge import pseudo_port
 from firmware_bridge.links.ports import Port
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file import load_sensor_file
 from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.tracks import Recording, Track
 
 WEIGHT_COUNTS = 2400.0
 

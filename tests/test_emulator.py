@@ -19,11 +19,11 @@ from firmware_bridge.controller import FRAME_S, Controller, SlcanAdapter, bus_ti
 from firmware_bridge.emulator import main
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, decode
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.tracks import Track
 
 # What the controller says.
 

@@ -8,7 +8,7 @@ from experiment_samples import quick_bench
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
-from firmware_bridge.recording import CSV_HEADER
+from firmware_bridge.recording.formats import CSV_HEADER
 from train.errors import DatasetError
 from train.experiments import real
 from train.experiments.hidden_taxel import (

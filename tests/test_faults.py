@@ -18,9 +18,9 @@ from firmware_bridge.faults.lines import LINE_FAULTS, Piece
 from firmware_bridge.faults.stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
 from firmware_bridge.faults.truth import FATES, ROW, Truth
 from firmware_bridge.pseudo_port import PseudoPort
+from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
-from firmware_bridge.tracks import Track
 
 CYCLES = 100
 BUS = [

@@ -6,7 +6,7 @@ from edge.evaluation.classical_methods import fitted_methods
 from edge.evaluation.evaluate import judge
 from edge.inference.bundled import BUNDLE_DIR
 from edge.perception.tap_tracker import ON_COUNTS
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from train.data.world import World, solve_pad
 from train.dataset import Sequences
 from train.freeze import SEED, TEST_FORCE_N, demo_recording, drawn, fit_classical, fit_taxels, freeze, held_out, main

@@ -22,11 +22,11 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain, read_model
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge import recording
 from firmware_bridge.bounded import read_bounded
 from firmware_bridge.errors import NpzError, RecordingError
-from firmware_bridge.npz import read_npz
-from firmware_bridge.recording import CSV_HEADER, load_recording
+from firmware_bridge.recording import formats as recording
+from firmware_bridge.recording.formats import CSV_HEADER, load_recording
+from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
 from train.authors_files import load_authors_taps
 from train.dataset import load_sequences

@@ -17,11 +17,11 @@ from mcap_samples import OFFSET_NS, make_results, odd_scans, record_into
 from edge.api import open_recording, open_sink
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
-from firmware_bridge import mcap_recording
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.mcap_recording import MOST_RECORD_BYTES
-from firmware_bridge.recording import load_recording
-from firmware_bridge.scan_messages import BASELINE, SCAN
+from firmware_bridge.recording import mcap_reader as mcap_recording
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.mcap_reader import MOST_RECORD_BYTES
+from firmware_bridge.recording.scan_messages import BASELINE, SCAN
 
 MEMORY_LIMIT_BYTES = 60_000_000
 GOOD = {

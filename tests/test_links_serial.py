@@ -17,10 +17,10 @@ from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import bursts, slcan_serial
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, USPA44_MAP, trigger_frame
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.tracks import Recording, Track
 
 
 @pytest.mark.parametrize("acknowledges", [True, False])

@@ -42,8 +42,8 @@ from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.recording import load_recording
-from firmware_bridge.scan_messages import decode_baseline, decode_scan
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file import SensorEntry, SensorFile
 from firmware_bridge.sensor_file_text import save_sensor_file

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.recording import CSV_HEADER, load_recording
+from firmware_bridge.recording.formats import CSV_HEADER, load_recording
 
 HEADER = ",".join(CSV_HEADER) + "\n"
 

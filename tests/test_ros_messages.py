@@ -17,9 +17,9 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.sinks.json_record import record
 from edge.sinks.ros2 import cdr_messages as ros_messages
-from firmware_bridge.cdr import HEADER, MessageType, stamp
 from firmware_bridge.errors import CdrError
-from firmware_bridge.scan_messages import SCAN, decode_scan, encode_scan
+from firmware_bridge.recording.cdr import HEADER, MessageType, stamp
+from firmware_bridge.recording.scan_messages import SCAN, decode_scan, encode_scan
 from firmware_bridge.scans.scan import VendorReading
 
 

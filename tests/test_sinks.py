@@ -31,7 +31,7 @@ from edge.sinks.pipe_capacity import has_room
 from edge.sinks.registry import FORMS, open_sink
 from edge.sinks.status_line import StatusSink
 from firmware_bridge.errors import LinkLostError
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, VendorReading
 
 SHAPES = ((3, 4, 4), (40, 40))

@@ -20,7 +20,7 @@ from edge.view.access import grant, is_loopback
 from edge.view.recorder import RecordCommands, Recorder
 from edge.view.viewer_commands import LONGEST_BYTES, WAITING, Asked
 from edge.view.viewer_state import Viewer
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 
 TOKEN = "correct-horse-battery"
 

@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 from edge.cli.main import main
 from edge.pipeline import replay_setup as recordings
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 
 DEMO = (sys.executable, "-m", "edge.cli.main", "--source", "demo")
 

@@ -25,7 +25,7 @@ from edge.view import server
 from edge.view import viewer_connection as attended
 from edge.view.live_view import LiveView
 from edge.view.static_page import PAGE_FILE
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"
 TOKEN = "correct-horse-battery"

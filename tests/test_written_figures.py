@@ -13,7 +13,7 @@ from edge_samples import BASELINE, ROOT
 from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import ADDED, Contract
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import GAINS, PAD_RANGES, Pad
 from firmware_bridge.sensor_file import SensorEntry, SensorFile

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from firmware_bridge.in_place import write_in_place
-from firmware_bridge.npz import read_npz
+from firmware_bridge.recording.npz_reader import read_npz
 from train.errors import DatasetError
 from train.nuisances import Nuisances, Seed, read_windows
 from train.resample import resample, resample_touching

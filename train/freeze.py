@@ -21,7 +21,7 @@ from edge.perception.dead_taxel_fill import load_estimator
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.in_place import write_in_place
-from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION, load_recording
+from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION, load_recording
 from train.batches import Draw, WindowBatches
 from train.data.files import load_taps
 from train.data.press_batches import read_presses

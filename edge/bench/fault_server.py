@@ -15,7 +15,7 @@ from edge.bench.fault_played import TELLING, telling_counts
 from edge.bench.fault_records import Seen, in_thread, keep_lines, read_records
 from edge.bench.fault_run import END_TIMEOUT_S
 from edge.bench.program import REST_COUNTS, environment
-from firmware_bridge.tracks import Recording, Track
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 SENSOR: Final = "1"

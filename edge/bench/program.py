@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edge.bench.errors import BenchError
 from edge.pipeline.pump import uncollected
-from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 SEED: Final = 0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge.errors import EdgeError
 from edge.perception.result import Filled
-from firmware_bridge.npz import read_npz
+from firmware_bridge.recording.npz_reader import read_npz
 
 RIDGE: Final = 2e-3
 """Of a kind's mean variance, added to every channel: gains and noise of a sensor of its own."""

@@ -10,11 +10,11 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.changed import ChangedLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.source import place_recordings, recording_paths
-from firmware_bridge.recording import npz_baselines
+from firmware_bridge.recording.formats import npz_baselines
+from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file import SensorEntry
-from firmware_bridge.tracks import Recording
 from firmware_bridge.zeroing.baseline import Baseline
 
 

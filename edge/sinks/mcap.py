@@ -28,12 +28,12 @@ from edge.sinks.ros2.cdr_messages import (
 )
 from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.forced_end import finishing
-from firmware_bridge.cdr import MessageType
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.recording.tracks import MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.tracks import MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.zeroing.baseline import Baseline
 
 EVENTS_TOPIC: Final = "/events"

@@ -24,7 +24,7 @@ from edge.pipeline.sink import Sink
 from edge.terminal.forced_end import finishing
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.recording import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 
 LAYOUT: Final = "layout.json"
 ROWS: Final = "rows"

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import SourceError
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.tracks import LAST_TIME_NS, Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.schedule import NS_PER_S, Clock, Sleep, sleep_until
-from firmware_bridge.tracks import LAST_TIME_NS, Recording, Track
 
 
 class _Due(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.npz import read_npz
+from firmware_bridge.recording.npz_reader import read_npz
 from train.errors import DatasetError
 
 SCHEMA: Final = "tactile-edge-sr presses"

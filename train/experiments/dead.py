@@ -28,7 +28,7 @@ from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import STUCK_SCANS, TaxelWatch
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.experiments.hidden_taxel import recorded_sets, recording_paths, recordings_folder

@@ -25,7 +25,7 @@ from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.recording import load_recording
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.experiments.hidden_taxel import REST_SCANS, recording_paths, recordings_folder

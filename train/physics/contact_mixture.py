@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.npz import read_npz
+from firmware_bridge.recording.npz_reader import read_npz
 from train.data.presses import PressSet
 from train.errors import DatasetError
 from train.nuisances import LARGEST_COUNTS, Nuisances, read_windows

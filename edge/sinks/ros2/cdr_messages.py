@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from firmware_bridge.cdr import STD_HEADER, TIME, MessageType, stamp
+from firmware_bridge.recording.cdr import STD_HEADER, TIME, MessageType, stamp
 
 IMAGE: Final = MessageType(
     "sensor_msgs/msg/Image",

@@ -5,13 +5,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.errors import CdrError
 from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
+from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.tracks import HIGHEST_COUNT, LAST_TIME_NS
 from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
 
 _ALL: Final = (1 << USPA44.taxel_count) - 1

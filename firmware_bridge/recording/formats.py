@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.npz import read_npz
+from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 
 if TYPE_CHECKING:
     from firmware_bridge.zeroing.baseline import Baseline
@@ -190,7 +190,7 @@ def _load_npz(path: Path) -> Recording:
 
 
 def _load_mcap(path: Path) -> Recording:
-    from firmware_bridge.mcap_recording import load_mcap  # which loads the mcap package
+    from firmware_bridge.recording.mcap_reader import load_mcap  # which loads the mcap package
 
     return load_mcap(path)
 

@@ -23,13 +23,20 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from firmware_bridge.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.geometry import USPA44
-from firmware_bridge.scan_messages import BASELINE, SCAN, decode_baseline, decode_scan
+from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
+from firmware_bridge.recording.scan_messages import BASELINE, SCAN, decode_baseline, decode_scan
+from firmware_bridge.recording.tracks import (
+    MOST_SENSORS,
+    MOUNTING_METADATA,
+    SOURCE_METADATA,
+    Recording,
+    Track,
+    origin_of,
+)
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import VendorReading, is_sensor_name
-from firmware_bridge.tracks import MOST_SENSORS, MOUNTING_METADATA, SOURCE_METADATA, Recording, Track, origin_of
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_RECORD_BYTES: Final = 1 << 25
