@@ -63,7 +63,7 @@ from firmware_bridge.links.source import DEMO_LOOP
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.sensor_file import SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from firmware_bridge.links.source import open_sources
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
 from firmware_bridge.scans.pad import Pad
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 TURNED = Mounting(tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()), True, (1, -1, -1))

@@ -26,7 +26,7 @@ from firmware_bridge import pseudo_port
 from firmware_bridge.links.ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file import load_sensor_file
+from firmware_bridge.sensor_file.model import load_sensor_file
 from firmware_bridge.slcan_emulator import Emulator
 
 WEIGHT_COUNTS = 2400.0

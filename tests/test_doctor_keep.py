@@ -19,8 +19,8 @@ from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import Pad
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.zeroing.baseline import Baseline
 

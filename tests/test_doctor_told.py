@@ -13,8 +13,8 @@ from edge.doctor.findings import Finding, summary
 from edge.doctor.options import doctor_parser
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 WELL = as_scans(healthy_counts(200))
 

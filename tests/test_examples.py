@@ -17,8 +17,8 @@ from edge.api import Result
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Notice
-from firmware_bridge.sensor_file import SensorEntry, SensorFile
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 TIMEOUT_S = 120
 PATIENT = ("--oldest-ms", "20000")

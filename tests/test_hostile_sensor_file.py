@@ -4,7 +4,7 @@ import pytest
 from fuzz_targets import sensor_toml_seeds
 
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.sensor_file import load_sensor_file
+from firmware_bridge.sensor_file.model import load_sensor_file
 
 
 @pytest.mark.parametrize(

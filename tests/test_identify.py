@@ -5,8 +5,8 @@ import pytest
 from experiment_samples import quick_bench
 
 from firmware_bridge.scans.pad import Pad
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
 from train.errors import DatasetError
 from train.experiments import identify as experiment

@@ -45,8 +45,8 @@ from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file import SensorEntry, SensorFile
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
 
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]

@@ -10,8 +10,8 @@ from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import PAD_RANGES, Pad
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
 
 names = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), min_size=1, max_size=9)

@@ -30,8 +30,8 @@ from edge.inference.bundled import demo_recording, find_model
 from firmware_bridge.links import devices, source
 from firmware_bridge.links.ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
-from firmware_bridge.sensor_file import SensorEntry, SensorFile
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.vendor_server import VendorServer
 from firmware_bridge.xela_server_emulator import ServerEmulator

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.scans.pad import Pad
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train.data.presses import load_presses
 from train.errors import DatasetError, TrainError
 from train.experiments.hidden_taxel import recorded_sets, recording_paths

@@ -16,7 +16,7 @@ from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import LinkLostError, SensorFileError
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file import SensorFile
+from firmware_bridge.sensor_file.model import SensorFile
 
 EXIT_WRONG: Final = 1
 EXIT_STOPPED: Final = 130

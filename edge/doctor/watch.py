@@ -13,7 +13,7 @@ from edge.pipeline.source_setup import link_to, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.sensor_file import SensorFile
+from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing.baseline import Baseline
 
 READ_TIMEOUT_S: Final = 0.1

@@ -8,8 +8,8 @@ from firmware_bridge import in_place
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.ports import serial_ports
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file_text import save_sensor_file
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
 
 _AS_WIRED = frozenset({"mounting"})

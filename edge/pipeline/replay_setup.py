@@ -14,7 +14,7 @@ from firmware_bridge.recording.formats import npz_baselines
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.sensor_file import SensorEntry
+from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import Baseline
 
 

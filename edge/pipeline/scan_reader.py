@@ -12,7 +12,7 @@ from edge.errors import UsageError
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.links.base import Link, Notice, SourceKind
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.sensor_file import SensorFile
+from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
 """Five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""

@@ -11,7 +11,7 @@ from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.source import DEMO_LOOP, open_sources
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
-from firmware_bridge.sensor_file import PARTS, SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
 

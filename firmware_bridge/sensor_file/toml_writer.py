@@ -14,7 +14,14 @@ from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import PAD_RANGES, Pad
-from firmware_bridge.sensor_file import FILE_FORMAT, FILE_VERSION, PARTS, SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.model import (
+    FILE_FORMAT,
+    FILE_VERSION,
+    PARTS,
+    SensorEntry,
+    SensorFile,
+    load_sensor_file,
+)
 from firmware_bridge.zeroing.baseline import Baseline
 
 

@@ -20,7 +20,7 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import GAIN_RANGE, GAINS, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
-from firmware_bridge.sensor_file_table import (
+from firmware_bridge.sensor_file.toml_reader import (
     REMEDY,
     Table,
     a_table,
