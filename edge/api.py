@@ -59,7 +59,7 @@ from firmware_bridge.errors import (
 )
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.links.source import DEMO_LOOP
+from firmware_bridge.links.parse import DEMO_LOOP
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from edge.budgeting.model_steps import Ladder
     from edge.doctor.findings import Finding
     from edge.inference.onnx_session import ModelSession
-    from firmware_bridge.links.devices import Found
+    from firmware_bridge.links.discovery import Found
 
 # What only some need, onnxruntime before all, is imported where it is needed: start-up time and memory are promises.
 
@@ -348,7 +348,7 @@ def open_ladder(
 
 def devices() -> "tuple[list[Found], list[str]]":
     """What is plugged in and what is in its way; and what could not be looked at, and why. Opens nothing."""
-    from firmware_bridge.links import devices
+    from firmware_bridge.links import discovery as devices
 
     return devices.devices()
 

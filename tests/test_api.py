@@ -354,7 +354,7 @@ def test_the_doctors_findings_are_those_of_the_api(files):
 
 
 def test_devices_are_listed(monkeypatch):
-    monkeypatch.setattr("firmware_bridge.links.devices.devices", lambda: (["found"], ["note"]))
+    monkeypatch.setattr("firmware_bridge.links.discovery.devices", lambda: (["found"], ["note"]))
     assert api.devices() == (["found"], ["note"])
 
 

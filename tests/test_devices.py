@@ -8,10 +8,11 @@ import pytest
 from edge.cli import main as cli
 from edge.cli.devices_command import NOTHING, SERVER_HINT, page
 from firmware_bridge.errors import DeviceError
-from firmware_bridge.links import devices, gs_usb_devices
-from firmware_bridge.links.devices import Found, can_interfaces, serial_devices
+from firmware_bridge.links import discovery as devices
+from firmware_bridge.links import gs_usb_devices
+from firmware_bridge.links.discovery import Found, can_interfaces, serial_devices
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice
-from firmware_bridge.links.ports import Port
+from firmware_bridge.links.serial_ports import Port
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus", "USB-CAN Plus", "VScom")
 GRIPPER = Port("/dev/ttyUSB1", (0x0403, 0x6015), "GRIP1", "FT231X USB UART", "FT231X USB UART", "FTDI")

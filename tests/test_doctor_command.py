@@ -23,7 +23,7 @@ from edge.doctor import write_sensor_file as keep
 from edge.doctor.options import doctor_parser
 from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, orders
 from firmware_bridge import pseudo_port
-from firmware_bridge.links.ports import Port
+from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import load_sensor_file

@@ -17,8 +17,8 @@ from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.can_networks import can_networks
-from firmware_bridge.links.devices import can_interfaces
-from firmware_bridge.links.lasting import LastingLink
+from firmware_bridge.links.discovery import can_interfaces
+from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
 

@@ -19,7 +19,7 @@ from firmware_bridge.gs_usb_emulator import GsUsbBackend, GsUsbPort
 from firmware_bridge.links import gs_usb_devices, gs_usb_link
 from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
 from firmware_bridge.links.gs_usb_link import GsUsbLink
-from firmware_bridge.links.lasting import LastingLink
+from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
 

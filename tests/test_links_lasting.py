@@ -10,8 +10,8 @@ from edge_samples import FakeLink, make_scan
 from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links.base import Link, Notice
-from firmware_bridge.links.lasting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
-from firmware_bridge.links.several import NamedLink, SeveralLinks
+from firmware_bridge.links.merged import NamedLink, SeveralLinks
+from firmware_bridge.links.reconnecting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 S = 1_000_000_000
@@ -314,7 +314,7 @@ class Hesitant(SimpleQueue):
 
 
 def test_one_that_gives_up_is_told_also_if_its_marker_is_met_at_once(monkeypatch):
-    monkeypatch.setattr("firmware_bridge.links.several.SimpleQueue", Hesitant)
+    monkeypatch.setattr("firmware_bridge.links.merged.SimpleQueue", Hesitant)
     links = [FakeLink([], error=LinkLostError("gone")), FakeLink([], endless=True)]
     with SeveralLinks(links) as link, pytest.raises(LinkLostError, match="gone"):
         for _ in range(20):

@@ -27,7 +27,7 @@ from edge.cli import main as cli
 from firmware_bridge import server_emulator
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server
-from firmware_bridge.links.source import open_source, open_sources
+from firmware_bridge.links.parse import open_source, open_sources
 from firmware_bridge.links.xela_server import XelaServerLink, server_address
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 from firmware_bridge.vendor_server import GARBAGE, VERSIONS, VendorServer, sim_recording

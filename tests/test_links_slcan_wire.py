@@ -15,7 +15,7 @@ from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links import slcan_serial
-from firmware_bridge.links.ports import PluggedAdapter, Port
+from firmware_bridge.links.serial_ports import PluggedAdapter, Port
 from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans

@@ -11,14 +11,14 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
-from firmware_bridge.links import source
+from firmware_bridge.links import parse as source
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink
-from firmware_bridge.links.ports import Port, find_adapter, find_by_serial, serial_ports
+from firmware_bridge.links.parse import FORMS, open_source
 from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.links.serial_ports import Port, find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.links.source import FORMS, open_source
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")

@@ -27,8 +27,9 @@ from edge_samples import BASELINE, ROOT, ListSink
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
-from firmware_bridge.links import devices, source
-from firmware_bridge.links.ports import Port
+from firmware_bridge.links import discovery as devices
+from firmware_bridge.links import parse as source
+from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file

@@ -6,7 +6,7 @@ from typing import TextIO
 
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import DeviceError
-from firmware_bridge.links.devices import Found, devices
+from firmware_bridge.links.discovery import Found, devices
 
 NOTHING = (
     "no adapter found: check both plugs of a VScom (the second is the sensor's power), what `dmesg` said when it was "

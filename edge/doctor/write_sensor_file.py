@@ -6,7 +6,7 @@ from pathlib import Path
 
 from firmware_bridge import in_place
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.links.ports import serial_ports
+from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file

@@ -9,7 +9,7 @@ from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.base import Link, SourceKind
-from firmware_bridge.links.source import DEMO_LOOP, open_sources
+from firmware_bridge.links.parse import DEMO_LOOP, open_sources
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
@@ -48,7 +48,7 @@ def link_to(
     """The link to what was asked for, not yet entered.
 
     Args:
-        texts: as in firmware_bridge.links.source; without any, the adapter of the sensor file or the one there is.
+        texts: as in firmware_bridge.links.parse; without any, the adapter of the sensor file or the one there is.
         known: of the sensors.
         model: which CAN id is which taxel, instead of the id map that is known.
         rate_hz: at which recordings are played, in [Hz].

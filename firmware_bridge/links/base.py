@@ -1,4 +1,4 @@
-"""What every link offers; adding a link is one file with this interface, and its form in `source`."""
+"""What every link offers; adding a link is one file with this interface, and its form in `parse`."""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType

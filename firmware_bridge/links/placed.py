@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from firmware_bridge.links.base import Link
-from firmware_bridge.links.changed import ChangedLink
+from firmware_bridge.links.wrapper import ChangedLink
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 

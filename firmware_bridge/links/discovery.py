@@ -12,7 +12,7 @@ from typing import Final, Literal, NamedTuple
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
-from firmware_bridge.links.ports import NO_PERMISSION, Port, serial_ports
+from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, serial_ports
 
 _IP_TIMEOUT_S: Final = 2.0
 SLOW_LATENCY_MS: Final = 16

@@ -11,7 +11,7 @@ from typing import Final
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
-from firmware_bridge.links.changed import ChangedLink
+from firmware_bridge.links.wrapper import ChangedLink
 from firmware_bridge.scans.scan import Scan
 
 POLL_S: Final = 0.1
