@@ -20,8 +20,8 @@ from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 from edge.inference.bundled import demo_recording
 from edge.terminal.progress_bar import Progress
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.slcan_emulator import Emulator
 
 PICTURES: Final = Path(__file__).with_name("pictures")
 TAKEN: Final = 5

@@ -12,7 +12,7 @@ import numpy as np
 
 from firmware_bridge.can import gs_usb
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.controller import FRAME_S, Controller, bus_timeline
+from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, bus_timeline
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans

@@ -20,10 +20,10 @@ from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 
 from edge.cli import main as cli
 from edge.inference import bundled as bundle
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links import parse as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]

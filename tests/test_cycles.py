@@ -19,12 +19,12 @@ from cycle_samples import (
 )
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.faults.injector import Injector
-from firmware_bridge.faults.stretches import parse_stretches
-from firmware_bridge.faults.truth import Truth
+from firmware_bridge.emulation.faults.injector import Injector
+from firmware_bridge.emulation.faults.stretches import parse_stretches
+from firmware_bridge.emulation.faults.truth import Truth
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP
-from firmware_bridge.slcan_emulator import Emulator
 
 LONGEST_WAIT_MS = 1.5
 FIRST = 1000

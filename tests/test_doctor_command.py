@@ -22,12 +22,12 @@ from edge.doctor import session as visit
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.options import doctor_parser
 from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, orders
-from firmware_bridge import pseudo_port
+from firmware_bridge.emulation import pty_port as pseudo_port
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import load_sensor_file
-from firmware_bridge.slcan_emulator import Emulator
 
 WEIGHT_COUNTS = 2400.0
 

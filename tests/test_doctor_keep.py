@@ -16,12 +16,12 @@ from edge.doctor import write_sensor_file as keep
 from edge.doctor.write_sensor_file import check_writable
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.zeroing.baseline import Baseline
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())

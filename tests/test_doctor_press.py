@@ -12,10 +12,10 @@ from edge.doctor.examine import check_baseline
 from edge.doctor.pad_orientation import CORNER_PLACES, Press, corner_taxel, find_axes, find_order, orders, z_sign
 from edge.doctor.press_findings import judge_press
 from edge.doctor.press_guide import PATIENCE_S, Answer, GuidedPress
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.zeroing.baseline import deformation
 
 AXES = [(swap, (x, y, z)) for swap, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1))]

@@ -15,15 +15,15 @@ import serial
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
-from firmware_bridge.emulator import main
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.slcan_main import main
+from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, decode
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.scans.slcan_scans import SlcanScans
-from firmware_bridge.slcan_emulator import Emulator
 
 # What the controller says.
 
@@ -382,7 +382,7 @@ def test_the_rate_may_come_from_the_recorded_times():
 
 
 def start(*arguments: object) -> subprocess.Popen:
-    command = [sys.executable, "-m", "firmware_bridge.emulator", *map(str, arguments)]
+    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", *map(str, arguments)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -97,7 +97,7 @@ def closing(empty, tmp_path):
     write_recording(tmp_path / "rest.npz", [0] * 100)
     write_model(tmp_path / "tiny.onnx")
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
-    command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", "--loop"]
+    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop"]
     with subprocess.Popen(
         [*command, str(tmp_path / "rest.npz")], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as emulator:

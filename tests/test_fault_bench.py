@@ -25,14 +25,14 @@ from edge.bench.fault_run import run_among_faults
 from edge.bench.fault_server import ServerRan, judge_server
 from edge.bench.faults import main
 from edge.sinks.npz import gather
+from firmware_bridge.emulation.fault_log import Told
+from firmware_bridge.emulation.faults.injector import Injector
+from firmware_bridge.emulation.faults.stretches import LINK_FAULTS, parse_stretches
+from firmware_bridge.emulation.faults.truth import FATES, ROW, Truth
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError
-from firmware_bridge.faults.injector import Injector
-from firmware_bridge.faults.stretches import LINK_FAULTS, parse_stretches
-from firmware_bridge.faults.truth import FATES, ROW, Truth
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.truth_files import Told
 
 PERIOD_NS = 10_000_000
 COUNTERS = ("frames", "foreign", "bad_lines", "skipped_bytes", "duplicates")
@@ -451,7 +451,7 @@ def test_an_adapter_that_was_reset_is_silent_until_it_is_opened_again(tmp_path):
 
 def test_the_emulator_tells_the_truth_on_disk(tmp_path):
     recording = write_recording(tmp_path / "played.csv", make_recording(20).tracks[0].counts, rate_hz=100)
-    command = [sys.executable, "-m", "firmware_bridge.emulator", "--faults", "lost=.5@0+1", "--seed", "3"]
+    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--faults", "lost=.5@0+1", "--seed", "3"]
     command += ["--truth", str(tmp_path / "truth"), "--link", str(tmp_path / "port"), str(recording)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True
@@ -467,7 +467,7 @@ def test_the_emulator_tells_the_truth_on_disk(tmp_path):
 
 
 def test_the_emulator_refuses_faults_that_cannot_be(tmp_path, capsys):
-    from firmware_bridge.emulator import main as emulate
+    from firmware_bridge.emulation.slcan_main import main as emulate
 
     recording = write_recording(tmp_path / "played.csv", make_recording(20).tracks[0].counts, rate_hz=100)
     with pytest.raises(SystemExit):

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.controller import Controller, bus_timeline
-from firmware_bridge.faults.frames import FRAME_FAULTS, READ, BusFrame
-from firmware_bridge.faults.injector import BURST_S, Injector
-from firmware_bridge.faults.lines import LINE_FAULTS, Piece
-from firmware_bridge.faults.stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
-from firmware_bridge.faults.truth import FATES, ROW, Truth
-from firmware_bridge.pseudo_port import PseudoPort
+from firmware_bridge.emulation.faults.frames import FRAME_FAULTS, READ, BusFrame
+from firmware_bridge.emulation.faults.injector import BURST_S, Injector
+from firmware_bridge.emulation.faults.lines import LINE_FAULTS, Piece
+from firmware_bridge.emulation.faults.stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
+from firmware_bridge.emulation.faults.truth import FATES, ROW, Truth
+from firmware_bridge.emulation.pty_port import PseudoPort
+from firmware_bridge.emulation.xela_controller import Controller, bus_timeline
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans

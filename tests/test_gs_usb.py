@@ -12,7 +12,7 @@ from firmware_bridge.can import gs_usb
 from firmware_bridge.can.bus_errors import LOST_RECENTLY_NS, BusErrors
 from firmware_bridge.can.gs_usb import BitTimingLimits, GsUsbDecoder, HostFrame, bit_timing
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.controller import scan_frames
+from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.gs_usb_adapter import CANDLELIGHT
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans
 

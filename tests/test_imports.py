@@ -27,9 +27,12 @@ def test_the_runtime_loads_no_training_library():
         for path in sorted((ROOT / package).rglob("*.py"))
         if path.stem != "__init__" and (find_spec("cyclonedds") or "ros2" not in path.parts)
     ]
-    assert {"edge.cli.main", "edge.inference.onnx_session", "edge.cli.demo_score", "firmware_bridge.emulator"} <= set(
-        modules
-    )
+    assert {
+        "edge.cli.main",
+        "edge.inference.onnx_session",
+        "edge.cli.demo_score",
+        "firmware_bridge.emulation.slcan_main",
+    } <= set(modules)
     assert not loaded(*modules) & FORBIDDEN
 
 
@@ -54,8 +57,8 @@ UNUSED_IN_A_REPLAY = {
     "edge.cli.demo_score",
     "edge.terminal.heatmap",
     "edge.cli.realtime",
-    "firmware_bridge.emulator",
-    "firmware_bridge.slcan_emulator",
+    "firmware_bridge.emulation.slcan_main",
+    "firmware_bridge.emulation.slcan_emulator",
     "firmware_bridge.links.demo",
     "firmware_bridge.links.slcan_serial",
     "firmware_bridge.links.xela_server",

@@ -12,7 +12,7 @@ import pytest
 from bridge_samples import make_counts, read_scans
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.controller import scan_frames
+from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.can_bus import CanBusLink

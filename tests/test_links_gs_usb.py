@@ -12,7 +12,7 @@ from usb.backend import libusb1
 
 from firmware_bridge import gs_usb_emulator
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.controller import scan_frames
+from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
 from firmware_bridge.gs_usb_emulator import GsUsbBackend, GsUsbPort

@@ -14,6 +14,7 @@ import serial
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import fd_reader as bursts
 from firmware_bridge.links import slcan_serial
@@ -21,7 +22,6 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, USPA44_MAP, trigger_frame
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.slcan_emulator import Emulator
 
 
 @pytest.mark.parametrize("acknowledges", [True, False])

@@ -24,14 +24,14 @@ from edge_samples import ROOT
 from websockets.protocol import State
 
 from edge.cli import main as cli
-from firmware_bridge import server_emulator
+from firmware_bridge.emulation import xela_server_main as server_emulator
+from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
+from firmware_bridge.emulation.xela_server_model import GARBAGE, VERSIONS, VendorServer, sim_recording
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server
 from firmware_bridge.links.parse import open_source, open_sources
 from firmware_bridge.links.xela_server import XelaServerLink, server_address
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
-from firmware_bridge.vendor_server import GARBAGE, VERSIONS, VendorServer, sim_recording
-from firmware_bridge.xela_server_emulator import ServerEmulator
 
 
 def looping(**options) -> VendorServer:
@@ -498,7 +498,14 @@ def test_simulation_mode_looks_like_a_sensor():
 
 def test_the_emulator_by_hand(tmp_path):
     path = write_recording(tmp_path / "made.csv", make_counts(20), rate_hz=100.0)
-    command = [sys.executable, "-m", "firmware_bridge.server_emulator", str(path), "--loop", "--until-stdin-closes"]
+    command = [
+        sys.executable,
+        "-m",
+        "firmware_bridge.emulation.xela_server_main",
+        str(path),
+        "--loop",
+        "--until-stdin-closes",
+    ]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -13,13 +13,13 @@ from test_links_serial import SilentDevice, wait_for
 from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.serial_ports import PluggedAdapter, Port
 from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
-from firmware_bridge.slcan_emulator import Emulator
 
 MS = 1_000_000
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from bridge_samples import REAL_RECORDINGS, read_until_lost, undisturbed
 
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.slcan_emulator import Emulator
 
 TRIALS = sorted(path.parent for path in REAL_RECORDINGS.glob("*/xela_sensor1.csv"))
 

@@ -13,8 +13,8 @@ import pytest
 from bridge_samples import undisturbed
 from edge_samples import ROOT, write_model
 
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))

@@ -12,10 +12,10 @@ from can.interfaces.slcan import slcanBus
 from test_links_serial import SilentDevice
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
-from firmware_bridge.controller import SlcanAdapter, scan_frames
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_controller import SlcanAdapter, scan_frames
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.slcan_emulator import Emulator
 
 
 def open_peer(port: str) -> slcanBus:

@@ -30,10 +30,10 @@ from edge.sinks.binary_message import unpack
 from edge.terminal.heatmap import colours
 from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
-from firmware_bridge.slcan_emulator import Emulator
 from firmware_bridge.zeroing.baseline import BaselineEstimator, save_baselines
 
 CHROMIUM = shutil.which("chromium")

@@ -27,15 +27,15 @@ from edge_samples import BASELINE, ROOT, ListSink
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
+from firmware_bridge.emulation.xela_server_model import VendorServer
 from firmware_bridge.links import discovery as devices
 from firmware_bridge.links import parse as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.vendor_server import VendorServer
-from firmware_bridge.xela_server_emulator import ServerEmulator
 from firmware_bridge.zeroing.baseline import save_baselines
 
 COMMANDS = written_samples.commands()
@@ -50,7 +50,7 @@ PARSED = {
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python -m edge\.bench\..*": "takes minutes; test_fault_bench and test_soak run them",
-    r"python -m firmware_bridge\.emulator .*--loop.*": "plays until it is ended; test_emulator runs it",
+    r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until it is ended; test_emulator runs it",
     r"python tests/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
     r"edge-sr (record |replay |--source replay:)FILE( --view)?": "a name is to be filled in; press.mcap is run",

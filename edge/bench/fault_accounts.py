@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from edge.bench.fault_judge import Found
-from firmware_bridge.truth_files import Told
+from firmware_bridge.emulation.fault_log import Told
 
 
 @dataclass(frozen=True, slots=True)

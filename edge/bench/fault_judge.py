@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from edge.bench.fault_records import Seen
-from firmware_bridge.faults.frames import READ
-from firmware_bridge.faults.truth import FATES
+from firmware_bridge.emulation.fault_log import Told
+from firmware_bridge.emulation.faults.frames import READ
+from firmware_bridge.emulation.faults.truth import FATES
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.truth_files import Told
 
 STALE_US: Final = 100_000
 """What a record gives as one reading of the pad was on the bus within this time."""

@@ -14,8 +14,8 @@ from edge.bench.fault_run import CALM_S
 from edge.bench.fault_server import GARBAGE_EVERY, ServerFound, ServerRan
 from edge.bench.report import head, line
 from edge.bench.soak import slope
-from firmware_bridge.faults.stretches import LINK_FAULTS
-from firmware_bridge.truth_files import Told
+from firmware_bridge.emulation.fault_log import Told
+from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
 
 EXIT_SINK: Final = 5
 MEMORY_MB_PER_MINUTE: Final = 0.2

@@ -12,7 +12,7 @@ import orjson
 from numpy.typing import NDArray
 
 from edge.sinks.pipe_capacity import PIPE_BYTES
-from firmware_bridge.truth_files import Told
+from firmware_bridge.emulation.fault_log import Told
 
 
 class Seen(NamedTuple):

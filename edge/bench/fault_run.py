@@ -19,8 +19,8 @@ from edge.bench.fault_records import Ran, Seen, Size, in_thread, keep_lines, rea
 from edge.bench.fault_sinks import failing_sinks, fill_up, look_into_files, read_and_go, read_slowly
 from edge.bench.program import CONTROLLERS, REST_COUNTS, environment
 from edge.terminal.progress_bar import SECONDS, Progress
-from firmware_bridge.faults.stretches import parse_stretches
-from firmware_bridge.truth_files import EVENTS, read_truth
+from firmware_bridge.emulation.fault_log import EVENTS, read_truth
+from firmware_bridge.emulation.faults.stretches import parse_stretches
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 CALM_S: Final = 4.0

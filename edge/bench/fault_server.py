@@ -65,8 +65,8 @@ class ServerFound:
 
 def run_against_server(seconds: float, seed: int, folder: Path) -> ServerRan:
     """Run the program for so long against a server that fails every two to four seconds."""
-    from firmware_bridge.vendor_server import VendorServer
-    from firmware_bridge.xela_server_emulator import ServerEmulator
+    from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
+    from firmware_bridge.emulation.xela_server_model import VendorServer
 
     class Telling(VendorServer):
         """Keeps when it first said what."""

@@ -168,7 +168,7 @@ def emulating(*arguments: str) -> Iterator[str]:
     Raises:
         BenchError: it did not start.
     """
-    command = [sys.executable, "-m", "firmware_bridge.emulator", "--until-stdin-closes", *arguments]
+    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", *arguments]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
     ) as emulator:

@@ -41,7 +41,7 @@ class DemoLink(Link):
             [
                 sys.executable,
                 "-m",
-                "firmware_bridge.emulator",
+                "firmware_bridge.emulation.slcan_main",
                 "--until-stdin-closes",
                 *rate,
                 *loop,

@@ -13,8 +13,8 @@ import random
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from firmware_bridge.faults.frames import FRAME_FAULTS
-from firmware_bridge.faults.lines import LINE_FAULTS
+from firmware_bridge.emulation.faults.frames import FRAME_FAULTS
+from firmware_bridge.emulation.faults.lines import LINE_FAULTS
 
 BURSTS: Final = "bursts"
 """The adapter holds bytes back for 16 ms, as an FTDI chip does that nobody asked not to."""

@@ -1,7 +1,7 @@
 """Command line of the emulated xela_server, to try a client by hand.
 
-    python -m firmware_bridge.server_emulator FILE [FILE]
-    python -m firmware_bridge.server_emulator --sim
+    python -m firmware_bridge.emulation.xela_server_main FILE [FILE]
+    python -m firmware_bridge.emulation.xela_server_main --sim
 
 The first line it prints is the URL, of this machine alone.
 """
@@ -15,10 +15,10 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from firmware_bridge.emulation.xela_server_emulator import DEFAULT_MESSAGE_HZ, ServerEmulator
+from firmware_bridge.emulation.xela_server_model import VERSIONS, VendorServer, sim_recording
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.vendor_server import VERSIONS, VendorServer, sim_recording
-from firmware_bridge.xela_server_emulator import DEFAULT_MESSAGE_HZ, ServerEmulator
 
 INTERRUPTED: Final = 130
 LONGEST_S: Final = 1e6
@@ -27,7 +27,7 @@ _STOP_POLL_S: Final = 0.05
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve the recordings named on the command line."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_bridge.server_emulator", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m firmware_bridge.emulation.xela_server_main", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("file", nargs="*", help="recording, .csv or .npz")

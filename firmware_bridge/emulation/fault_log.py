@@ -10,9 +10,9 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.faults.injector import Injector
-from firmware_bridge.faults.stretches import Stretch
-from firmware_bridge.faults.truth import ROW, Truth
+from firmware_bridge.emulation.faults.injector import Injector
+from firmware_bridge.emulation.faults.stretches import Stretch
+from firmware_bridge.emulation.faults.truth import ROW, Truth
 
 FRAMES: Final = "frames.bin"
 EVENTS: Final = "events.jsonl"

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Final, Self
 
-from firmware_bridge.vendor_server import GARBAGE, VendorServer
-from firmware_bridge.websocket_server import WebSocketServer
+from firmware_bridge.emulation.websocket_server import WebSocketServer
+from firmware_bridge.emulation.xela_server_model import GARBAGE, VendorServer
 
 DEFAULT_MESSAGE_HZ: Final = 100.0
 HOST: Final = "127.0.0.1"

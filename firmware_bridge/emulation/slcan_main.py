@@ -1,6 +1,6 @@
 """Command line of the emulated controller and its slcan adapter, to try a client by hand.
 
-    python -m firmware_bridge.emulator FILE [FILE]
+    python -m firmware_bridge.emulation.slcan_main FILE [FILE]
 
 The first line it prints is the port.
 """
@@ -14,14 +14,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.controller import FRAME_S
+from firmware_bridge.emulation.fault_log import TruthFiles
+from firmware_bridge.emulation.faults.injector import Injector
+from firmware_bridge.emulation.faults.stretches import parse_stretches
+from firmware_bridge.emulation.faults.truth import Truth
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.errors import BridgeError
-from firmware_bridge.faults.injector import Injector
-from firmware_bridge.faults.stretches import parse_stretches
-from firmware_bridge.faults.truth import Truth
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.slcan_emulator import Emulator
-from firmware_bridge.truth_files import TruthFiles
 
 INTERRUPTED: Final = 130
 _STOP_POLL_S: Final = 0.05
@@ -29,7 +29,7 @@ _STOP_POLL_S: Final = 0.05
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play the recordings named on the command line."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_bridge.emulator", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m firmware_bridge.emulation.slcan_main", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("file", nargs="+", help="recording, .csv or .npz")
     parser.add_argument(

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
-from firmware_bridge.faults.injector import Injector
-from firmware_bridge.faults.lines import Piece
-from firmware_bridge.pseudo_port import COUNTED_LATE_NS, PseudoPort
+from firmware_bridge.emulation.faults.injector import Injector
+from firmware_bridge.emulation.faults.lines import Piece
+from firmware_bridge.emulation.pty_port import COUNTED_LATE_NS, PseudoPort
+from firmware_bridge.emulation.xela_controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 

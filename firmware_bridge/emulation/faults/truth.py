@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from firmware_bridge.faults.frames import READ, BusFrame
-from firmware_bridge.faults.lines import LINE_ENDS, Piece
+from firmware_bridge.emulation.faults.frames import READ, BusFrame
+from firmware_bridge.emulation.faults.lines import LINE_ENDS, Piece
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 FATES: Final = (

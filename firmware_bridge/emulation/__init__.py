@@ -1,0 +1,1 @@
+"""Emulated controllers and servers, with faults."""
