@@ -22,7 +22,7 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain, read_model
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.bounded import read_bounded
+from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.recording import formats as recording
 from firmware_bridge.recording.formats import CSV_HEADER, load_recording

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.bounded import read_up_to
+from firmware_bridge.bounded_read import read_up_to
 
 BROKEN: Final = (
     pickle.UnpicklingError,

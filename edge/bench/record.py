@@ -18,7 +18,7 @@ from edge.bench.soak import Soak
 from edge.bench.system import StartUp, SystemRow
 from edge.bench.targets import Verdict
 from edge.bench.timing import Pace, Times
-from firmware_bridge.bounded import read_bounded
+from firmware_bridge.bounded_read import read_bounded
 
 FORMAT: Final = "tactile bench"
 VERSION: Final = 1

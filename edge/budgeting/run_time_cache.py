@@ -15,7 +15,7 @@ import numpy as np
 import onnxruntime
 
 from edge.budgeting.run_times import ROUND_TICKS, ROUNDS, RunTime
-from firmware_bridge.bounded import read_bounded
+from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.in_place import write_in_place
 
 FILE_NAME: Final = "calibration.json"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from edge.errors import ModelError
-from firmware_bridge.bounded import read_bounded
+from firmware_bridge.bounded_read import read_bounded
 
 MOST_BYTES: Final = 1 << 28
 """A hundred times the largest bundled model, ten times the paper's network."""

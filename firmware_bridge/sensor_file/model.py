@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.bounded import read_bounded
+from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap

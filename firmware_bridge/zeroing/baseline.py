@@ -12,7 +12,7 @@ from typing import Any, Final, Literal, NoReturn, Self, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.bounded import read_bounded
+from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.geometry import AXES
 from firmware_bridge.in_place import write_in_place
