@@ -40,7 +40,7 @@ from train.errors import CheckpointError, TrainError
 from train.freeze import SEED, held_out
 from train.networks.blocks import PatternNet
 from train.physics.pads import input_scale
-from train.poses import ANGLE_STEP_DEG
+from train.surfaces.poses import ANGLE_STEP_DEG
 from train.training import load_network
 
 OUTPUT_UNIT: Final = "mm"

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from train.contact import ContactSolver
-from train.depth import NOTHING_MM
 from train.layer import Layer
+from train.surfaces.depth_image import NOTHING_MM
 
 CELL_MM = 0.47
 SIZE = 42

@@ -14,13 +14,13 @@ from threadpoolctl import threadpool_limits
 
 from train import generate as generating
 from train.dataset import join, load_sequences, windows
-from train.depth import Pose
 from train.errors import DatasetError, MeshError, SurfaceError
 from train.generate import generate, main
 from train.generation import Generation, random_figures, solve_chunk
 from train.nuisances import Nuisances
-from train.poses import paper_targets, position_mm, positions_of, turned_back
 from train.simulation import SimulatedSensor
+from train.surfaces.depth_image import Pose
+from train.surfaces.poses import paper_targets, position_mm, positions_of, turned_back
 
 SMALL = Generation(surfaces=("C", "small square", "glyph:7"), count=10, taps=2, chunk=3, seed=5)
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import shapely
 
-from train.glyphs import AREA_MM2, GLYPH_REACH_MM, POLYGON_REACH_MM, glyph, polygon
-from train.surfaces import FIGURE_HEIGHT_MM, PLATE_MM, is_flat, surface_mesh
+from train.surfaces.catalogue import FIGURE_HEIGHT_MM, PLATE_MM, is_flat, surface_mesh
+from train.surfaces.random_figures import AREA_MM2, GLYPH_REACH_MM, POLYGON_REACH_MM, glyph, polygon
 
 SEEDS = range(250)
 KINDS = {"glyph": (glyph, GLYPH_REACH_MM), "polygon": (polygon, POLYGON_REACH_MM)}

@@ -7,7 +7,6 @@ import pytest
 
 from edge.evaluation.metrics import contact_iou
 from firmware_bridge.geometry import USPA44
-from train.depth import Pose, Relief, footprints
 from train.families.shape import NOWHERE_MM
 from train.layer import surface_compliance
 from train.physics.covers import BARE, Cover
@@ -15,7 +14,8 @@ from train.physics.gripped import MOST_FORCE_N, SAMPLES, SCALE, TRACTION_SCALE, 
 from train.physics.pads import NOMINAL
 from train.resample import resample
 from train.simulation import FINE_SCALE, SimulatedSensor
-from train.surfaces import surface_mesh
+from train.surfaces.catalogue import surface_mesh
+from train.surfaces.depth_image import Pose, Relief, footprints
 
 PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
 

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from train.errors import MeshError, TrainError
-from train.meshes import MAX_TRIANGLES, load_mesh
+from train.surfaces.meshes import MAX_TRIANGLES, load_mesh
 
 BOX_MM = (10.0, 8.0, 3.0)
 AT_REST = [-5, -4, -3, 5, 4, 0]

@@ -8,7 +8,6 @@ import pytest
 from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from train.depth import Pose
 from train.hysteresis import frame_weights, maxwell
 from train.nuisances import (
     LARGEST_COUNTS,
@@ -20,6 +19,7 @@ from train.nuisances import (
     jitter_poses,
     read_windows,
 )
+from train.surfaces.depth_image import Pose
 
 NONE = Nuisances.none()
 STRONG = Nuisances(

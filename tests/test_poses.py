@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from train.depth import Pose
-from train.poses import (
+from train.surfaces.catalogue import SURFACES
+from train.surfaces.depth_image import Pose
+from train.surfaces.poses import (
     HELD_OUT_RADIUS_MM,
     PAPER_ANGLES_DEG,
     POSITION_STEP_MM,
@@ -16,7 +17,6 @@ from train.poses import (
     random_targets,
     turned_back,
 )
-from train.surfaces import SURFACES
 
 
 def test_the_nine_positions_are_a_grid_from_the_top_left():

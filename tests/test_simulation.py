@@ -5,11 +5,11 @@ import trimesh
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.contact import ContactSolver
-from train.depth import Pose, Relief, footprints
 from train.layer import Layer
 from train.simulation import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
 from train.skin import NEWTONS_PER_COUNT_Z
-from train.surfaces import surface_mesh
+from train.surfaces.catalogue import surface_mesh
+from train.surfaces.depth_image import Pose, Relief, footprints
 
 SENSOR = SimulatedSensor()
 PIXEL_MM = USPA44.pixel_pitch_mm(FINE_SCALE)

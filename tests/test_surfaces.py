@@ -6,8 +6,8 @@ import shapely
 import trimesh
 
 from train.errors import SurfaceError
-from train.figures import figure
-from train.surfaces import FIGURE_HEIGHT_MM, PLATE_MM, PLATES, REACH_MM, SURFACES, is_flat, surface_mesh
+from train.surfaces.catalogue import FIGURE_HEIGHT_MM, PLATE_MM, PLATES, REACH_MM, SURFACES, is_flat, surface_mesh
+from train.surfaces.paper_figures import figure
 
 WITH_A_HOLE = {"O", "P", "hollow circle", "hollow square", "hollow triangle"}
 ROUND = [1.0, 1.5, 4.0, 10.0, 100.0, 1000.0]

@@ -3,10 +3,10 @@ import pytest
 import torch
 
 from train.contact import ContactSolver
-from train.depth import Relief, depth_image
 from train.layer import Layer
-from train.poses import random_targets
-from train.surfaces import FIGURE_HEIGHT_MM, surface_mesh
+from train.surfaces.catalogue import FIGURE_HEIGHT_MM, surface_mesh
+from train.surfaces.depth_image import Relief, depth_image
+from train.surfaces.poses import random_targets
 from train.tpsf import BETA_MM, spread, spread_by_fft, tpsf, tpsf_pattern
 
 PIXEL_MM = 0.47

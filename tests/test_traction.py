@@ -4,7 +4,6 @@ import torch
 
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
-from train.depth import NOTHING_MM
 from train.layer import Layer, inner_displacement, surface_compliance
 from train.magnets import Magnet
 from train.physics.friction import FrictionSolver
@@ -16,6 +15,7 @@ from train.physics.tangential_layer import (
     surface_tensor,
 )
 from train.skin import Skin
+from train.surfaces.depth_image import NOTHING_MM
 
 SIZE, CELL_MM = 42, 0.47
 AS = np.concatenate([[0.0], np.logspace(-9, 4, 120), [1e6, 1e12]])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import AXES, USPA44
 from train.errors import DatasetError
 from train.plain_pickle import BROKEN, load_plain, plain_value
-from train.poses import position_and_angle
+from train.surfaces.poses import position_and_angle
 
 FRAMES_KEPT: Final = 16
 FIRST_SHARE: Final = 0.3

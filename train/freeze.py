@@ -27,14 +27,14 @@ from train.data.files import load_taps
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
 from train.dataset import Sequences, between_frames, quarter_turns
-from train.depth import Pose
 from train.errors import TrainError
 from train.generation import Generation, solve_all
 from train.nuisances import Nuisances, apply_nuisances, draw_rest
-from train.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position_mm
 from train.resample import resample
 from train.simulation import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
-from train.surfaces import SURFACES
+from train.surfaces.catalogue import SURFACES
+from train.surfaces.depth_image import Pose
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position_mm
 from train.taxels import fit_kinds
 
 SEED: Final = 20240228

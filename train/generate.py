@@ -35,8 +35,8 @@ from edge.terminal.progress_bar import Progress
 from train.dataset import Sequences, join, load_sequences
 from train.errors import DatasetError, TrainError
 from train.generation import FORCE_N, Generation, one_thread, random_figures, solve_chunk
-from train.poses import ANGLE_STEP_DEG, MAX_TAPS
-from train.surfaces import PLATES, SURFACES, surface_mesh
+from train.surfaces.catalogue import PLATES, SURFACES, surface_mesh
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 from train.workers import start_workers
 
 _INTERRUPTED: Final = 130

@@ -15,12 +15,15 @@ from threadpoolctl import threadpool_limits
 
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, join
-from train.depth import SAMPLES
 from train.errors import DatasetError, TrainError
 from train.layer import Layer
 from train.magnets import Magnet
 from train.nuisances import Nuisances, jitter_poses
-from train.poses import (
+from train.simulation import SimulatedSensor
+from train.skin import IN_PLANE_SHARE
+from train.surfaces.catalogue import SURFACES
+from train.surfaces.depth_image import SAMPLES
+from train.surfaces.poses import (
     ANGLE_STEP_DEG,
     MAX_TAPS,
     Split,
@@ -31,9 +34,6 @@ from train.poses import (
     random_targets,
     turned_back,
 )
-from train.simulation import SimulatedSensor
-from train.skin import IN_PLANE_SHARE
-from train.surfaces import SURFACES
 from train.tpsf import BETA_MM
 
 FORCE_N: Final = 9.2

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from firmware_bridge.geometry import AXES, SensorGeometry
-from train.depth import Pose
 from train.hysteresis import NuisanceError, draw_lag, frame_weights
+from train.surfaces.depth_image import Pose
 
 Seed = int | Sequence[int] | np.random.SeedSequence
 
@@ -149,7 +149,7 @@ def apply_nuisances(
         nuisances: of these sensors.
         seed: every nuisance draws from a stream of its own under it: switching one off changes no other.
         tap_s: durations, broadcast to (n, K), in [s]; None draws them between the bounds of TAP_S.
-        angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.depth.Pose.
+        angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.surfaces.depth_image.Pose.
 
     Returns:
         Whole zeroed counts, shape of `clean`.

@@ -18,12 +18,12 @@ from edge.inference.onnx_session import ModelSession
 from export.stability.case import timed
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
-from train.depth import NOTHING_MM, Pose, Relief, footprints
 from train.experiments.report import Row
 from train.layer import Layer
 from train.resample import resample
 from train.skin import Skin
-from train.surfaces import SURFACES, surface_mesh
+from train.surfaces.catalogue import SURFACES, surface_mesh
+from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, footprints
 from train.tpsf import tpsf_pattern
 
 SHIPPED: Final = "ships"

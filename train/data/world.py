@@ -15,8 +15,8 @@ from train.generation import mesh_sha256, one_thread
 from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
-from train.poses import MAX_TAPS
-from train.surfaces import surface_mesh
+from train.surfaces.catalogue import surface_mesh
+from train.surfaces.poses import MAX_TAPS
 
 INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly; the upper one is what the layer is linear to."""

@@ -18,10 +18,10 @@ from torch import Tensor
 from firmware_bridge.geometry import USPA44
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
-from train.poses import random_targets
 from train.psf_net import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.resample import resample
 from train.simulation import FINE_SCALE, FRAMES, SimulatedSensor, Taps
+from train.surfaces.poses import random_targets
 
 SURFACES: Final = ("large circle", "small circle")
 """The first has four times the area of the second."""

@@ -19,13 +19,13 @@ from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.contact import ContactSolver
-from train.depth import depth_image
 from train.experiments.referee import CENTRE, FINEST, REFEREE_POISSON, SCALE, Mesh, Verdict, press_or_recall, relief
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.layer import Layer
 from train.simulation import MAX_INDENTATION_MM
-from train.surfaces import PLATES
+from train.surfaces.catalogue import PLATES
+from train.surfaces.depth_image import depth_image
 from train.tpsf import BETA_MM, spread, tpsf_pattern
 
 STEPS: Final = 10

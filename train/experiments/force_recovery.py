@@ -39,7 +39,7 @@ from train.experiments.trainings import mixed
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, TEST_FORCE_N
 from train.nuisances import Nuisances
-from train.poses import TARGET_ANGLES_DEG
+from train.surfaces.poses import TARGET_ANGLES_DEG
 
 _RATE_HZ: Final = 100.0
 _QUICK_RATE_HZ: Final = 20.0

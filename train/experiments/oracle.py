@@ -20,7 +20,6 @@ from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.presses import PressSet, join_presses
 from train.data.world import INDENTATION_MM
-from train.depth import Relief, footprints
 from train.experiments.report import Row
 from train.experiments.scores import pattern_cells
 from train.experiments.shipped import ALL, NOTHING, SHORT, infer_presses
@@ -29,9 +28,10 @@ from train.generation import one_thread
 from train.nuisances import Nuisances
 from train.physics.gripped import SAMPLES, GrippedPad, Presses
 from train.physics.pads import Pad, constants, draw_pad
-from train.poses import as_poses, random_targets, turned_back
 from train.simulation import MAX_INDENTATION_MM
-from train.surfaces import SURFACES, surface_mesh
+from train.surfaces.catalogue import SURFACES, surface_mesh
+from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.poses import as_poses, random_targets, turned_back
 
 PRESSES: Final = 30
 SEED: Final = 31

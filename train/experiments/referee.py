@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44
-from train.depth import Pose, Relief, depth_image
 from train.layer import Layer
 from train.mooney_rivlin import C2_SHARE
-from train.surfaces import surface_mesh
+from train.surfaces.catalogue import surface_mesh
+from train.surfaces.depth_image import Pose, Relief, depth_image
 
 SCALE: Final = 10
 """Patterns are compared at 40 x 40, as in the paper."""

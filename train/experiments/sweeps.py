@@ -13,7 +13,7 @@ from train.dataset import Sequences
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, freeze
 from train.nuisances import LARGEST_COUNTS, Nuisances
-from train.poses import ANGLE_STEP_DEG, TARGET_ANGLES_DEG
+from train.surfaces.poses import ANGLE_STEP_DEG, TARGET_ANGLES_DEG
 
 TAPS: Final = 4
 """Of the longest window that is judged here."""

@@ -10,7 +10,7 @@ from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import alike, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
-from train.poses import MAX_TAPS
+from train.surfaces.poses import MAX_TAPS
 from train.training import infer
 
 

@@ -10,7 +10,7 @@ from train.fit import given_taps
 from train.generation import Generation, random_figures
 from train.loop import Recipe
 from train.networks.blocks import PatternNet
-from train.poses import ANGLE_STEP_DEG, MAX_TAPS
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 from train.training import Training
 
 SEEN: Final = Generation(taps=MAX_TAPS, seed=1)

@@ -28,7 +28,7 @@ from train.fit import given_taps
 from train.generation import random_figures
 from train.loop import Recipe
 from train.networks.blocks import PatternNet
-from train.surfaces import SURFACES
+from train.surfaces.catalogue import SURFACES
 from train.training import Training
 
 HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")

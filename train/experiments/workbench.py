@@ -29,8 +29,8 @@ from train.generation import Generation
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.nuisances import Nuisances
-from train.poses import MAX_TAPS, Split
-from train.surfaces import SURFACES
+from train.surfaces.catalogue import SURFACES
+from train.surfaces.poses import MAX_TAPS, Split
 from train.training import Training, fit_network, load_network
 
 _TIMED_RUNS: Final = 30

@@ -8,14 +8,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.depth import Relief, footprints
 from train.errors import SurfaceError
 from train.families import faces, rounds, solids
 from train.families.shape import Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.poses import ANGLE_STEP_DEG, as_poses, random_targets, turned_back
-from train.surfaces import SURFACES, surface_mesh
+from train.surfaces.catalogue import SURFACES, surface_mesh
+from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.poses import ANGLE_STEP_DEG, as_poses, random_targets, turned_back
 
 SHAPES: Final[Mapping[str, Callable[[np.random.Generator], Height]]] = {
     **{maker.__name__: maker for maker in (faces.flat, faces.block, faces.edge, faces.corner, faces.slot, faces.step)},
@@ -139,7 +139,8 @@ def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
 def _turned(lie: Lie, turn_deg: float, x_mm: float, y_mm: float) -> Lie:
     """The same shape seen by a pad that was turned about its centre and then moved.
 
-    In the pad's axes, x to the right and y down, a shape turns as the pad does seen from above (train.depth.Pose).
+    In the pad's axes, x to the right and y down, a shape turns as the pad does seen from above
+    (train.surfaces.depth_image.Pose).
     """
     turn = np.radians(turn_deg)
     cosine, sine = np.cos(turn), np.sin(turn)

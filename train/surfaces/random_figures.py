@@ -11,7 +11,7 @@ import numpy as np
 from shapely import LinearRing, LineString, Polygon, affinity, set_precision, unary_union
 from shapely.geometry.base import BaseGeometry
 
-from train.figures import Points, arc
+from train.surfaces.paper_figures import Points, arc
 
 GLYPH_REACH_MM: Final = 8.0
 """Glyphs stay within this of the plate's centre along x and y."""

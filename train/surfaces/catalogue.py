@@ -17,9 +17,9 @@ import trimesh
 from shapely.geometry.base import BaseGeometry
 
 from train.errors import SurfaceError
-from train.figures import LETTERS, SHAPES, figure
-from train.glyphs import glyph, polygon
-from train.meshes import load_mesh
+from train.surfaces.meshes import load_mesh
+from train.surfaces.paper_figures import LETTERS, SHAPES, figure
+from train.surfaces.random_figures import glyph, polygon
 
 PLATE_MM: Final = 20.0
 FIGURE_HEIGHT_MM: Final = 2.0

@@ -1,0 +1,1 @@
+"""Surfaces to tap, and where they are tapped."""
