@@ -53,7 +53,7 @@ from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_base
 from train.authors_files import load_authors_taps
 from train.dataset import Sequences, load_sequences
 from train.errors import DatasetError
-from train.simulation import FRAMES
+from train.physics.simulated_sensor import FRAMES
 
 LONGEST_MESSAGE = 1000
 """Characters of an error that a user can still read, paths among them."""

@@ -7,7 +7,7 @@ import torch
 from train.batches import COUNTS_PER_UNIT, Draw, WindowBatches, network_input
 from train.dataset import windows
 from train.generation import Generation, solve_all
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 
 CLEAN = Draw(nuisances=Nuisances.none())
 

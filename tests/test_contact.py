@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from train.contact import ContactSolver
-from train.layer import Layer
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
 from train.surfaces.depth_image import NOTHING_MM
 
 CELL_MM = 0.47

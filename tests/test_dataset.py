@@ -9,8 +9,8 @@ import pytest
 from train import dataset
 from train.dataset import Sequences, join, load_sequences, quarter_turns, windows
 from train.errors import DatasetError, TrainError
-from train.nuisances import Nuisances
-from train.simulation import FRAMES
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import FRAMES
 
 QUIET = Nuisances.none()
 SHARES = np.arange(1, FRAMES + 1) / FRAMES

@@ -7,7 +7,7 @@ from experiment_samples import quick_bench
 
 from train.experiments import bound
 from train.experiments.bound import Nudged, least_mse, nudged
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 
 QUIET = replace(Nuisances.none(), noise_counts=1.0)
 

@@ -10,7 +10,7 @@ from train.experiments import force_recovery
 from train.experiments.course import CLAIM_N, RANGE_N, Course, Scans, contact, errors, loop_percent, pressed
 from train.experiments.force_recovery import Gauge, training_presses
 from train.experiments.trainings import mixed
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 
 COURSE = Course(20.0)
 RAMP_N = 5.0 * COURSE.share

@@ -14,9 +14,9 @@ from firmware_bridge.scans.pad import Pad
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError
 from train.experiments import baselines, families, kriging, nominal, oracle, pads, scores, shipped, wrench
-from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import NOMINAL
+from train.physics.sensor_noise import Nuisances
 
 
 @pytest.fixture(scope="module")

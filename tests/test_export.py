@@ -24,7 +24,7 @@ from train.errors import CheckpointError
 from train.freeze import freeze
 from train.loop import Recipe
 from train.networks.registry import build
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 from train.training import Training, fit_network, infer, load_network
 
 COMPACT = Training(

@@ -4,10 +4,10 @@ import pytest
 pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
 
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
-from train.fem import FemPad, NoEquilibriumError
-from train.layer import Layer
-from train.mooney_rivlin import MooneyRivlin
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.fem_reference import FemPad, NoEquilibriumError
+from train.physics.mooney_rivlin import MooneyRivlin
 
 NOTHING_MM = 1e3
 

@@ -3,10 +3,10 @@ import pytest
 import torch
 
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
-from train.layer import Layer
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
 from train.physics.free_sides import FreeSides
-from train.skin import Skin
+from train.physics.taxel_response import Skin
 
 SIZE, CELL_MM = 42, 0.47
 CELLS_MM = (np.arange(SIZE) - (SIZE - 1) / 2) * CELL_MM

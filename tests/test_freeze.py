@@ -11,8 +11,8 @@ from train.data.world import World, solve_pad
 from train.dataset import Sequences
 from train.freeze import SEED, TEST_FORCE_N, demo_recording, drawn, fit_classical, fit_taxels, freeze, held_out, main
 from train.generation import Generation, solve_all
-from train.nuisances import Nuisances
-from train.simulation import FRAMES, MAX_INDENTATION_MM
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
 from train.taxels import KINDS, fit_kinds
 
 

@@ -8,8 +8,8 @@ from train.data.frozen_presses import freeze_presses, load_frozen_presses, main
 from train.data.presses import PressSet
 from train.families.catalogue import SHARES
 from train.freeze import fit_classical, fit_taxels
-from train.nuisances import Nuisances
 from train.physics.pads import INPUTS, KNOWN, input_scale
+from train.physics.sensor_noise import Nuisances
 
 WIDE_SHA256 = "b1476a097b6710464287ada7ab193fdf6f99a324ecefffb1265e3f682ccfd04c"
 

@@ -17,8 +17,8 @@ from train.dataset import join, load_sequences, windows
 from train.errors import DatasetError, MeshError, SurfaceError
 from train.generate import generate, main
 from train.generation import Generation, random_figures, solve_chunk
-from train.nuisances import Nuisances
-from train.simulation import SimulatedSensor
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import SimulatedSensor
 from train.surfaces.depth_image import Pose
 from train.surfaces.poses import paper_targets, position_mm, positions_of, turned_back
 

@@ -8,12 +8,12 @@ import pytest
 from edge.evaluation.metrics import contact_iou
 from firmware_bridge.geometry import USPA44
 from train.families.shape import NOWHERE_MM
-from train.layer import surface_compliance
 from train.physics.covers import BARE, Cover
+from train.physics.elastic_layer import surface_compliance
 from train.physics.gripped import MOST_FORCE_N, SAMPLES, SCALE, TRACTION_SCALE, GrippedPad, PressError
 from train.physics.pads import NOMINAL
-from train.resample import resample
-from train.simulation import FINE_SCALE, SimulatedSensor
+from train.physics.resample import resample
+from train.physics.simulated_sensor import FINE_SCALE, SimulatedSensor
 from train.surfaces.catalogue import surface_mesh
 from train.surfaces.depth_image import Pose, Relief, footprints
 

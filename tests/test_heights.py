@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from train.contact import ContactSolver
-from train.heights import PLANES, heights_pattern
-from train.layer import Layer
-from train.tpsf import tpsf_pattern
+from train.physics.contact import ContactSolver
+from train.physics.curved_patterns import PLANES, heights_pattern
+from train.physics.elastic_layer import Layer
+from train.physics.tpsf import tpsf_pattern
 
 PIXEL_MM = 0.47
 SIDE = 42

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from train.layer import Layer, inner_displacement, surface_compliance
+from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
 
 WAVES = np.array([0.0, 1e-6, 1e-3, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 1e3, 1e6])
 

@@ -5,7 +5,7 @@ from magpylib.func import cylinder_field, dipole_field
 from scipy.spatial.transform import Rotation
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.magnets import FIELDS, Magnet, MagnetArray, cylinder_mt, dipole_mt
+from train.physics.magnets import FIELDS, Magnet, MagnetArray, cylinder_mt, dipole_mt
 
 MAGNET = Magnet()
 ONE = SensorGeometry("one", rows=1, cols=1, pitch_mm=4.7, width_mm=4.7, height_mm=4.7)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from train.layer import Layer
-from train.mooney_rivlin import MooneyRivlin
+from train.physics.elastic_layer import Layer
+from train.physics.mooney_rivlin import MooneyRivlin
 
 RUBBER = MooneyRivlin(0.05, 0.02, 6.0)
 STEP = 1e-6

@@ -8,8 +8,8 @@ import pytest
 from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from train.hysteresis import frame_weights, maxwell
-from train.nuisances import (
+from train.physics.hysteresis import frame_weights, maxwell
+from train.physics.sensor_noise import (
     LARGEST_COUNTS,
     NAMES,
     NuisanceError,

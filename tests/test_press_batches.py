@@ -10,8 +10,8 @@ from press_samples import make_press_set
 from train.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses
 from train.data.press_batches import PressBatches, read_presses
-from train.nuisances import Nuisances
 from train.physics.pads import INPUTS
+from train.physics.sensor_noise import Nuisances
 
 QUIET = Nuisances.none()
 GAINS_ALONE = replace(QUIET, gain_spread=0.1)

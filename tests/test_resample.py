@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from train.resample import resample, resample_touching
+from train.physics.resample import resample, resample_touching
 
 SCALES = [4, 4.5, 6, 7, 8, 10, 12.5, 15, 19, 20]
 

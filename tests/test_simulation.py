@@ -4,10 +4,10 @@ import torch
 import trimesh
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.contact import ContactSolver
-from train.layer import Layer
-from train.simulation import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
-from train.skin import NEWTONS_PER_COUNT_Z
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
+from train.physics.taxel_response import NEWTONS_PER_COUNT_Z
 from train.surfaces.catalogue import surface_mesh
 from train.surfaces.depth_image import Pose, Relief, footprints
 

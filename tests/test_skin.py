@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from firmware_bridge.geometry import USPA44
-from train.layer import Layer
-from train.magnets import Magnet
-from train.skin import NEWTONS_PER_COUNT_Z, Skin
+from train.physics.elastic_layer import Layer
+from train.physics.magnets import Magnet
+from train.physics.taxel_response import NEWTONS_PER_COUNT_Z, Skin
 
 SIZE, CELL_MM = 42, 0.47
 SKIN = Skin(USPA44, Layer(), SIZE, CELL_MM)

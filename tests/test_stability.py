@@ -11,9 +11,9 @@ from export.stability import __main__ as command
 from export.stability import counts, layer_contact, magnets, networks, pareto, psf
 from export.stability.case import Case, refused
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
-from train.layer import Layer
-from train.magnets import Magnet, MagnetArray
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.magnets import Magnet, MagnetArray
 
 CHEAP = tuple(part for part in command.PARTS if part != "finite_elements")
 NAME = "-".join(["stability", *CHEAP, "quick"])
@@ -97,7 +97,7 @@ def test_an_unknown_part_is_a_usage_error(capsys):
 
 def test_a_thick_layer_needs_a_wide_grid(monkeypatch):
     """The row that found it: on twice the pad, copies of the pad were felt."""
-    monkeypatch.setattr("train.contact._DIES_WITHIN", 0)
+    monkeypatch.setattr("train.physics.contact._DIES_WITHIN", 0)
     broken = [row for row in layer_contact.cases() if not row.holds]
     assert {row.severity for row in broken} == {"10 mm", "20 mm", "50 mm"}
 

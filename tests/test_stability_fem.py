@@ -4,8 +4,8 @@ import pytest
 pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
 
 from export.stability import finite_elements
-from train.fem import FemPad, NoEquilibriumError
-from train.layer import Layer
+from train.physics.elastic_layer import Layer
+from train.physics.fem_reference import FemPad, NoEquilibriumError
 
 
 @pytest.fixture(scope="module")

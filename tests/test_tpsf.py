@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 
-from train.contact import ContactSolver
-from train.layer import Layer
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.tpsf import BETA_MM, spread, spread_by_fft, tpsf, tpsf_pattern
 from train.surfaces.catalogue import FIGURE_HEIGHT_MM, surface_mesh
 from train.surfaces.depth_image import Relief, depth_image
 from train.surfaces.poses import random_targets
-from train.tpsf import BETA_MM, spread, spread_by_fft, tpsf, tpsf_pattern
 
 PIXEL_MM = 0.47
 ONE = np.ones(1)

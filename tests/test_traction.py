@@ -3,18 +3,18 @@ import pytest
 import torch
 
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
-from train.layer import Layer, inner_displacement, surface_compliance
-from train.magnets import Magnet
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
 from train.physics.friction import FrictionSolver
 from train.physics.magnet_response import traction_response
+from train.physics.magnets import Magnet
 from train.physics.tangential_layer import (
     inner_tangential,
     surface_spread,
     surface_tangential_compliance,
     surface_tensor,
 )
-from train.skin import Skin
+from train.physics.taxel_response import Skin
 from train.surfaces.depth_image import NOTHING_MM
 
 SIZE, CELL_MM = 42, 0.47

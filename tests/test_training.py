@@ -13,8 +13,8 @@ from train.freeze import SEED, freeze, held_out
 from train.generation import Generation, solve_all
 from train.loop import Recipe
 from train.networks.compact import CompactNet
-from train.nuisances import Nuisances
 from train.physics.pads import KNOWN
+from train.physics.sensor_noise import Nuisances
 from train.training import Training, best_contact_level, fit_network, infer, load_network
 
 SMALL = {"channels": 16, "blocks": 1}

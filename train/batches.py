@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from train.data.batch import Batch
 from train.dataset import Sequences, quarter_turns, windows
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 from train.surfaces.catalogue import is_random_figure
 
 COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)

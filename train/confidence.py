@@ -12,7 +12,7 @@ from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences
 from train.freeze import SEED, freeze
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 
 BINS: Final = 10
 _SET_FORCES_N: Final = (5.0, 2.0, 1.0)

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_reader import read_npz
 from train.errors import DatasetError
-from train.nuisances import Nuisances, Seed, read_windows
-from train.resample import resample, resample_touching
-from train.simulation import FINE_SCALE, FRAMES
+from train.physics.resample import resample, resample_touching
+from train.physics.sensor_noise import Nuisances, Seed, read_windows
+from train.physics.simulated_sensor import FINE_SCALE, FRAMES
 
 SCHEMA: Final = "tactile-edge-sr sequences"
 VERSION: Final = 1

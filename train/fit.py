@@ -25,8 +25,8 @@ from train.errors import TrainError
 from train.freeze import SEED, freeze, held_out
 from train.loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
-from train.nuisances import Nuisances
 from train.physics.pads import KNOWN
+from train.physics.sensor_noise import Nuisances
 from train.training import Training, fit_network
 
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}

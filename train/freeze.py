@@ -29,9 +29,9 @@ from train.data.presses import PressSet
 from train.dataset import Sequences, between_frames, quarter_turns
 from train.errors import TrainError
 from train.generation import Generation, solve_all
-from train.nuisances import Nuisances, apply_nuisances, draw_rest
-from train.resample import resample
-from train.simulation import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
+from train.physics.resample import resample
+from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest
+from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
 from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import Pose
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position_mm

@@ -16,11 +16,12 @@ from threadpoolctl import threadpool_limits
 from edge.terminal.progress_bar import tracked
 from train.dataset import Sequences, join
 from train.errors import DatasetError, TrainError
-from train.layer import Layer
-from train.magnets import Magnet
-from train.nuisances import Nuisances, jitter_poses
-from train.simulation import SimulatedSensor
-from train.skin import IN_PLANE_SHARE
+from train.physics.elastic_layer import Layer
+from train.physics.magnets import Magnet
+from train.physics.sensor_noise import Nuisances, jitter_poses
+from train.physics.simulated_sensor import SimulatedSensor
+from train.physics.taxel_response import IN_PLANE_SHARE
+from train.physics.tpsf import BETA_MM
 from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import SAMPLES
 from train.surfaces.poses import (
@@ -34,7 +35,6 @@ from train.surfaces.poses import (
     random_targets,
     turned_back,
 )
-from train.tpsf import BETA_MM
 
 FORCE_N: Final = 9.2
 """Presses go this far, so that set forces up to 8 N with 15 % of spread lie on them."""

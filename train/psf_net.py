@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.tpsf import Kernel, Plateau, tpsf
+from train.physics.tpsf import Kernel, Plateau, tpsf
 
 Gamma = Literal["sensor", "sample"]
 Form = Literal["paper", "code"]
@@ -55,8 +55,8 @@ class PsfNet(nn.Module):
 
     Args:
         geometry: the taxels.
-        kernel: form of the PSF, see `train.tpsf.spread`.
-        plateau: see `train.tpsf.tpsf`.
+        kernel: form of the PSF, see `train.physics.tpsf.spread`.
+        plateau: see `train.physics.tpsf.tpsf`.
         gamma: "sensor": one number, learnt beside the network (whose last layer has then two outputs);
             "sample": read off every scan.
         form: of the degradation, see `degrade`.

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from export.stability.case import Case, timed
-from train.contact import ContactSolver
-from train.layer import Layer
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
 
 PART: Final = "curved contact"
 _POISSON: Final = 0.45

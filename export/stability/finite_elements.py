@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from export.stability.case import Case, refused, timed
 from firmware_bridge.geometry import USPA44
 from train.experiments.referee import REFEREE_POISSON, Mesh
-from train.fem import FemPad, FemPresses, NoEquilibriumError
-from train.layer import Layer
+from train.physics.elastic_layer import Layer
+from train.physics.fem_reference import FemPad, FemPresses, NoEquilibriumError
 
 PART: Final = "FEM referee"
 BULKS: Final = (10.0, 100.0, 1000.0, 10000.0)

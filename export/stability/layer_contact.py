@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from export.stability.case import Case, refused, timed
-from train.contact import ContactResult, ContactSolver
-from train.layer import Layer, inner_displacement, surface_compliance
+from train.physics.contact import ContactResult, ContactSolver
+from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
 
 PART: Final = "layer contact"
 SIZE: Final = 42

@@ -8,7 +8,7 @@ import numpy as np
 
 from export.stability.case import Case, refused, timed
 from firmware_bridge.geometry import USPA44
-from train.magnets import MOVEMENT, Magnet, MagnetArray, cylinder_mt, dipole_mt
+from train.physics.magnets import MOVEMENT, Magnet, MagnetArray, cylinder_mt, dipole_mt
 
 PART: Final = "magnet reading"
 _NEAREST: Final = 0.75

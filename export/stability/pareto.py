@@ -17,18 +17,18 @@ from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
 from export.stability.case import timed
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
 from train.experiments.report import Row
-from train.layer import Layer
-from train.resample import resample
-from train.skin import Skin
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.resample import resample
+from train.physics.taxel_response import Skin
+from train.physics.tpsf import tpsf_pattern
 from train.surfaces.catalogue import SURFACES, surface_mesh
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, footprints
-from train.tpsf import tpsf_pattern
 
 SHIPPED: Final = "ships"
 _SHIPPED_GRID: Final = (42, 0.47)
-"""As train.simulation has it: whole cells of a tenth of the pitch, .13 mm short of each rim."""
+"""As train.physics.simulated_sensor has it: whole cells of a tenth of the pitch, .13 mm short of each rim."""
 SIZES: Final = (24, 42, 50, 100, 200)
 """Cells along the pad's 20 mm."""
 TOLERANCES: Final = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)

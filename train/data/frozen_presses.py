@@ -18,9 +18,9 @@ from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
 from train.errors import TrainError
 from train.freeze import SEED
-from train.nuisances import NAMES, Nuisances
 from train.physics.pads import input_scale, known_numbers
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.sensor_noise import NAMES, Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
 """The frozen set of every family on pads of their own; nothing is chosen by it."""
@@ -87,8 +87,8 @@ class FrozenPresses:
 def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances | None = None) -> FrozenPresses:
     """Read every sequence once, by a sensor of its own.
 
-    Gains act after hysteresis and cross-talk and before drift and noise, as in `train.nuisances`; here they are drawn
-    apart, so that they are known.
+    Gains act after hysteresis and cross-talk and before drift and noise, as in `train.physics.sensor_noise`; here they
+    are drawn apart, so that they are known.
     """
     nuisances = Nuisances() if nuisances is None else nuisances
     before = nuisances.without(*(name for name in NAMES if name not in _BEFORE_GAIN), "gain_spread")

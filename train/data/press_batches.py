@@ -11,8 +11,8 @@ from train.batches import network_input
 from train.data.batch import Batch
 from train.data.presses import PressSet
 from train.errors import DatasetError
-from train.nuisances import Nuisances, read_windows
 from train.physics.pads import known_numbers
+from train.physics.sensor_noise import Nuisances, read_windows
 
 _NOTHING: Final = 0.35
 _ALL: Final = 0.35

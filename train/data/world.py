@@ -12,9 +12,9 @@ from train.data.presses import VERSION, PressSet
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.generation import mesh_sha256, one_thread
-from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
+from train.physics.sensor_noise import Nuisances
 from train.surfaces.catalogue import surface_mesh
 from train.surfaces.poses import MAX_TAPS
 

@@ -11,8 +11,8 @@ from scipy import fft, ndimage
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.geometry import USPA44
 from train.experiments.workbench import Workbench
-from train.layer import Layer, inner_displacement, surface_compliance
-from train.magnets import Magnet
+from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
+from train.physics.magnets import Magnet
 
 WAVELENGTHS_MM: Final = (20.0, 14.0, 10.0, 7.0, 5.0, 3.0)
 _GRATING_MM: Final = 60.0

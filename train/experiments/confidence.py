@@ -26,7 +26,7 @@ from train.experiments.unseen import TEST_FIGURES, TEST_SEED
 from train.experiments.workbench import Workbench
 from train.freeze import SEED, freeze
 from train.generation import random_figures
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 
 PARTS: Final = 8
 """Bins of equally many frames, by what is expected of them."""

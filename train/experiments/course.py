@@ -12,7 +12,7 @@ from edge.perception.tap_tracker import TapTracker
 from firmware_bridge.geometry import USPA44
 from train.dataset import Sequences, between_frames
 from train.freeze import SEED, TEST_FORCE_N
-from train.nuisances import Nuisances, apply_nuisances, read_windows
+from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
 
 PRESS_S, HOLD_S, RELEASE_S, REST_S = 2.0, 5.0, 1.0, 2.0
 _ENDS_S: Final = np.cumsum([PRESS_S, HOLD_S, RELEASE_S, REST_S])

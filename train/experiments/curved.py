@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
 from train.experiments.referee import CENTRE, FINEST, SCALE, Mesh, press_or_recall, relief
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
-from train.heights import PLANES, heights_pattern
-from train.layer import Layer
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.contact import ContactSolver
+from train.physics.curved_patterns import PLANES, heights_pattern
+from train.physics.elastic_layer import Layer
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.physics.tpsf import tpsf_pattern
 from train.surfaces.depth_image import depth_image
-from train.tpsf import tpsf_pattern
 
 SURFACES: Final = ("sphere:10", "cylinder:10")
 STEPS: Final = 5

@@ -35,7 +35,7 @@ from train.experiments.hidden_taxel import recorded_sets, recording_paths, recor
 from train.experiments.report import Report, Row, with_interval
 from train.experiments.workbench import Workbench, thinned
 from train.freeze import SEED
-from train.nuisances import LARGEST_COUNTS
+from train.physics.sensor_noise import LARGEST_COUNTS
 
 MODELS: Final = ("stsr", "mtsr4")
 MOST_DEAD: Final = 8

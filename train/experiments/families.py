@@ -26,7 +26,7 @@ from train.experiments.shipped import ALL, NOTHING, SHORT, infer_presses, load_s
 from train.experiments.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.freeze import SEED
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 TRAINING: Final = World(count=34_000, seed=1)
 VALIDATION: Final = World(count=1260, taps=4, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)

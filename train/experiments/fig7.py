@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
 from train.experiments.referee import CENTRE, FINEST, REFEREE_POISSON, SCALE, Mesh, Verdict, press_or_recall, relief
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
-from train.layer import Layer
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.surfaces.catalogue import PLATES
 from train.surfaces.depth_image import depth_image
-from train.tpsf import BETA_MM, spread, tpsf_pattern
 
 STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)

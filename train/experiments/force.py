@@ -25,8 +25,8 @@ from train.experiments.report import Report, Row, bootstrap_interval, with_inter
 from train.experiments.trainings import mixed
 from train.experiments.workbench import Figures, Workbench
 from train.freeze import SCALE, SEED, TEST_FORCE_N
-from train.nuisances import Nuisances
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
 _DRAWS: Final = 4

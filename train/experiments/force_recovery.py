@@ -38,7 +38,7 @@ from train.experiments.report import Report, Row, with_interval
 from train.experiments.trainings import mixed
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, TEST_FORCE_N
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import TARGET_ANGLES_DEG
 
 _RATE_HZ: Final = 100.0

@@ -28,11 +28,11 @@ from train.experiments.hidden_taxel import (
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.identify import distinct, mixture_beside
-from train.nuisances import Nuisances, read_windows
 from train.physics.contact_mixture import CHANNELS, ContactMixture, Z, normalise
 from train.physics.gain_estimate import Estimate, estimate
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, constants, draw_pad
+from train.physics.sensor_noise import Nuisances, read_windows
 
 SENSORS: Final = World(count=4800, per_pad=200, seed=9015)
 """Other pads than those of seed 9014, on which what the estimate holds for sure was set."""

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
 from train.freeze import SCALE
+from train.physics.contact import ContactSolver
 from train.physics.gripped import GrippedPad
 
 FRICTION: Final = 0.4

@@ -16,8 +16,8 @@ from train.experiments.scores import pattern_cells
 from train.experiments.shipped import ALL, NOTHING, PAD, infer
 from train.experiments.workbench import Workbench, thinned
 from train.generation import random_figures
-from train.nuisances import Nuisances
 from train.physics.pads import INPUTS, NOMINAL
+from train.physics.sensor_noise import Nuisances
 
 TEST_FIGURES: Final = 24
 TEST_SEED: Final = 999

@@ -25,10 +25,10 @@ from train.experiments.scores import pattern_cells
 from train.experiments.shipped import ALL, NOTHING, SHORT, infer_presses
 from train.experiments.workbench import Workbench
 from train.generation import one_thread
-from train.nuisances import Nuisances
 from train.physics.gripped import SAMPLES, GrippedPad, Presses
 from train.physics.pads import Pad, constants, draw_pad
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.surfaces.catalogue import SURFACES, surface_mesh
 from train.surfaces.depth_image import Relief, footprints
 from train.surfaces.poses import as_poses, random_targets, turned_back

@@ -25,10 +25,10 @@ from train.experiments.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.freeze import SEED
 from train.generation import one_thread
-from train.nuisances import Nuisances
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, NOMINAL, Pad
-from train.simulation import MAX_INDENTATION_MM
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 SHAPES: Final = 40
 SHAPES_SEED: Final = 4711

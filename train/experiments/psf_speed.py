@@ -12,7 +12,7 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
-from train.tpsf import Kernel, spread, spread_by_fft
+from train.physics.tpsf import Kernel, spread, spread_by_fft
 
 _SCALE = 10
 LEAST_TIMES = 100

@@ -45,7 +45,7 @@ from train.experiments.hidden_taxel import (
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, drawn
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 
 _SCAN_NS: Final = 16_750_000
 _TAXELS: Final = USPA44.taxel_count

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44
-from train.layer import Layer
-from train.mooney_rivlin import C2_SHARE
+from train.physics.elastic_layer import Layer
+from train.physics.mooney_rivlin import C2_SHARE
 from train.surfaces.catalogue import surface_mesh
 from train.surfaces.depth_image import Pose, Relief, depth_image
 
@@ -20,7 +20,7 @@ SCALE: Final = 10
 CENTRE: Final = Pose(0.0, 0.0, 0.0)
 """The paper's p5 r0."""
 _EDITION: Final = 1
-"""Raise it when train.fem changes what it finds: kept results of another edition are not read."""
+"""Raise it when train.physics.fem_reference changes what it finds: kept results of another edition are not read."""
 
 
 class Mesh(NamedTuple):
@@ -104,7 +104,7 @@ _FIGURES: Final = ("force_n", "newton_steps", "residual", "run_s")
 
 
 def _work_out(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], pose: Pose, layer: Layer) -> Verdict:
-    from train.fem import FemPad  # here, because kept results need no FElupe
+    from train.physics.fem_reference import FemPad  # here, because kept results need no FElupe
 
     pad = FemPad(*mesh, layer)
     presses = pad.press(depth_image(relief(surface), pose, pad.size, pad.cell_mm), indentation_mm)

@@ -56,7 +56,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     report = Report("robust", folder, quick=bench.quick)
     report.say(
         f"{len(plain.surface)} taps at the held-out position, {len(plain)} frames, clean sequences the same "
-        "everywhere; of the nuisances (train.nuisances) one is changed, the others stay at their defaults, and every "
+        "everywhere; of the nuisances (train.physics.sensor_noise) one is changed, the others stay at their "
+        "defaults, and every "
         "other draw stays as it is. Only other pose errors and angles need taps of their own: with other angles the "
         "newest tap is still the same one, with other pose errors it is not. Dead taxels are drawn, exactly so many on "
         "each tap's sensor; a lost scan leaves the one before it; taps of another surface are the oldest ones. "

@@ -12,7 +12,7 @@ from edge.evaluation.test_set import FrozenSet
 from train.dataset import Sequences
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, freeze
-from train.nuisances import LARGEST_COUNTS, Nuisances
+from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances
 from train.surfaces.poses import ANGLE_STEP_DEG, TARGET_ANGLES_DEG
 
 TAPS: Final = 4

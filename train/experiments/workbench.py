@@ -28,7 +28,7 @@ from train.generate import generate
 from train.generation import Generation
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
-from train.nuisances import Nuisances
+from train.physics.sensor_noise import Nuisances
 from train.surfaces.catalogue import SURFACES
 from train.surfaces.poses import MAX_TAPS, Split
 from train.training import Training, fit_network, load_network

@@ -15,8 +15,8 @@ from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.recording.npz_reader import read_npz
 from train.data.presses import PressSet
 from train.errors import DatasetError
-from train.nuisances import LARGEST_COUNTS, Nuisances, read_windows
 from train.physics.pads import INPUTS
+from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, read_windows
 
 CHANNELS: Final = len(AXES) * USPA44.taxel_count
 Z: Final = slice(AXES.index("z") * USPA44.taxel_count, (AXES.index("z") + 1) * USPA44.taxel_count)

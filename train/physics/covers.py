@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44
-from train.layer import Layer, surface_compliance
+from train.physics.elastic_layer import Layer, surface_compliance
 
 
 @dataclass(frozen=True, slots=True)

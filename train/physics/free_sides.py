@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.layer import Layer
-from train.magnets import MOVEMENT
+from train.physics.elastic_layer import Layer
+from train.physics.magnets import MOVEMENT
 
 
 class Give(NamedTuple):

@@ -6,7 +6,7 @@ moves with the surface, or slips, and bears the traction mu p against its slip (
 
 That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's
 compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
-2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.contact.
+2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.physics.contact.
 
 Pressure alone spreads the surface too; on request friction holds that as well, as if every cell had been in contact
 from the start, which is exact for flat surfaces. What traction does to pressure is left out (Goodman 1962). That is
@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.contact import box_sides, boxes, period_cells
-from train.layer import Layer
+from train.physics.contact import box_sides, boxes, period_cells
+from train.physics.elastic_layer import Layer
 from train.physics.tangential_layer import surface_spread, surface_tensor
 
 _MAX_STEPS: Final = 60
@@ -111,7 +111,8 @@ class FrictionSolver:
             friction: (n,), coefficients mu, >= 0.
             tolerance: residual at which a pose is done.
             holds_spread: friction also holds what the pressure would spread. Then the magnets' in-plane movement
-                under pressure counts in full (train.skin.Skin, in_plane_share 1): these tractions hold it back.
+                under pressure counts in full (train.physics.taxel_response.Skin, in_plane_share 1): these tractions
+                hold it back.
 
         Raises:
             ValueError: shapes or values do not fit.

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from firmware_bridge.geometry import AXES, USPA44
 from train.errors import DatasetError
-from train.nuisances import Nuisances
 from train.physics.contact_mixture import CHANNELS, ContactMixture, normalise
 from train.physics.pads import INPUTS
+from train.physics.sensor_noise import Nuisances
 
 PLACE_SPREAD: Final = 0.08
 """Standard deviation of a place's log-strength by its magnet's seat and moment: .06 to .11 on drawn pads."""

@@ -1,8 +1,8 @@
 """Presses of any shape onto one pad, at one moment: pressure, traction, readings, and truth.
 
-A tap of `train.simulation` follows a press from first touch to its end; here each press is one moment, with a pad of
-its own, a tilt, a tangential load and a twist. Shapes are heights at any place (`train.families`), looked at on a grid
-of SAMPLES x SAMPLES places a cell, from which follow each cell's depth and how much of it is covered.
+A tap of `train.physics.simulated_sensor` follows a press from first touch to its end; here each press is one moment,
+with a pad of its own, a tilt, a tangential load and a twist. Shapes are heights at any place (`train.families`), looked
+at on a grid of SAMPLES x SAMPLES places a cell, from which follow each cell's depth and how much of it is covered.
 
 A soft object gives way as a thick layer of its own; a cloth or glove on the pad gives way and spreads what it carries.
 Friction is solved after the pressure, which it leaves as it is (Goodman 1962).
@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44
-from train.contact import ContactSolver
 from train.errors import TrainError
-from train.heights import heights_pattern
+from train.physics.contact import ContactSolver
 from train.physics.covers import BARE, Cover
+from train.physics.curved_patterns import heights_pattern
 from train.physics.friction import FrictionSolver
 from train.physics.pads import Pad
+from train.physics.resample import resample, resample_touching
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.physics.taxel_response import Skin
 from train.physics.touched import carrying, pressed_in, which_of
-from train.resample import resample, resample_touching
-from train.simulation import MAX_INDENTATION_MM
-from train.skin import Skin
 
 SAMPLES: Final = 4
 """Places along a cell's side at which a shape is looked at."""

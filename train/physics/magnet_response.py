@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import SensorGeometry
-from train.layer import Layer, inner_displacement
-from train.magnets import MOVEMENT, Magnet
+from train.physics.elastic_layer import Layer, inner_displacement
+from train.physics.magnets import MOVEMENT, Magnet
 from train.physics.tangential_layer import inner_tangential
 
 _PADS_WIDE: Final = 4

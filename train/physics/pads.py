@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.layer import Layer
-from train.magnets import Magnet
+from train.physics.elastic_layer import Layer
 from train.physics.free_sides import FreeSides
-from train.skin import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
+from train.physics.magnets import Magnet
+from train.physics.taxel_response import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
 
 _UNEVEN_MM: Final = 0.015
 """Largest RMS of a pad's own unevenness: a moulded silicone face."""

@@ -2,8 +2,8 @@
 
 Traction along a wave (t parallel to q) moves the pad along the wave and up and down, and traction across it moves it
 across alone: two independent problems. Traction is what acts on the pad, positive to the right and back; z is the
-height above the board, and displacements in z are positive downwards, as in train.layer. Lengths in [mm], stresses
-in [MPa].
+height above the board, and displacements in z are positive downwards, as in train.physics.elastic_layer. Lengths in
+[mm], stresses in [MPa].
 
 For a traction t exp(i q x) in the direction (c, s) = q / |q| the displacements are
     u_i = [across delta_ij + (along - across) q_i q_j / q^2] t_j,   u_down = i sunk (q_j / q) t_j.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from train.layer import Layer, inner_waves
+from train.physics.elastic_layer import Layer, inner_waves
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,8 @@ class TangentialResponse:
         along: in the plane, along the wave, under traction along it.
         across: in the plane, across the wave, under traction across it.
         sunk: i times this is the displacement downwards under traction along the wave. On top it is, by reciprocity,
-            -U of train.layer.inner_displacement. The contact leaves it out (train.physics.friction says why).
+            -U of train.physics.elastic_layer.inner_displacement. The contact leaves it out (train.physics.friction says
+            why).
     """
 
     along: NDArray[np.float64]
@@ -39,7 +40,7 @@ def surface_tangential_compliance(
     """Surface displacement per traction (along the wave, across it), in closed form, in [mm/MPa].
 
     along = (1-nu)/(G q) [(3-4nu) sinh 2a + 2a] / [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2], a = qh, which is
-    train.layer.surface_compliance but for one sign; across = tanh(a) / (G q). Both are h/G at q = 0.
+    train.physics.elastic_layer.surface_compliance but for one sign; across = tanh(a) / (G q). Both are h/G at q = 0.
 
     Args:
         layer: the pad.
@@ -59,7 +60,7 @@ def surface_spread(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.fl
     """Surface displacement along the wave per pressure: u = i times this, in closed form, in [mm/MPa].
 
     U = [(1-2nu)(3-4nu)(cosh 2a - 1) - 2a^2] / (2 G q [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2]), a = qh: the surface
-    value of train.layer.inner_displacement. Below 0 a pressure drives the surface apart.
+    value of train.physics.elastic_layer.inner_displacement. Below 0 a pressure drives the surface apart.
 
     Args:
         layer: the pad.

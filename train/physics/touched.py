@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.contact import REACH, ContactSolver
+from train.physics.contact import REACH, ContactSolver
 from train.physics.covers import BARE, Cover
 
 _WALL_MM: Final = 0.1

@@ -1,7 +1,7 @@
 """The whole pad with its free sides, by linear finite elements: what the correction is fitted to.
 
 A quarter of the pad, four times over: even and odd about either middle plane. The rigid face is larger than the pad.
-Needs the extra of train.fem.
+Needs the extra of train.physics.fem_reference.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
 from firmware_bridge.geometry import USPA44
-from train.fem import rest_tangent
-from train.layer import Layer
-from train.magnets import MOVEMENT, Magnet
+from train.physics.elastic_layer import Layer
+from train.physics.fem_reference import rest_tangent
+from train.physics.magnets import MOVEMENT, Magnet
 
 CELL_MM: Final = USPA44.pixel_pitch_mm(10)
 """Of the elements over the pad's face, and of the contact's cells."""
@@ -136,7 +136,7 @@ class WholePad:
         return loads_n
 
     def _movement(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
-        """MOVEMENT (4, 5, k) of the quarter's magnets; they lean as train.skin has it."""
+        """MOVEMENT (4, 5, k) of the quarter's magnets; they lean as train.physics.taxel_response has it."""
         plane = moved[self._level]
         down = -plane[:, :, 2]
         slope_x, slope_y = (np.gradient(down, self.nodes_mm, axis=axis) for axis in (1, 0))

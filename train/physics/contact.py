@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.layer import Layer, surface_compliance
+from train.physics.elastic_layer import Layer, surface_compliance
 from train.physics.free_sides import FreeSides, SideGive
 
 _MAX_STEPS: Final = 200

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import SensorGeometry
-from train.layer import Layer
-from train.magnets import Magnet, MagnetArray
+from train.physics.elastic_layer import Layer
 from train.physics.free_sides import FreeSides
 from train.physics.magnet_response import pressure_response, traction_response
+from train.physics.magnets import Magnet, MagnetArray
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
 IN_PLANE_SHARE: Final = 0.4
@@ -35,10 +35,10 @@ class Skin:
         size: cells along a side of the pressure grid.
         cell_mm: their size, in [mm].
         magnet: of every taxel.
-        field: how the magnets' field is worked out, a name in train.magnets.FIELDS.
+        field: how the magnets' field is worked out, a name in train.physics.magnets.FIELDS.
         in_plane_share: factor on the magnets' in-plane movement under pressure; tractions keep all of theirs.
-        rest: where each magnet sits and how it leans, see train.magnets.MagnetArray.
-        moments: of each magnet, see train.magnets.MagnetArray.
+        rest: where each magnet sits and how it leans, see train.physics.magnets.MagnetArray.
+        moments: of each magnet, see train.physics.magnets.MagnetArray.
         counts_per_newton: of the sum of z under an even load.
         sides: the pad's free sides; without, it goes on for ever.
 
@@ -93,7 +93,7 @@ class Skin:
     def movement(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.floating]:
-        """How loads on the pad move the magnets: (..., taxels, 5), train.magnets.MOVEMENT.
+        """How loads on the pad move the magnets: (..., taxels, 5), train.physics.magnets.MOVEMENT.
 
         Args:
             pressure_mpa: (..., size, size), in [MPa].

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.layer import Layer
+from train.physics.elastic_layer import Layer
 
 C2_SHARE: Final = 0.2
 """Of C1 + C2. At small strain their sum alone counts; silicones are fitted with shares of 0 to about 0.3."""

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.contact import REACH, ContactSolver
-from train.heights import heights_pattern
-from train.layer import Layer
-from train.skin import Skin
+from train.physics.contact import REACH, ContactSolver
+from train.physics.curved_patterns import heights_pattern
+from train.physics.elastic_layer import Layer
+from train.physics.taxel_response import Skin
+from train.physics.tpsf import tpsf_pattern
 from train.surfaces.catalogue import is_flat, surface_mesh
 from train.surfaces.depth_image import NOTHING_MM, Footprints, Pose, Relief, footprints
-from train.tpsf import tpsf_pattern
 
 MAX_INDENTATION_MM: Final = 0.5
 """A tap ends here if its set force is not reached: beyond a tenth of the layer it is no longer linear."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from firmware_bridge.geometry import AXES, SensorGeometry
-from train.hysteresis import NuisanceError, draw_lag, frame_weights
+from train.physics.hysteresis import NuisanceError, draw_lag, frame_weights
 from train.surfaces.depth_image import Pose
 
 Seed = int | Sequence[int] | np.random.SeedSequence

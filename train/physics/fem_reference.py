@@ -21,8 +21,8 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.errors import TrainError
-from train.layer import Layer
-from train.mooney_rivlin import C2_SHARE, MooneyRivlin
+from train.physics.elastic_layer import Layer
+from train.physics.mooney_rivlin import C2_SHARE, MooneyRivlin
 
 try:
     import felupe

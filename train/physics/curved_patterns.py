@@ -1,7 +1,7 @@
 """Patterns of curved surfaces: several planes at different heights, each with a PSF of its own.
 
 Where the surface touches, the pad follows it. Around the contact each plane spreads what it presses in, the deeper the
-wider. A flat surface is one plane, and its pattern is `train.tpsf.tpsf_pattern`'s.
+wider. A flat surface is one plane, and its pattern is `train.physics.tpsf.tpsf_pattern`'s.
 
 Source: Wu and Liu 2024, Section VII, as future work; nothing of it is worked out there.
 """
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.tpsf import BETA_MM, Kernel, spread
+from train.physics.tpsf import BETA_MM, Kernel, spread
 
 PLANES: Final = 4
 """Twice as many change the error by less than 0.1 % of the indentation."""
@@ -44,7 +44,7 @@ def heights_pattern(
         planes: the most planes, at least 1.
         beta_mm: reach of the kernel of a plane at the top, > 0, in [mm].
         edge_beta_mm: reach of the kernel of a plane that just touches, > 0, in [mm].
-        kernel: see `train.tpsf.spread`.
+        kernel: see `train.physics.tpsf.spread`.
 
     Raises:
         ValueError: shapes do not fit, there is no plane, a beta is not positive, or the kernel is unknown.
