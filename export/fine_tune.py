@@ -18,11 +18,11 @@ from export.int8 import quantised
 from export.parity import GraphRun
 from export.rounding import integer_convolutions, rounded
 from firmware_bridge.geometry import SensorGeometry
-from train.batches import network_input
 from train.calibration import calibrate
 from train.data.batch import Batch
+from train.data.batches import network_input
+from train.data.dataset import Sequences
 from train.data.presses import PressSet
-from train.dataset import Sequences
 from train.fit import given_taps
 from train.loop import Recipe, train
 from train.networks.blocks import PatternNet

@@ -23,10 +23,10 @@ from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, Q
 from edge.inference.contract import INPUT_NAME, PAD_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ExportError
-from train.batches import Draw
 from train.data.batch import Batch
+from train.data.batches import Draw
+from train.data.dataset import Sequences
 from train.data.presses import PressSet
-from train.dataset import Sequences
 from train.loop import Recipe
 from train.training import batches_of
 

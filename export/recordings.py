@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from train.experiments.hidden_taxel import recorded_sets
+from train.data.real_grips import recorded_sets
 
 _SCANS_APART = 20
 

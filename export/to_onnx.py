@@ -29,13 +29,13 @@ from export.parity import check_parity, extreme_windows, read_windows
 from export.rounding import folded
 from export.writing import Writer
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.batches import COUNTS_PER_UNIT
 from train.calibration import half_width_mm
 from train.confidence import confidence_sets
+from train.data.batches import COUNTS_PER_UNIT
+from train.data.dataset import Sequences
 from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.presses import PressSet, load_presses
-from train.dataset import Sequences
 from train.errors import CheckpointError, TrainError
 from train.freeze import SEED, held_out
 from train.networks.blocks import PatternNet

@@ -50,8 +50,8 @@ from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
-from train.authors_files import load_authors_taps
-from train.dataset import Sequences, load_sequences
+from train.data.authors_files import load_authors_taps
+from train.data.dataset import Sequences, load_sequences
 from train.errors import DatasetError
 from train.physics.simulated_sensor import FRAMES
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.lib import format as npy
 
-from train.authors_files import FRAMES_KEPT, kept_frames, load_authors_taps
+from train.data.authors_files import FRAMES_KEPT, kept_frames, load_authors_taps
+from train.data.plain_pickle import load_plain, plain_value
 from train.errors import DatasetError
-from train.plain_pickle import load_plain, plain_value
 
 RAN = []
 

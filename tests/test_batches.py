@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from train.batches import COUNTS_PER_UNIT, Draw, WindowBatches, network_input
-from train.dataset import windows
-from train.generation import Generation, solve_all
+from train.data.batches import COUNTS_PER_UNIT, Draw, WindowBatches, network_input
+from train.data.dataset import windows
+from train.data.generation_config import Generation, solve_all
 from train.physics.sensor_noise import Nuisances
 
 CLEAN = Draw(nuisances=Nuisances.none())

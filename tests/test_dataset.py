@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from train import dataset
-from train.dataset import Sequences, join, load_sequences, quarter_turns, windows
+from train.data import dataset
+from train.data.dataset import Sequences, join, load_sequences, quarter_turns, windows
 from train.errors import DatasetError, TrainError
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FRAMES

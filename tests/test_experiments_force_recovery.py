@@ -5,7 +5,7 @@ import pytest
 from experiment_samples import quick_bench
 
 from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
-from train.dataset import between_frames
+from train.data.dataset import between_frames
 from train.experiments import force_recovery
 from train.experiments.course import CLAIM_N, RANGE_N, Course, Scans, contact, errors, loop_percent, pressed
 from train.experiments.force_recovery import Gauge, training_presses

@@ -9,15 +9,15 @@ from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
 from firmware_bridge.recording.formats import CSV_HEADER
-from train.errors import DatasetError
-from train.experiments import real
-from train.experiments.hidden_taxel import (
+from train.data.real_grips import (
     from_other_trials,
     linear_from_others,
     neighbours_mean,
     recorded_grips,
     recorded_sets,
 )
+from train.errors import DatasetError
+from train.experiments import real
 from train.experiments.workbench import Workbench
 
 REST = np.array([15_900, 16_430, 38_600])[:, None, None] + 11 * np.arange(16).reshape(4, 4)

@@ -25,7 +25,7 @@ def test_what_is_begun_with_is_kept_too(name):
 
 
 LOADERS = {"numpy.load": ("allow_pickle", False), "torch.load": ("weights_only", True)}
-MAY_UNPICKLE = {"train/plain_pickle.py"}
+MAY_UNPICKLE = {"train/data/plain_pickle.py"}
 
 
 def test_nothing_is_loaded_that_could_run():

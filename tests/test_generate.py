@@ -13,10 +13,10 @@ import trimesh
 from threadpoolctl import threadpool_limits
 
 from train import generate as generating
-from train.dataset import join, load_sequences, windows
+from train.data.dataset import join, load_sequences, windows
+from train.data.generation_config import Generation, random_figures, solve_chunk
 from train.errors import DatasetError, MeshError, SurfaceError
 from train.generate import generate, main
-from train.generation import Generation, random_figures, solve_chunk
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import SimulatedSensor
 from train.surfaces.depth_image import Pose

@@ -28,8 +28,8 @@ from firmware_bridge.recording import formats as recording
 from firmware_bridge.recording.formats import CSV_HEADER, load_recording
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
-from train.authors_files import load_authors_taps
-from train.dataset import load_sequences
+from train.data.authors_files import load_authors_taps
+from train.data.dataset import load_sequences
 from train.errors import CheckpointError, DatasetError
 from train.training import load_network
 

@@ -8,9 +8,9 @@ from firmware_bridge.scans.pad import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
+from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
 from train.experiments import identify as experiment
-from train.experiments.hidden_taxel import recording_paths, recordings_folder
 from train.physics.contact_mixture import CHANNELS, ContactMixture, Z, load_mixture
 from train.physics.gain_estimate import CONSTANT_SPREAD, estimate
 from train.physics.pads import INPUTS

@@ -5,7 +5,7 @@ import pytest
 
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
-from train.experiments.hidden_taxel import recorded_grips, recording_paths, recordings_folder
+from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
 from train.experiments.real import Played, has_hole, play, share_touched, unevenness
 
 RECORDINGS = recordings_folder()

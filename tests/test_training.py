@@ -7,10 +7,10 @@ import torch
 
 from edge.evaluation.metrics import psnr_db
 from train.calibration import interval_coverage
+from train.data.generation_config import Generation, solve_all
 from train.errors import CheckpointError
 from train.fit import BUNDLED, given_taps, main
 from train.freeze import SEED, freeze, held_out
-from train.generation import Generation, solve_all
 from train.loop import Recipe
 from train.networks.compact import CompactNet
 from train.physics.pads import KNOWN

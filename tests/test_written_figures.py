@@ -19,7 +19,7 @@ from firmware_bridge.scans.pad import GAINS, PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
-from train import dataset
+from train.data import dataset
 
 FORMATS = (ROOT / "docs" / "formats.md").read_text()
 MEASURED = "reports/bench.md"

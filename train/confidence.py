@@ -10,7 +10,7 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.expected_error import doubt
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from train.dataset import Sequences
+from train.data.dataset import Sequences
 from train.freeze import SEED, freeze
 from train.physics.sensor_noise import Nuisances
 

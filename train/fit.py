@@ -17,10 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from train.data.dataset import Sequences
 from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.presses import PressSet, load_presses
-from train.dataset import Sequences
 from train.errors import TrainError
 from train.freeze import SEED, freeze, held_out
 from train.loop import Recipe, leave_group, rank_and_world

@@ -22,20 +22,20 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION, load_recording
-from train.batches import Draw, WindowBatches
+from train.data.batches import Draw, WindowBatches
+from train.data.contact_kinds import fit_kinds
+from train.data.dataset import Sequences, between_frames, quarter_turns
 from train.data.files import load_taps
+from train.data.generation_config import Generation, solve_all
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
-from train.dataset import Sequences, between_frames, quarter_turns
 from train.errors import TrainError
-from train.generation import Generation, solve_all
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
 from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import Pose
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position_mm
-from train.taxels import fit_kinds
 
 SEED: Final = 20240228
 """The paper's day of publication; never to be changed, or no two figures can be compared."""

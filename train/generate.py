@@ -10,7 +10,7 @@ A cluster that is already there takes the work through joblib's own backends. Wi
     import joblib
     from distributed import Client
     from train.generate import generate
-    from train.generation import Generation
+    from train.data.generation_config import Generation
 
     with Client("tcp://scheduler:8786"), joblib.parallel_config(backend="dask"):
         generate(Generation(count=100_000), Path("train.npz"))
@@ -32,12 +32,12 @@ from typing import Final, cast
 import joblib
 
 from edge.terminal.progress_bar import Progress
-from train.dataset import Sequences, join, load_sequences
+from train.data.dataset import Sequences, join, load_sequences
+from train.data.generation_config import FORCE_N, Generation, one_thread, random_figures, solve_chunk
+from train.data.workers import start_workers
 from train.errors import DatasetError, TrainError
-from train.generation import FORCE_N, Generation, one_thread, random_figures, solve_chunk
 from train.surfaces.catalogue import PLATES, SURFACES, surface_mesh
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
-from train.workers import start_workers
 
 _INTERRUPTED: Final = 130
 # Joblib's resource tracker, a process of its own, finds now and then that an interrupted pool's semaphore is gone

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.in_place import write_in_place
-from train.batches import Draw, WindowBatches, network_input
 from train.calibration import calibrate, interval_coverage
 from train.data.batch import Batch
+from train.data.batches import Draw, WindowBatches, network_input
+from train.data.dataset import Sequences
 from train.data.press_batches import PressBatches
 from train.data.presses import PressSet
-from train.dataset import Sequences
 from train.errors import CheckpointError, DatasetError
 from train.loop import Objective, Recipe, device_name, device_of_rank, rank_and_world, train, wait_for_all
 from train.networks.blocks import PatternNet

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from firmware_bridge.recording.npz_reader import read_npz
+from train.data.dataset import Sequences, join, load_sequences
 from train.data.presses import SCHEMA, PressSet, join_presses, load_presses
-from train.dataset import Sequences, join, load_sequences
 from train.errors import DatasetError
 
 _MOST_SCHEMA_BYTES = 4096

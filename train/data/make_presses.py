@@ -21,10 +21,10 @@ import joblib
 
 from edge.terminal.progress_bar import Progress
 from train.data.presses import PressSet, join_presses, load_presses
+from train.data.workers import start_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
-from train.workers import start_workers
 
 _INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.batches import network_input
 from train.data.batch import Batch
+from train.data.batches import network_input
 from train.data.presses import PressSet
 from train.errors import DatasetError
 from train.physics.pads import known_numbers

@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from train.data.generation_config import mesh_sha256, one_thread
 from train.data.presses import VERSION, PressSet
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
-from train.generation import mesh_sha256, one_thread
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
 from train.physics.sensor_noise import Nuisances

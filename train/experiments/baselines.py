@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import Method, bilinear, fit_gain, fit_linear_map
 from edge.evaluation.metrics import psnr_db
-from train.batches import COUNTS_PER_UNIT
+from train.data.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import FrozenPresses
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet

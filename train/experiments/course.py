@@ -10,7 +10,7 @@ from edge.evaluation import metrics
 from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import TapTracker
 from firmware_bridge.geometry import USPA44
-from train.dataset import Sequences, between_frames
+from train.data.dataset import Sequences, between_frames
 from train.freeze import SEED, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
 

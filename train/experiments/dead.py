@@ -31,7 +31,7 @@ from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
-from train.experiments.hidden_taxel import recorded_sets, recording_paths, recordings_folder
+from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
 from train.experiments.report import Report, Row, with_interval
 from train.experiments.workbench import Workbench, thinned
 from train.freeze import SEED

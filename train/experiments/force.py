@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.terminal.progress_bar import tracked
-from train.dataset import Sequences, windows
+from train.data.dataset import Sequences, windows
 from train.experiments.methods import Method, classical_methods, compact_methods
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.trainings import mixed

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import ON_COUNTS
 from edge.terminal.progress_bar import tracked
-from train.dataset import Sequences, windows
+from train.data.dataset import Sequences, windows
 from train.experiments.course import (
     CLAIM_N,
     HOLD_S,

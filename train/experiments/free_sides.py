@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from train.experiments.hidden_taxel import recorded_sets, recording_paths, recordings_folder
+from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.physics.contact import ContactSolver

@@ -16,8 +16,7 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import AXES, USPA44
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
-from train.data.world import World
-from train.experiments.hidden_taxel import (
+from train.data.real_grips import (
     ScanSet,
     linear_from_others,
     neighbours_mean,
@@ -25,6 +24,7 @@ from train.experiments.hidden_taxel import (
     recording_paths,
     recordings_folder,
 )
+from train.data.world import World
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.identify import distinct, mixture_beside

@@ -13,7 +13,7 @@ from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, met
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.geometry import USPA44
-from train.dataset import Sequences
+from train.data.dataset import Sequences
 from train.errors import TrainError
 from train.experiments.report import Row
 from train.experiments.trainings import compact, trained

@@ -11,11 +11,11 @@ from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.scans.pad import GAINS, Pad
+from train.data.generation_config import random_figures
 from train.experiments.report import Row
 from train.experiments.scores import pattern_cells
 from train.experiments.shipped import ALL, NOTHING, PAD, infer
 from train.experiments.workbench import Workbench, thinned
-from train.generation import random_figures
 from train.physics.pads import INPUTS, NOMINAL
 from train.physics.sensor_noise import Nuisances
 

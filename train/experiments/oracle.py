@@ -18,13 +18,13 @@ from edge.evaluation.evaluate import judge
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
+from train.data.generation_config import one_thread
 from train.data.presses import PressSet, join_presses
 from train.data.world import INDENTATION_MM
 from train.experiments.report import Row
 from train.experiments.scores import pattern_cells
 from train.experiments.shipped import ALL, NOTHING, SHORT, infer_presses
 from train.experiments.workbench import Workbench
-from train.generation import one_thread
 from train.physics.gripped import SAMPLES, GrippedPad, Presses
 from train.physics.pads import Pad, constants, draw_pad
 from train.physics.sensor_noise import Nuisances

@@ -17,6 +17,7 @@ from edge.evaluation.metrics import psnr_db
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
+from train.data.generation_config import one_thread
 from train.data.presses import PressSet
 from train.data.world import press_shapes
 from train.experiments.report import Report, Row, with_interval
@@ -24,7 +25,6 @@ from train.experiments.shipped import ALL, NOTHING, SHORT, infer_presses, load_s
 from train.experiments.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.freeze import SEED
-from train.generation import one_thread
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, NOMINAL, Pad
 from train.physics.sensor_noise import Nuisances

@@ -31,8 +31,7 @@ from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
-from train.data.world import World, solve_pad
-from train.experiments.hidden_taxel import (
+from train.data.real_grips import (
     Grip,
     from_other_trials,
     linear_from_others,
@@ -42,6 +41,7 @@ from train.experiments.hidden_taxel import (
     recordings_folder,
     z_of,
 )
+from train.data.world import World, solve_pad
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, drawn

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from edge.evaluation.test_set import FrozenSet
-from train.dataset import Sequences
+from train.data.dataset import Sequences
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, SEED, freeze
 from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances

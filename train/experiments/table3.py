@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
-from train.dataset import Sequences
+from train.data.dataset import Sequences
 from train.experiments.methods import classical_methods
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained

@@ -4,10 +4,10 @@ from dataclasses import replace
 from typing import Any, Final
 
 from edge.evaluation.test_set import FrozenSet
-from train.dataset import Sequences, join
+from train.data.dataset import Sequences, join
+from train.data.generation_config import Generation, random_figures
 from train.experiments.workbench import Workbench
 from train.fit import given_taps
-from train.generation import Generation, random_figures
 from train.loop import Recipe
 from train.networks.blocks import PatternNet
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS

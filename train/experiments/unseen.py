@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
-from train.dataset import Sequences, join
+from train.data.dataset import Sequences, join
+from train.data.generation_config import random_figures
 from train.experiments.intervals import intervals
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.trainings import FIGURES, SEEN
 from train.experiments.workbench import Workbench, cost_cells, error_cells
 from train.fit import given_taps
-from train.generation import random_figures
 from train.loop import Recipe
 from train.networks.blocks import PatternNet
 from train.surfaces.catalogue import SURFACES

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.geometry import USPA44
+from train.data.dataset import Sequences
 from train.data.frozen_presses import FrozenPresses, load_frozen_presses
+from train.data.generation_config import Generation
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
 from train.data.world import World
-from train.dataset import Sequences
 from train.errors import CheckpointError
 from train.experiments.report import Row, with_interval
 from train.freeze import SEED, freeze
 from train.generate import generate
-from train.generation import Generation
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.physics.sensor_noise import Nuisances

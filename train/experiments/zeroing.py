@@ -28,7 +28,7 @@ from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
-from train.experiments.hidden_taxel import REST_SCANS, recording_paths, recordings_folder
+from train.data.real_grips import REST_SCANS, recording_paths, recordings_folder
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
 from train.freeze import SEED

@@ -14,8 +14,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from firmware_bridge.geometry import AXES, USPA44
+from train.data.plain_pickle import BROKEN, load_plain, plain_value
 from train.errors import DatasetError
-from train.plain_pickle import BROKEN, load_plain, plain_value
 from train.surfaces.poses import position_and_angle
 
 FRAMES_KEPT: Final = 16

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from train.data.batch import Batch
-from train.dataset import Sequences, quarter_turns, windows
+from train.data.dataset import Sequences, quarter_turns, windows
 from train.physics.sensor_noise import Nuisances
 from train.surfaces.catalogue import is_random_figure
 
