@@ -27,7 +27,7 @@ from train.fit import given_taps
 from train.loop import Recipe, train
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
-from train.objectives import RelativeError
+from train.networks.losses import RelativeError
 from train.training import batches_of
 
 

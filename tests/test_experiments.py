@@ -108,7 +108,7 @@ def test_every_experiment_is_a_file_that_can_be_run():
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_its_own_steps_are_followed_by_a_bar(name):
     """For one of a single page never moves; that of its training is another."""
-    source = {"fig5": "train/psf_net.py"}.get(name, f"train/experiments/{name.replace('-', '_')}.py")
+    source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"train/experiments/{name.replace('-', '_')}.py")
     assert re.search(r"\bfor .* in .*tracked\(", (ROOT / source).read_text())
 
 

@@ -22,7 +22,7 @@ from train.data.batch import Batch
 from train.data.batches import network_input
 from train.networks.blocks import PatternNet
 from train.networks.registry import build
-from train.networks.seed import SeedNet
+from train.networks.wu_liu_2024 import SeedNet
 
 STEPS = 30
 

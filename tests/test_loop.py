@@ -13,7 +13,7 @@ from train import loop
 from train.data.batch import Batch
 from train.loop import DivergedError, NotResumableError, Recipe, learning_rate_share, train
 from train.networks.blocks import PatternNet
-from train.objectives import RelativeError
+from train.networks.losses import RelativeError
 
 RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)
 
@@ -181,7 +181,7 @@ sys.path.insert(0, "tests")
 from pathlib import Path
 from test_loop import batches, new_net, weights, RECIPE
 from train.loop import leave_group, rank_and_world, train
-from train.objectives import RelativeError
+from train.networks.losses import RelativeError
 net, used = new_net(), []
 def recorded(number):
     used.append(number)

@@ -6,7 +6,7 @@ import torch
 
 from train.data.batch import Batch
 from train.networks.compact import TRACTION_SCALE, CompactNet, HeteroscedasticError, heteroscedastic_loss
-from train.objectives import relative_rms_error
+from train.networks.losses import relative_rms_error
 
 
 @pytest.fixture(scope="module")

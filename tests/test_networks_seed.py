@@ -4,8 +4,8 @@ import torch
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.networks.registry import build, grown
-from train.networks.seed import SeedNet
 from train.networks.symmetric import write_out
+from train.networks.wu_liu_2024 import SeedNet
 
 PUBLISHED = {
     "srcnn": (4.36, 6.96),

@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from train.data.batch import Batch
+from train.networks.losses import relative_error
 from train.networks.srgan import Discriminator, SrganObjective, TactileSRGAN
-from train.objectives import relative_error
 
 
 class Plain(nn.Module):

@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
+from train.networks.tpsf_net import COUNTS_PER_UNIT, PsfNet, PsfParameters, degrade, fit_psf_net, pressed
 from train.physics.tpsf import tpsf
-from train.psf_net import COUNTS_PER_UNIT, PsfNet, PsfParameters, degrade, fit_psf_net, pressed
 
 FORMS = ["paper", "code"]
 PIXEL_MM = 0.47

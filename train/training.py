@@ -25,9 +25,9 @@ from train.errors import CheckpointError, DatasetError
 from train.loop import Objective, Recipe, device_name, device_of_rank, rank_and_world, train, wait_for_all
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
+from train.networks.losses import RelativeError
 from train.networks.registry import build, grown
 from train.networks.srgan import SrganObjective, TactileSRGAN
-from train.objectives import RelativeError
 from train.physics.gripped import SCALE
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())

@@ -8,8 +8,8 @@ import torch
 
 from export.stability.case import Case, refused, timed
 from firmware_bridge.geometry import USPA44
+from train.networks.tpsf_net import Form, degrade
 from train.physics.tpsf import Kernel, Plateau, spread, tpsf
-from train.psf_net import Form, degrade
 
 PART: Final = "tPSF"
 BETAS_MM: Final = (1e-6, 1e-3, 0.1, 1.0, 10.0, 1e3)

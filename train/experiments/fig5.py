@@ -18,9 +18,9 @@ from torch import Tensor
 from firmware_bridge.geometry import USPA44
 from train.experiments.report import Report, Row
 from train.experiments.workbench import Workbench
+from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.physics.resample import resample
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, SimulatedSensor, Taps
-from train.psf_net import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.surfaces.poses import random_targets
 
 SURFACES: Final = ("large circle", "small circle")

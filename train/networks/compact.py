@@ -15,8 +15,8 @@ from torch.nn import functional as F
 
 from train.data.batch import Batch
 from train.networks.blocks import PatternNet
+from train.networks.losses import relative_rms_error, truth_size
 from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
-from train.objectives import relative_rms_error, truth_size
 
 _QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added before a tap is divided by its own: noise and absent taps stay small."""

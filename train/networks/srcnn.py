@@ -8,7 +8,7 @@ single convolution before the blocks, which would be 4.29 M.
 from torch import Tensor, nn
 
 from train.networks.blocks import MultiScaleResidual, PatternNet, initialise, normed_conv, to_pattern, upsample
-from train.networks.seed import BLOCKS, CHANNELS
+from train.networks.wu_liu_2024 import BLOCKS, CHANNELS
 
 
 class TactileSRCNN(PatternNet):

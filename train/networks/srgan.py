@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, distributed, nn
 
 from train.data.batch import Batch
+from train.networks.losses import relative_error, truth_size
 from train.networks.srcnn import TactileSRCNN
-from train.objectives import relative_error, truth_size
 
 _CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
