@@ -18,17 +18,17 @@ from export.int8 import quantised
 from export.parity import GraphRun
 from export.rounding import integer_convolutions, rounded
 from firmware_bridge.geometry import SensorGeometry
-from train.calibration import calibrate
 from train.data.batch import Batch
 from train.data.batches import network_input
 from train.data.dataset import Sequences
 from train.data.presses import PressSet
 from train.fit import given_taps
-from train.loop import Recipe, train
+from train.learning.checkpoint import batches_of
+from train.learning.interval_calibration import calibrate
+from train.learning.training_loop import Recipe, train
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.losses import RelativeError
-from train.training import batches_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ from train.data.batch import Batch
 from train.data.batches import Draw
 from train.data.dataset import Sequences
 from train.data.presses import PressSet
-from train.loop import Recipe
-from train.training import batches_of
+from train.learning.checkpoint import batches_of
+from train.learning.training_loop import Recipe
 
 _PERCENTILE: Final = 99.999
 """Of a layer's values lie within its range; what lies beyond is cut. With the whole range the bundled models lose .03

@@ -29,8 +29,6 @@ from export.parity import check_parity, extreme_windows, read_windows
 from export.rounding import folded
 from export.writing import Writer
 from firmware_bridge.geometry import USPA44, SensorGeometry
-from train.calibration import half_width_mm
-from train.confidence import confidence_sets
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.dataset import Sequences
 from train.data.files import load_taps
@@ -38,10 +36,12 @@ from train.data.frozen_presses import freeze_presses
 from train.data.presses import PressSet, load_presses
 from train.errors import CheckpointError, TrainError
 from train.freeze import SEED, held_out
+from train.learning.checkpoint import load_network
+from train.learning.expected_error_table import confidence_sets
+from train.learning.interval_calibration import half_width_mm
 from train.networks.blocks import PatternNet
 from train.physics.pads import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG
-from train.training import load_network
 
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.15

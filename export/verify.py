@@ -34,8 +34,8 @@ from export.recordings import recorded_windows
 from export.reference import contract_in, in_float, network_of, origin_of
 from export.to_onnx import MOST_LOSS_DB
 from train.errors import TrainError
+from train.learning.checkpoint import load_network
 from train.networks.blocks import PatternNet
-from train.training import load_network
 
 _TORCH_BATCH: Final = 128
 INT8_READ: Final = 0.25

@@ -15,7 +15,7 @@ from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.progress_bar import tracked
 from export.reference import origin
 from firmware_bridge.in_place import write_in_place
-from train.confidence import fit_confidence
+from train.learning.expected_error_table import fit_confidence
 
 
 @dataclass(frozen=True, slots=True)

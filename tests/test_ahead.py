@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from train.ahead import drawn_ahead
+from train.learning.prefetch import drawn_ahead
 
 ENOUGH_S = 20
 

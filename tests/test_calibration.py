@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.calibration import calibrate, coverages, half_width_mm, interval_coverage
+from train.learning.interval_calibration import calibrate, coverages, half_width_mm, interval_coverage
 
 LEVELS = [0.1, 0.5, 0.8, 0.9, 0.99]
 

@@ -8,8 +8,8 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.expected_error import Expected, doubt, expect, is_confidence
 from edge.inference.onnx_session import ModelSession
-from train.confidence import BINS, doubts_and_errors, fit_confidence
 from train.data.frozen_presses import load_frozen_presses
+from train.learning.expected_error_table import BINS, doubts_and_errors, fit_confidence
 
 TABLE = {
     "1": {"doubt": [0.1, 0.3], "error": [0.2, 0.4], "gain": [0.0, 0.1]},

@@ -19,13 +19,13 @@ from export.graph import to_model
 from export.parity import GraphRun, check_parity, read_windows
 from export.to_onnx import export, main
 from firmware_bridge.geometry import USPA44
-from train.calibration import half_width_mm, interval_coverage
 from train.errors import CheckpointError
 from train.freeze import freeze
-from train.loop import Recipe
+from train.learning.checkpoint import Training, fit_network, infer, load_network
+from train.learning.interval_calibration import half_width_mm, interval_coverage
+from train.learning.training_loop import Recipe
 from train.networks.registry import build
 from train.physics.sensor_noise import Nuisances
-from train.training import Training, fit_network, infer, load_network
 
 COMPACT = Training(
     "sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options={"channels": 16, "blocks": 1}

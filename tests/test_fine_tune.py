@@ -17,9 +17,9 @@ from export.int8 import integer_nodes, quantised
 from export.parity import GraphRun
 from export.rounding import folded, integer_convolutions, rounded
 from firmware_bridge.geometry import USPA44
-from train.calibration import interval_coverage
 from train.data.batch import Batch
 from train.data.batches import network_input
+from train.learning.interval_calibration import interval_coverage
 from train.networks.blocks import PatternNet
 from train.networks.registry import build
 from train.networks.wu_liu_2024 import SeedNet

@@ -31,7 +31,7 @@ from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
 from train.data.authors_files import load_authors_taps
 from train.data.dataset import load_sequences
 from train.errors import CheckpointError, DatasetError
-from train.training import load_network
+from train.learning.checkpoint import load_network
 
 MEMORY_LIMIT_BYTES = 60_000_000
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from edge_samples import ROOT
 
-from train import loop
 from train.data.batch import Batch
-from train.loop import DivergedError, NotResumableError, Recipe, learning_rate_share, train
+from train.learning import training_loop as loop
+from train.learning.training_loop import DivergedError, NotResumableError, Recipe, learning_rate_share, train
 from train.networks.blocks import PatternNet
 from train.networks.losses import RelativeError
 
@@ -180,7 +180,7 @@ import os, sys, json, torch
 sys.path.insert(0, "tests")
 from pathlib import Path
 from test_loop import batches, new_net, weights, RECIPE
-from train.loop import leave_group, rank_and_world, train
+from train.learning.training_loop import leave_group, rank_and_world, train
 from train.networks.losses import RelativeError
 net, used = new_net(), []
 def recorded(number):

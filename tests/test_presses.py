@@ -10,8 +10,8 @@ from press_samples import make_press_set
 from train.data.files import load_taps
 from train.data.presses import join_presses, load_presses
 from train.errors import DatasetError
-from train.loop import Recipe
-from train.training import batches_of
+from train.learning.checkpoint import batches_of
+from train.learning.training_loop import Recipe
 
 
 def arrays_of(presses):

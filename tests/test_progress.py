@@ -24,7 +24,7 @@ from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
-from train import confidence
+from train.learning import expected_error_table as confidence
 
 CLEARED = re.compile(r"\r *\r$")
 RATE = re.compile(r"scan/s|s/scan")

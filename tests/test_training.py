@@ -6,16 +6,16 @@ import pytest
 import torch
 
 from edge.evaluation.metrics import psnr_db
-from train.calibration import interval_coverage
 from train.data.generation_config import Generation, solve_all
 from train.errors import CheckpointError
 from train.fit import BUNDLED, given_taps, main
 from train.freeze import SEED, freeze, held_out
-from train.loop import Recipe
+from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
+from train.learning.interval_calibration import interval_coverage
+from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
 from train.physics.pads import KNOWN
 from train.physics.sensor_noise import Nuisances
-from train.training import Training, best_contact_level, fit_network, infer, load_network
 
 SMALL = {"channels": 16, "blocks": 1}
 TRAINING = Training(

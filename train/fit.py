@@ -23,11 +23,11 @@ from train.data.frozen_presses import freeze_presses
 from train.data.presses import PressSet, load_presses
 from train.errors import TrainError
 from train.freeze import SEED, freeze, held_out
-from train.loop import Recipe, leave_group, rank_and_world
+from train.learning.checkpoint import Training, fit_network
+from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
 from train.physics.pads import KNOWN
 from train.physics.sensor_noise import Nuisances
-from train.training import Training, fit_network
 
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}
 """Share of windows with 1, 2, ... K taps given."""

@@ -10,7 +10,7 @@ from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import at_angle, by_angle, compact, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
-from train.training import infer
+from train.learning.checkpoint import infer
 
 ANGLES_DEG: Final = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 

@@ -17,11 +17,11 @@ from train.data.press_batches import read_presses
 from train.data.presses import PressSet
 from train.experiments.kriging import Kriging
 from train.freeze import SCALE, SEED
+from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import GrippedPad
 from train.physics.pads import NOMINAL
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
-from train.training import best_contact_level
 
 LENGTHS_MM: Final = (0.5, 1.0, 1.5, 2.0, 3.0, 4.5)
 NOISES: Final = (1e-4, 1e-3, 1e-2, 1e-1)

@@ -21,12 +21,12 @@ from train.experiments.report import Report, Row, with_interval
 from train.experiments.trainings import compact, mixed, trained
 from train.experiments.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N
+from train.learning.checkpoint import infer
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
 from train.surfaces.catalogue import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, as_poses, paper_targets, turned_back
-from train.training import infer
 
 TAPS: Final = (1, 2, 4, 7)
 ANGLES_DEG: Final = (ANGLE_STEP_DEG, 30.0)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from train.calibration import LEVEL
 from train.data.generation_config import random_figures
 from train.experiments.band_limit import WAVELENGTHS_MM, edge_distance_mm, gratings, kept_back, let_through
 from train.experiments.intervals import Intervals, intervals
@@ -24,6 +23,7 @@ from train.experiments.report import Cell, Report, Row, with_interval
 from train.experiments.trainings import compact, mixed, trained
 from train.experiments.unseen import TEST_FIGURES, TEST_SEED
 from train.experiments.workbench import Workbench, cost_cells
+from train.learning.interval_calibration import LEVEL
 from train.networks.blocks import PatternNet
 
 NAMES: Final = ("stsr", "mtsr2", "mtsr4")

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.test_set import FrozenSet
-from train.calibration import LEVEL, half_width_mm
 from train.errors import CheckpointError
 from train.experiments.report import Row, with_interval
+from train.learning.checkpoint import infer
+from train.learning.interval_calibration import LEVEL, half_width_mm
 from train.networks.blocks import PatternNet
-from train.training import infer
 
 
 @dataclass(frozen=True, slots=True)

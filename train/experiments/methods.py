@@ -19,8 +19,8 @@ from train.experiments.report import Row
 from train.experiments.trainings import compact, trained
 from train.experiments.workbench import Figures, Workbench, cost_cells
 from train.freeze import CLASSICAL_WINDOWS, SCALE, fit_classical
+from train.learning.checkpoint import infer
 from train.networks.blocks import PatternNet
-from train.training import infer
 
 _QUICK_WINDOWS: Final = 300
 _TIMED_RUNS: Final = 30

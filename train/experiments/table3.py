@@ -15,7 +15,7 @@ from train.experiments.methods import classical_methods
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
 from train.experiments.workbench import Figures, Workbench, cost_cells, error_cells, thinned
-from train.training import infer
+from train.learning.checkpoint import infer
 
 PAPER: Final[Mapping[str, tuple[float, float, float, float]]] = {
     "bilinear": (17.31, 0.5128, 18.10, 0.5663),

@@ -10,8 +10,8 @@ from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval
 from train.experiments.trainings import alike, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
+from train.learning.checkpoint import infer
 from train.surfaces.poses import MAX_TAPS
-from train.training import infer
 
 
 def run(bench: Workbench, folder: Path) -> Path:

@@ -12,8 +12,8 @@ from edge.terminal.progress_bar import tracked
 from train.experiments.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.trainings import OUT, OUT_EPOCHS, OUT_EPOCHS_MORE, SEQUENCES, epochs, mixed, trained
 from train.experiments.workbench import Workbench, cost_cells, error_cells
+from train.learning.checkpoint import Training, infer
 from train.networks.blocks import PatternNet
-from train.training import Training, infer
 
 Psnr = dict[str, NDArray[np.float64]]
 """Of every frame of the test set, (n,) in [dB], by network."""

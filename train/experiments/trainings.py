@@ -8,10 +8,10 @@ from train.data.dataset import Sequences, join
 from train.data.generation_config import Generation, random_figures
 from train.experiments.workbench import Workbench
 from train.fit import given_taps
-from train.loop import Recipe
+from train.learning.checkpoint import Training
+from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
-from train.training import Training
 
 SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
 """The 18 surfaces."""

@@ -26,10 +26,10 @@ from train.experiments.report import Report, Row, bootstrap_interval, with_inter
 from train.experiments.trainings import FIGURES, SEEN
 from train.experiments.workbench import Workbench, cost_cells, error_cells
 from train.fit import given_taps
-from train.loop import Recipe
+from train.learning.checkpoint import Training
+from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
 from train.surfaces.catalogue import SURFACES
-from train.training import Training
 
 HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")
 KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)

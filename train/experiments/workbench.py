@@ -26,12 +26,12 @@ from train.errors import CheckpointError
 from train.experiments.report import Row, with_interval
 from train.freeze import SEED, freeze
 from train.generate import generate
+from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.physics.sensor_noise import Nuisances
 from train.surfaces.catalogue import SURFACES
 from train.surfaces.poses import MAX_TAPS, Split
-from train.training import Training, fit_network, load_network
 
 _TIMED_RUNS: Final = 30
 _TIMED_MS: Final = 2000.0

@@ -64,7 +64,8 @@ class CompactNet(PatternNet):
             tap. At the same work quarter turns leave twice the free numbers, and training mirrors windows instead.
 
     Attributes:
-        deviation_scale: factor on the deviation, found after training by `train.calibration.calibrate`.
+        deviation_scale: factor on the deviation, found after training by
+            `train.learning.interval_calibration.calibrate`.
 
     Raises:
         ValueError: no taps, an odd scale, or channels that do not divide.

@@ -15,14 +15,22 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.in_place import write_in_place
-from train.calibration import calibrate, interval_coverage
 from train.data.batch import Batch
 from train.data.batches import Draw, WindowBatches, network_input
 from train.data.dataset import Sequences
 from train.data.press_batches import PressBatches
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
-from train.loop import Objective, Recipe, device_name, device_of_rank, rank_and_world, train, wait_for_all
+from train.learning.interval_calibration import calibrate, interval_coverage
+from train.learning.training_loop import (
+    Objective,
+    Recipe,
+    device_name,
+    device_of_rank,
+    rank_and_world,
+    train,
+    wait_for_all,
+)
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.losses import RelativeError

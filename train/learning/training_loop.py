@@ -28,9 +28,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
-from train.ahead import drawn_ahead
 from train.data.batch import Batch
 from train.errors import TrainError
+from train.learning.prefetch import drawn_ahead
 from train.networks.blocks import PatternNet
 
 Batches = Callable[[int], Batch]
