@@ -1,1 +1,1 @@
-"""The pad under tangential load: how the layer gives way to traction, and where a contact sticks or slips."""
+"""The simulated pad: contact and friction on its layer, movement of its magnets, readings of its taxels."""
