@@ -3,8 +3,8 @@ import pytest
 import trimesh
 from scipy.spatial import Delaunay
 
-from train.surfaces.catalogue import FIGURE_HEIGHT_MM, SURFACES, surface_mesh
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image, footprints
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, SURFACES, surface_mesh
 
 SIZE, CELL_MM = 42, 0.47
 CENTRE = Pose(0, 0, 0)

@@ -6,7 +6,7 @@ from experiment_samples import quick_bench
 
 from train.experiments import calibration
 from train.experiments.band_limit import edge_distance_mm, kept_back, let_through, save_grating
-from train.surfaces.catalogue import is_flat, surface_mesh
+from train.surfaces.named_surfaces import is_flat, surface_mesh
 
 PIXEL_MM = 0.47
 

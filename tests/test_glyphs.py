@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import shapely
 
-from train.surfaces.catalogue import FIGURE_HEIGHT_MM, PLATE_MM, is_flat, surface_mesh
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, PLATE_MM, is_flat, surface_mesh
 from train.surfaces.random_figures import AREA_MM2, GLYPH_REACH_MM, POLYGON_REACH_MM, glyph, polygon
 
 SEEDS = range(250)

@@ -14,8 +14,8 @@ from train.physics.gripped import MOST_FORCE_N, SAMPLES, SCALE, TRACTION_SCALE, 
 from train.physics.pads import NOMINAL
 from train.physics.resample import resample
 from train.physics.simulated_sensor import FINE_SCALE, SimulatedSensor
-from train.surfaces.catalogue import surface_mesh
 from train.surfaces.depth_image import Pose, Relief, footprints
+from train.surfaces.named_surfaces import surface_mesh
 
 PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import Pose
+from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import (
     HELD_OUT_RADIUS_MM,
     PAPER_ANGLES_DEG,

@@ -8,8 +8,8 @@ from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
 from train.physics.taxel_response import NEWTONS_PER_COUNT_Z
-from train.surfaces.catalogue import surface_mesh
 from train.surfaces.depth_image import Pose, Relief, footprints
+from train.surfaces.named_surfaces import surface_mesh
 
 SENSOR = SimulatedSensor()
 PIXEL_MM = USPA44.pixel_pitch_mm(FINE_SCALE)

@@ -6,7 +6,7 @@ import shapely
 import trimesh
 
 from train.errors import SurfaceError
-from train.surfaces.catalogue import FIGURE_HEIGHT_MM, PLATE_MM, PLATES, REACH_MM, SURFACES, is_flat, surface_mesh
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, PLATE_MM, PLATES, REACH_MM, SURFACES, is_flat, surface_mesh
 from train.surfaces.paper_figures import figure
 
 WITH_A_HOLE = {"O", "P", "hollow circle", "hollow square", "hollow triangle"}

@@ -5,8 +5,8 @@ import torch
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.tpsf import BETA_MM, spread, spread_by_fft, tpsf, tpsf_pattern
-from train.surfaces.catalogue import FIGURE_HEIGHT_MM, surface_mesh
 from train.surfaces.depth_image import Relief, depth_image
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, surface_mesh
 from train.surfaces.poses import random_targets
 
 PIXEL_MM = 0.47

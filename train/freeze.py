@@ -33,8 +33,8 @@ from train.errors import TrainError
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
-from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import Pose
+from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position_mm
 
 SEED: Final = 20240228

@@ -36,7 +36,7 @@ from train.data.dataset import Sequences, join, load_sequences
 from train.data.generation_config import FORCE_N, Generation, one_thread, random_figures, solve_chunk
 from train.data.workers import start_workers
 from train.errors import DatasetError, TrainError
-from train.surfaces.catalogue import PLATES, SURFACES, surface_mesh
+from train.surfaces.named_surfaces import PLATES, SURFACES, surface_mesh
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
 _INTERRUPTED: Final = 130

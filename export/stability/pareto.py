@@ -23,8 +23,8 @@ from train.physics.elastic_layer import Layer
 from train.physics.resample import resample
 from train.physics.taxel_response import Skin
 from train.physics.tpsf import tpsf_pattern
-from train.surfaces.catalogue import SURFACES, surface_mesh
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, footprints
+from train.surfaces.named_surfaces import SURFACES, surface_mesh
 
 SHIPPED: Final = "ships"
 _SHIPPED_GRID: Final = (42, 0.47)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from train.data.batch import Batch
 from train.data.dataset import Sequences, quarter_turns, windows
 from train.physics.sensor_noise import Nuisances
-from train.surfaces.catalogue import is_random_figure
+from train.surfaces.named_surfaces import is_random_figure
 
 COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)
 """Counts of x, y, z that make one unit of network input."""

@@ -22,8 +22,8 @@ from train.physics.sensor_noise import Nuisances, jitter_poses
 from train.physics.simulated_sensor import SimulatedSensor
 from train.physics.taxel_response import IN_PLANE_SHARE
 from train.physics.tpsf import BETA_MM
-from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import SAMPLES
+from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import (
     ANGLE_STEP_DEG,
     MAX_TAPS,

@@ -15,7 +15,7 @@ from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
 from train.physics.sensor_noise import Nuisances
-from train.surfaces.catalogue import surface_mesh
+from train.surfaces.named_surfaces import surface_mesh
 from train.surfaces.poses import MAX_TAPS
 
 INDENTATION_MM: Final = (0.03, 0.5)

@@ -25,7 +25,7 @@ from train.learning.checkpoint import infer
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
-from train.surfaces.catalogue import SURFACES
+from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, as_poses, paper_targets, turned_back
 
 TAPS: Final = (1, 2, 4, 7)

@@ -25,8 +25,8 @@ from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
-from train.surfaces.catalogue import PLATES
 from train.surfaces.depth_image import depth_image
+from train.surfaces.named_surfaces import PLATES
 
 STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)

@@ -29,8 +29,8 @@ from train.physics.gripped import SAMPLES, GrippedPad, Presses
 from train.physics.pads import Pad, constants, draw_pad
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
-from train.surfaces.catalogue import SURFACES, surface_mesh
 from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import as_poses, random_targets, turned_back
 
 PRESSES: Final = 30

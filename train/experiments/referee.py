@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import USPA44
 from train.physics.elastic_layer import Layer
 from train.physics.mooney_rivlin import C2_SHARE
-from train.surfaces.catalogue import surface_mesh
 from train.surfaces.depth_image import Pose, Relief, depth_image
+from train.surfaces.named_surfaces import surface_mesh
 
 SCALE: Final = 10
 """Patterns are compared at 40 x 40, as in the paper."""

@@ -29,7 +29,7 @@ from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
-from train.surfaces.catalogue import SURFACES
+from train.surfaces.named_surfaces import SURFACES
 
 HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")
 KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)

@@ -30,7 +30,7 @@ from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.physics.sensor_noise import Nuisances
-from train.surfaces.catalogue import SURFACES
+from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import MAX_TAPS, Split
 
 _TIMED_RUNS: Final = 30

@@ -13,8 +13,8 @@ from train.families import faces, rounds, solids
 from train.families.shape import Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.surfaces.catalogue import SURFACES, surface_mesh
 from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import ANGLE_STEP_DEG, as_poses, random_targets, turned_back
 
 SHAPES: Final[Mapping[str, Callable[[np.random.Generator], Height]]] = {

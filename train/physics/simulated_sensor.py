@@ -17,8 +17,8 @@ from train.physics.curved_patterns import heights_pattern
 from train.physics.elastic_layer import Layer
 from train.physics.taxel_response import Skin
 from train.physics.tpsf import tpsf_pattern
-from train.surfaces.catalogue import is_flat, surface_mesh
 from train.surfaces.depth_image import NOTHING_MM, Footprints, Pose, Relief, footprints
+from train.surfaces.named_surfaces import is_flat, surface_mesh
 
 MAX_INDENTATION_MM: Final = 0.5
 """A tap ends here if its set force is not reached: beyond a tenth of the layer it is no longer linear."""
@@ -29,7 +29,7 @@ FINE_SCALE: Final = 20
 _CELLS_PER_PITCH: Final = 10
 _SHARES: Final = (np.arange(FRAMES) + 1) / FRAMES
 _LEVEL_MM: Final = 1e-3
-"""Flat surfaces are flat to this, as train.surfaces.catalogue.is_flat has it."""
+"""Flat surfaces are flat to this, as train.surfaces.named_surfaces.is_flat has it."""
 _DROP: Final = 2.0
 """A surface this many indentations down falls away steeply: its edge is where its depth image says, not in between."""
 _FORCE_ERROR: Final = 0.003
@@ -91,7 +91,7 @@ class SimulatedSensor:
         """Tap surfaces at poses, one pose each, until the set force or MAX_INDENTATION_MM, whichever comes first.
 
         Args:
-            surfaces: (n,) names, see train.surfaces.catalogue.surface_mesh.
+            surfaces: (n,) names, see train.surfaces.named_surfaces.surface_mesh.
             poses: (n,).
             force_n: set forces, one for all or (n,), in [N].
             with_pattern: whether truth is wanted, for all or (n,); without it costs less.

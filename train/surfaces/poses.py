@@ -12,8 +12,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from train.surfaces.catalogue import SURFACES
 from train.surfaces.depth_image import Pose
+from train.surfaces.named_surfaces import SURFACES
 
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7
