@@ -2,7 +2,7 @@
 
 import pytest
 
-from train.experiments.workbench import Workbench
+from train.experiments.support.workbench import Workbench
 
 
 def quick_bench(tmp_path_factory: pytest.TempPathFactory) -> Workbench:

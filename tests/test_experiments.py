@@ -9,10 +9,10 @@ import pytest
 from edge_samples import ROOT
 
 from train.errors import CheckpointError
-from train.experiments import workbench
-from train.experiments.__main__ import EXPERIMENTS, main
-from train.experiments.trainings import OUT
-from train.experiments.workbench import Workbench
+from train.experiments.__main__ import EXPERIMENTS, main, module_of
+from train.experiments.support import workbench
+from train.experiments.support.trainings import OUT
+from train.experiments.support.workbench import Workbench
 
 COLUMNS = {
     "table3": {"method", "validation PSNR dB", "test PSNR dB", "test SSIM", "parameters", "MMAC", "run time ms"},
@@ -102,13 +102,13 @@ def test_every_experiment_is_a_file_that_can_be_run():
     import importlib
 
     for name in EXPERIMENTS:
-        assert callable(importlib.import_module(f"train.experiments.{name.replace('-', '_')}").run), name
+        assert callable(importlib.import_module(module_of(name)).run), name
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_its_own_steps_are_followed_by_a_bar(name):
     """For one of a single page never moves; that of its training is another."""
-    source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"train/experiments/{name.replace('-', '_')}.py")
+    source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"{module_of(name).replace('.', '/')}.py")
     assert re.search(r"\bfor .* in .*tracked\(", (ROOT / source).read_text())
 
 

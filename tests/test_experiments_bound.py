@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from train.experiments import bound
-from train.experiments.bound import Nudged, least_mse, nudged
+from train.experiments.paper import bound
+from train.experiments.paper.bound import Nudged, least_mse, nudged
 from train.physics.sensor_noise import Nuisances
 
 QUIET = replace(Nuisances.none(), noise_counts=1.0)

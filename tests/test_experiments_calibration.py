@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from train.experiments import calibration
-from train.experiments.band_limit import edge_distance_mm, kept_back, let_through, save_grating
+from train.experiments.sensor import calibration
+from train.experiments.support.band_limit import edge_distance_mm, kept_back, let_through, save_grating
 from train.surfaces.named_surfaces import is_flat, surface_mesh
 
 PIXEL_MM = 0.47

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from train.experiments import confidence
-from train.experiments.confidence import taps_until_stop
+from train.experiments.sensor import confidence
+from train.experiments.sensor.confidence import taps_until_stop
 
 
 @pytest.fixture(scope="module")

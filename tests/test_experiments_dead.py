@@ -8,8 +8,8 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import load_estimator
-from train.experiments import dead
-from train.experiments.workbench import thinned
+from train.experiments.sensor import dead
+from train.experiments.support.workbench import thinned
 
 
 @pytest.fixture(scope="module")

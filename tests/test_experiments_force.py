@@ -5,9 +5,9 @@ import pytest
 from experiment_samples import quick_bench
 
 from train.errors import TrainError
-from train.experiments import force
-from train.experiments.methods import Method, classical_methods
-from train.experiments.trainings import mixed
+from train.experiments.paper import force
+from train.experiments.support.methods import Method, classical_methods
+from train.experiments.support.trainings import mixed
 
 
 @pytest.fixture(scope="module")

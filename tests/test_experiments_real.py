@@ -17,8 +17,8 @@ from train.data.real_grips import (
     recorded_sets,
 )
 from train.errors import DatasetError
-from train.experiments import real
-from train.experiments.workbench import Workbench
+from train.experiments.sensor import real
+from train.experiments.support.workbench import Workbench
 
 REST = np.array([15_900, 16_430, 38_600])[:, None, None] + 11 * np.arange(16).reshape(4, 4)
 

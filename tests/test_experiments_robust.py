@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from train.experiments import robust
-from train.experiments.sweeps import (
+from train.experiments.sensor import robust
+from train.experiments.support.sweeps import (
     TAPS,
     all_sweeps,
     in_reverse,

@@ -13,7 +13,8 @@ from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad import Pad
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError
-from train.experiments import baselines, families, kriging, nominal, oracle, pads, scores, shipped, wrench
+from train.experiments.sensor import families, pads, wrench
+from train.experiments.support import baselines, kriging, nominal, oracle, scores, shipped
 from train.physics.gripped import GrippedPad
 from train.physics.pads import NOMINAL
 from train.physics.sensor_noise import Nuisances

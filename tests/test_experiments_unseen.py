@@ -6,9 +6,9 @@ from experiment_samples import quick_bench
 
 from edge.evaluation.test_set import FrozenSet
 from train.errors import CheckpointError
-from train.experiments import unseen
-from train.experiments.intervals import Intervals, intervals
-from train.experiments.trainings import FIGURES
+from train.experiments.paper import unseen
+from train.experiments.support.intervals import Intervals, intervals
+from train.experiments.support.trainings import FIGURES
 from train.networks.registry import build
 
 

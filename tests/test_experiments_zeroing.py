@@ -6,7 +6,7 @@ from experiment_samples import quick_bench
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
-from train.experiments import zeroing
+from train.experiments.sensor import zeroing
 
 
 @pytest.fixture(scope="module")

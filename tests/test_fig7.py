@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from train.experiments.fig7 import Method, _percent, _rms_mm
+from train.experiments.paper.fig7 import Method, _percent, _rms_mm
 
 TRUTH = np.zeros((1, 2, 4, 4), dtype=np.float32)
 TRUTH[0, :, 1:3, 1:3] = np.array([0.1, 0.2])[:, None, None]

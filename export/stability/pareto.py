@@ -17,7 +17,7 @@ from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
 from export.stability.case import timed
 from firmware_bridge.geometry import USPA44
-from train.experiments.report import Row
+from train.experiments.support.report import Row
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.resample import resample

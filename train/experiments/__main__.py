@@ -13,7 +13,7 @@ from edge.errors import EdgeError
 from edge.inference.bundled import BUNDLE_DIR
 from edge.terminal.progress_bar import tracked
 from train.errors import TrainError
-from train.experiments.workbench import Workbench
+from train.experiments.support.workbench import Workbench
 
 EXPERIMENTS: Final = {
     "families": "the shipped model on every family of shapes, beside baselines",
@@ -41,6 +41,16 @@ EXPERIMENTS: Final = {
     "curved": "several PSFs by height against FEM",
     "psf_speed": "patterns a second of the PSF by FFT and direct",
 }
+_PAPER: Final = {
+    *("table3", "table4", "fig5", "fig7", "angle", "taps", "bound", "trained_out"),
+    *("force", "force-recovery", "unseen", "curved", "psf_speed"),
+}
+"""Those in train.experiments.paper; the others are in train.experiments.sensor."""
+
+
+def module_of(name: str) -> str:
+    """Return the module of an experiment."""
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -73,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     bench = Workbench(options.data, options.checkpoints, options.quick, options.found, options.models, options.before)
     try:
         for name in tracked(options.names, "experiments", "page"):
-            page = importlib.import_module(f"train.experiments.{name.replace('-', '_')}").run(bench, options.reports)
+            page = importlib.import_module(module_of(name)).run(bench, options.reports)
             sys.stdout.write(f"{page}\n")
     except (TrainError, EdgeError) as error:
         sys.exit(f"experiments: {error}")

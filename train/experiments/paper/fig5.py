@@ -1,0 +1,154 @@
+"""Fig. 5: alpha and beta of the tactile PSF against the contact force, for two surfaces.
+
+One network learns from simulated taps of both surfaces, and is asked about taps at other poses. Scans are clean:
+the question is what the method sees, not how it bears noise. Beside the network's beta stands the one that explains
+each scan best, found by search: on a pad whose pressure is in proportion to the indentation it has no reason to grow.
+
+Source: Wu and Liu 2024, Fig. 5.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from firmware_bridge.geometry import USPA44
+from train.experiments.support.report import Report, Row
+from train.experiments.support.workbench import Workbench
+from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
+from train.physics.resample import resample
+from train.physics.simulated_sensor import FINE_SCALE, FRAMES, SimulatedSensor, Taps
+from train.surfaces.poses import random_targets
+
+SURFACES: Final = ("large circle", "small circle")
+"""The first has four times the area of the second."""
+_FORCE_N: Final = 5.0
+_SCALE: Final = 10
+_BINS: Final = 8
+
+
+def run(bench: Workbench, folder: Path) -> Path:
+    """Tap, train, and write table and plot.
+
+    Args:
+        bench: if quick, fewer taps and epochs.
+        folder: where the report goes.
+    """
+    poses, epochs = (6, 5) if bench.quick else (60, 120)
+    names, taps = _tap(poses)
+    held_out = np.arange(len(names)) // len(SURFACES) % 3 == 0
+    counts, depth = _scans(taps, ~held_out)
+    net = PsfNet()
+    losses = fit_psf_net(net, counts, depth, taps.indentation_mm[~held_out].ravel(), epochs=epochs)
+
+    counts, depth = _scans(taps, held_out)
+    with torch.no_grad():
+        scans, images = torch.from_numpy(counts), torch.from_numpy(depth)
+        read = net(scans)
+        reach = net.pattern(read, images).amax(dim=(1, 2)).numpy()
+        z = pressed(scans)
+        unexplained = float(((net.degraded(read, images) - z) ** 2).sum() / ((z - z.mean(dim=0)) ** 2).sum())
+    seen = {
+        "alpha": read.alpha.numpy() * float(net.k_scale),
+        "beta": read.beta_mm.numpy(),
+        "beta by search": _search(net, read, scans, images).numpy(),
+    }
+    surface = np.repeat(np.array(names)[held_out], taps.counts.shape[1])
+    force_n, indentation_mm = taps.force_n[held_out].ravel(), taps.indentation_mm[held_out].ravel()
+
+    report = Report("fig5", folder, quick=bench.quick)
+    report.table(
+        [row for name in SURFACES for row in _by_force(name, force_n, seen, surface == name)],
+        "Alpha and beta by contact force at poses that the network has not seen: means, and the median of the betas "
+        "found by search.",
+    )
+    report.table(
+        [
+            _line(name, key, force_n[surface == name], value[surface == name])
+            for name in SURFACES
+            for key, value in seen.items()
+        ],
+        "Straight lines through them.",
+        "lines",
+    )
+    error = np.sqrt(np.mean((reach - indentation_mm) ** 2)) / indentation_mm.max()
+    report.say(
+        f"Training loss {losses[0]:.4g} at first, {losses[-1]:.4g} at last. On the held-out taps "
+        f"{100 * unexplained:.1f} % of the variance of z is not explained, and the plateaus miss the indentations by "
+        f"{100 * error:.1f} % of the largest. gamma = {float(read.gamma):.3g} mm^0.5, "
+        f"k_scale = {float(net.k_scale):.3g} mm per (100 counts/mm^2)."
+    )
+    with report.figure() as figure:
+        left, right = figure.subplots(1, 2)
+        for name in SURFACES:
+            where = surface == name
+            left.plot(force_n[where], seen["alpha"][where], ".", label=name)
+            (dots,) = right.plot(force_n[where], seen["beta"][where], ".")
+            right.plot(force_n[where], seen["beta by search"][where], "x", color=dots.get_color(), ms=3, alpha=0.3)
+        left.set(xlabel="force [N]", ylabel="alpha [mm/mm²]")
+        right.set(xlabel="force [N]", ylabel="beta [mm]; x by search")
+        left.legend()
+    return report.write()
+
+
+def _tap(poses: int) -> tuple[list[str], Taps]:
+    """Tap both surfaces at random poses, in turns."""
+    targets = random_targets(np.random.default_rng(5), poses * len(SURFACES), SURFACES)
+    return targets.surfaces, SimulatedSensor().tap(targets.surfaces, targets.poses, _FORCE_N)
+
+
+def _scans(taps: Taps, which: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """All frames of some taps: counts (n, 3, rows, cols), and depth images (n, H, W) in 0..1."""
+    counts = taps.counts[which]
+    depth = resample(taps.touching[which, 0], FINE_SCALE, _SCALE)
+    return counts.reshape(-1, *USPA44.scan_shape), np.repeat(depth, counts.shape[1], axis=0)
+
+
+def _search(net: PsfNet, read: PsfParameters, scans: Tensor, images: Tensor) -> Tensor:
+    """The beta (n,) in [mm] with which the best alpha leaves least of each scan unexplained, at the network's gamma."""
+    betas_mm = torch.linspace(0.1, 2.0, 39)
+    wanted = pressed(scans).flatten(1)
+    left: list[Tensor] = []
+    for beta_mm in betas_mm:
+        unit = PsfParameters(torch.ones(1), beta_mm[None], read.gamma)
+        one = net.degraded(unit, images[::FRAMES]).flatten(1).repeat_interleave(FRAMES, dim=0)
+        alpha = (one * wanted).sum(dim=1) / (one * one).sum(dim=1)
+        left.append(((alpha[:, None] * one - wanted) ** 2).sum(dim=1))
+    return betas_mm[torch.stack(left).argmin(dim=0)]
+
+
+def _by_force(
+    name: str, force_n: NDArray[np.floating], seen: dict[str, NDArray[np.floating]], where: NDArray[np.bool_]
+) -> list[Row]:
+    edges = np.linspace(0, force_n[where].max(), _BINS + 1)
+    bin_of = np.clip(np.digitize(force_n, edges) - 1, 0, _BINS - 1)
+    rows: list[Row] = []
+    for number in range(_BINS):
+        inside = where & (bin_of == number)
+        if inside.any():
+            rows.append(
+                {
+                    "surface": name,
+                    "force N": float(force_n[inside].mean()),
+                    "alpha mm/mm2": float(seen["alpha"][inside].mean()),
+                    "beta mm": float(seen["beta"][inside].mean()),
+                    "beta by search mm": float(np.median(seen["beta by search"][inside])),
+                    "scans": int(inside.sum()),
+                }
+            )
+    return rows
+
+
+def _line(name: str, key: str, force_n: NDArray[np.floating], value: NDArray[np.floating]) -> Row:
+    slope, start = np.polyfit(force_n, value, 1)
+    left = np.mean((value - start - slope * force_n) ** 2)
+    return {
+        "surface": name,
+        "parameter": key,
+        "at no force": float(start),
+        "slope per N": float(slope),
+        "share explained": float(1 - left / max(np.var(value), 1e-30)),
+    }

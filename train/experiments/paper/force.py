@@ -1,0 +1,179 @@
+"""Error by contact force, small forces included.
+
+PSNR is taken against one full scale for all, so it is highest where there is least to be wrong about. What the force
+does to shapes shows in the error relative to the truth's own RMS, and in SSIM with the truth's own peak as full scale.
+
+Source: Wu and Liu 2024, Fig. 14.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import log
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from edge.evaluation.metrics import contact_iou, psnr_db, ssim
+from edge.terminal.progress_bar import tracked
+from train.data.dataset import Sequences, windows
+from train.experiments.support.methods import Method, classical_methods, compact_methods
+from train.experiments.support.report import Report, Row, bootstrap_interval, with_interval
+from train.experiments.support.trainings import mixed
+from train.experiments.support.workbench import Figures, Workbench
+from train.freeze import SCALE, SEED, TEST_FORCE_N
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
+
+EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
+_DRAWS: Final = 4
+_QUICK_DRAWS: Final = 1
+_NETWORKS: Final = ("stsr", "mtsr2", "mtsr4")
+_CLASSICAL: Final = ("linear map", "bilinear")
+_REACHED: Final = 0.99
+"""Share of the force asked for that a press must come to: some are as deep as they may before."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bin:
+    """Scans of one range of forces.
+
+    Attributes:
+        force_n: its bounds, in [N].
+        windows: (n, K, 3, rows, cols) in zeroed counts: the newest tap on its way, the earlier ones at their ends.
+        patterns: (n, H, W), truth, in [mm].
+        touching: (n, H, W) bool.
+        tap: (n,) index of the sequence.
+    """
+
+    force_n: tuple[float, float]
+    windows: NDArray[np.float32]
+    patterns: NDArray[np.float32]
+    touching: NDArray[np.bool_]
+    tap: NDArray[np.int64]
+
+
+def run(bench: Workbench, folder: Path) -> Path:
+    """Write the report `force`; the full run takes a few minutes once the networks are there."""
+    data = mixed(bench)
+    methods = [*compact_methods(bench, data, _NETWORKS), *classical_methods(bench, data, _CLASSICAL)]
+    sequences = bench.held_out("test").at_scale(SCALE)
+    draws = _QUICK_DRAWS if bench.quick else _DRAWS
+    bins = [
+        scans
+        for number, bounds in enumerate(pairwise(EDGES_N))
+        if (scans := scans_between(sequences, bounds, draws, [SEED, number]))
+    ]
+    figures = {
+        method.name: [errors(method, scans) for scans in bins] for method in tracked(methods, "forces", "method")
+    }
+    report = Report("force", folder, quick=bench.quick)
+    report.say(
+        f"The {len(sequences)} test taps, newest scan somewhere on its press, earlier taps at their ends of "
+        f"{TEST_FORCE_N:g} N; forces drawn evenly over their logarithm, {draws} a tap and "
+        "range, every scan read by a sensor of its own with all nuisances at their defaults. Small shapes are as deep "
+        f"as they may ({MAX_INDENTATION_MM} mm) before high forces, so those have fewer taps. PSNR and SSIM are "
+        "against the declared full scale: the less there is, the better they look. Relative error is RMS error over "
+        "the truth's RMS, and SSIM at own scale has each truth's peak as full scale: they tell how true the shape is."
+    )
+    report.say(_finding(bins, figures))
+    report.table(
+        [_row(method, scans, figures[method.name][i]) for i, scans in enumerate(bins) for method in methods],
+        "Errors by contact force, with 95 % intervals by tap.",
+    )
+    with report.figure(size=(13, 4.5)) as figure:
+        _draw(figure, bins, figures)
+    return report.write()
+
+
+def scans_between(sequences: Sequences, force_n: tuple[float, float], draws: int, seed: Sequence[int]) -> Bin | None:
+    """Scans of every sequence whose press comes that far, at forces drawn evenly over their logarithm; None if none."""
+    rng = np.random.default_rng([*seed, 0])
+    index = np.repeat(np.arange(len(sequences)), draws)
+    wanted_n = np.exp(rng.uniform(log(force_n[0]), log(force_n[1]), len(index)))
+    end_n = sequences.force_n[index, 0, -1]
+    reached = end_n >= _REACHED * wanted_n
+    if not reached.any():
+        return None
+    index, wanted_n = index[reached], wanted_n[reached]
+    taps_n = np.full((len(index), sequences.taps), TEST_FORCE_N)
+    taps_n[:, 0] = wanted_n
+    readings, patterns = windows(sequences, index, 1.0, taps_n, Nuisances(), [*seed, 1])
+    share = sequences.share_at_force(index, taps_n)[:, 0]
+    return Bin(force_n, readings, patterns, sequences.touching_at(index, share), index)
+
+
+def errors(method: Method, scans: Bin) -> Figures:
+    """Every figure of every scan, (n,) each."""
+    patterns, truth = method.patterns(scans.windows), scans.patterns
+    peak = truth.max(axis=(1, 2), keepdims=True)
+    return {
+        "psnr_db": psnr_db(patterns, truth, MAX_INDENTATION_MM),
+        "ssim": ssim(patterns, truth, MAX_INDENTATION_MM),
+        "ssim_own": ssim(patterns / peak, truth / peak, 1.0),
+        "relative_percent": relative_error_percent(patterns, truth),
+        "contact_iou": contact_iou(patterns, scans.touching, method.contact_level),
+    }
+
+
+def relative_error_percent(patterns: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.float64]:
+    """RMS error in [% of the truth's RMS], (n,) of maps (n, H, W)."""
+    error = np.mean((np.asarray(patterns, dtype=np.float64) - truth) ** 2, axis=(-2, -1))
+    return 100 * np.sqrt(error / np.mean(truth.astype(np.float64) ** 2, axis=(-2, -1)))
+
+
+def _row(method: Method, scans: Bin, found: Figures) -> Row:
+    return {
+        "force N": _label(scans),
+        "scans": len(scans.tap),
+        "taps": len(np.unique(scans.tap)),
+        "model": method.name,
+        "PSNR dB": with_interval(found["psnr_db"], scans.tap),
+        "SSIM": round(float(found["ssim"].mean()), 4),
+        "SSIM at own scale": with_interval(found["ssim_own"], scans.tap, 3),
+        "relative error %": with_interval(found["relative_percent"], scans.tap, 1),
+        "IoU": round(float(found["contact_iou"].mean()), 4),
+        **method.cost,
+    }
+
+
+def _finding(bins: list[Bin], figures: dict[str, list[Figures]]) -> str:
+    """Whether more taps help more where the force is small, as the paper has it."""
+    lines: list[str] = []
+    for place, scans in ((0, bins[0]), (-1, bins[-1])):
+        relative = {name: found[place]["relative_percent"] for name, found in figures.items()}
+        means = ", ".join(f"{name} {values.mean():.0f} %" for name, values in relative.items())
+        saved = relative["stsr"] - relative["mtsr4"]
+        low, high = bootstrap_interval(saved, scans.tap)
+        lines.append(
+            f"At {_label(scans)} N relative errors are {means}; of stsr's {relative['stsr'].mean():.1f} points mtsr4 "
+            f"saves {saved.mean():.1f} ({low:.1f}..{high:.1f})."
+        )
+    gains = [float(np.mean(figures["stsr"][i]["ssim_own"] - figures["mtsr4"][i]["ssim_own"])) for i in range(len(bins))]
+    best = int(np.argmin(gains))
+    lines.append(f"SSIM at own scale gains most from four taps at {_label(bins[best])} N: {-gains[best]:+.3f}.")
+    return " ".join(lines)
+
+
+def _draw(figure: Figure, bins: list[Bin], figures: dict[str, list[Figures]]) -> None:
+    """Three figures against the force; bands are the intervals."""
+    middle_n = [float(np.sqrt(scans.force_n[0] * scans.force_n[1])) for scans in bins]
+    shown = {"psnr_db": "PSNR [dB]", "ssim_own": "SSIM at own scale", "relative_percent": "relative error [%]"}
+    axes = figure.subplots(1, len(shown))
+    for place, (key, label) in zip(axes, shown.items(), strict=True):
+        for name, found in figures.items():
+            band = [bootstrap_interval(values[key], scans.tap) for values, scans in zip(found, bins, strict=True)]
+            (line,) = place.plot(middle_n, [float(values[key].mean()) for values in found], "o-", label=name)
+            place.fill_between(middle_n, *np.transpose(band), color=line.get_color(), alpha=0.15, linewidth=0)
+        place.set(xscale="log", xlabel="force [N]", ylabel=label)
+        place.set_xticks(EDGES_N, [f"{edge:g}" for edge in EDGES_N])
+        place.minorticks_off()
+    axes[0].legend()
+
+
+def _label(scans: Bin) -> str:
+    low_n, high_n = scans.force_n
+    return f"{low_n:g}..{high_n:g}"

@@ -1,0 +1,208 @@
+"""Force through press, hold and release, from what patterns sum up to.
+
+A pattern's deformation summed over its area becomes newtons by one factor, fitted on training presses. There are no
+offsets, and no curve is shifted: what drifts, lags or stays behind shows.
+
+Source: Wu and Liu 2024, Fig. 15.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from edge.evaluation.classical_methods import fit_gain
+from edge.perception.tap_tracker import ON_COUNTS
+from edge.terminal.progress_bar import tracked
+from train.data.dataset import Sequences, windows
+from train.experiments.support.course import (
+    CLAIM_N,
+    HOLD_S,
+    PRESS_S,
+    RANGE_N,
+    RELEASE_S,
+    REST_S,
+    Course,
+    Scans,
+    contact,
+    errors,
+    pressed,
+    volume_mm3,
+)
+from train.experiments.support.methods import Method, compact_methods
+from train.experiments.support.report import Report, Row, with_interval
+from train.experiments.support.trainings import mixed
+from train.experiments.support.workbench import Workbench
+from train.freeze import SCALE, SEED, TEST_FORCE_N
+from train.physics.sensor_noise import Nuisances
+from train.surfaces.poses import TARGET_ANGLES_DEG
+
+_RATE_HZ: Final = 100.0
+_QUICK_RATE_HZ: Final = 20.0
+_TAPS: Final = 4
+_ANGLE: Final = 1
+"""Of the four test angles the one each surface is pressed at: 30 degrees, the paper's target."""
+_FIT_PRESSES: Final = 600
+_FIT_FORCE_N: Final = (0.3, 8.0)
+_ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
+CONDITIONS: Final = {"just zeroed": _ZEROED, "drifted": Nuisances()}
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """Something that goes with the force, and its factor to newtons."""
+
+    name: str
+    measure: Callable[[Scans], NDArray[np.floating]]
+    cost: Row
+    newtons_per_unit: float = 1.0
+
+    def fitted(self, scans: Scans) -> "Gauge":
+        """The same with the factor that brings it nearest to these scans' forces, least squares."""
+        return Gauge(self.name, self.measure, self.cost, fit_gain(self.measure(scans), scans.force_n))
+
+    def force_n(self, scans: Scans) -> NDArray[np.floating]:
+        """Forces (n,) in [N]."""
+        return self.newtons_per_unit * self.measure(scans)
+
+
+def run(bench: Workbench, folder: Path) -> Path:
+    """Write the report `force-recovery`; the full run takes some minutes once the networks are there."""
+    data = mixed(bench)
+    course = Course(_QUICK_RATE_HZ if bench.quick else _RATE_HZ)
+    known = training_presses(data, 50 if bench.quick else _FIT_PRESSES)
+    gauges = [gauge.fitted(known) for gauge in _gauges(compact_methods(bench, data, ("stsr", "mtsr4")))]
+    sequences = bench.held_out("test").newest(_TAPS)
+    sequences = sequences.pick(np.arange(_ANGLE, len(sequences), len(TARGET_ANGLES_DEG)))
+
+    rows: list[Row] = []
+    by_surface: list[Row] = []
+    shown: dict[str, tuple[Scans, list[NDArray[np.floating]]]] = {}
+    for condition, nuisances in CONDITIONS.items():
+        figures: dict[str, list[dict[str, float]]] = {gauge.name: [] for gauge in gauges}
+        for number in tracked(range(len(sequences)), condition, "press"):
+            scans = pressed(sequences, number, course, nuisances)
+            gate = contact(scans, course)
+            found_n = [gauge.force_n(scans) for gauge in gauges]
+            for gauge, force_n in zip(gauges, found_n, strict=True):
+                figures[gauge.name].append(errors(scans.force_n, force_n, gate, course))
+            shown.setdefault(condition, (scans, found_n))
+        rows += [_row(condition, gauge, figures[gauge.name]) for gauge in gauges]
+        for i, name in enumerate(sequences.surfaces):
+            cells: Row = {f"{gauge.name} error %": round(figures[gauge.name][i]["error"], 2) for gauge in gauges}
+            by_surface.append({"nuisances": condition, "surface": str(name)} | cells)
+
+    report = Report("force-recovery", folder, quick=bench.quick)
+    report.say(
+        f"{len(sequences)} surfaces at the held-out position, each pressed to {TEST_FORCE_N:g} N (or as deep as may "
+        f"be) in {PRESS_S:g} s, held {HOLD_S:g} s, released in {RELEASE_S:g} s, then {REST_S:g} s at no load, at "
+        f"{course.rate_hz:g} scans a second. Every press is read by a sensor of its own, whose lag goes through the "
+        "whole course. `just zeroed` is without drift and earth field, `drifted` with all nuisances. One factor per "
+        f"method from {len(known.force_n)} training presses on sensors just zeroed, no offset anywhere. `true pattern` "
+        "is what a pattern without error would give."
+    )
+    report.say(
+        f"Errors in % of {RANGE_N:g} N: RMS over the whole course, with the common factor and with the one that suits "
+        "the press best, which leaves out what shape and gain do to the factor. Loop: largest difference between press "
+        "and release at equal true force. At no load: mean |force|, and false contacts: scans whose pattern sums up to "
+        f"more than {CLAIM_N:g} N, and scans that pass the runtime's contact threshold ({ON_COUNTS:g} counts of summed "
+        "z), behind which no pattern is made; that threshold misses loaded scans, too."
+    )
+    for condition in CONDITIONS:
+        report.say(_finding(condition, [row for row in rows if row["nuisances"] == condition]))
+    report.table(rows, "Force recovery, means over presses with 95 % intervals.")
+    report.table(by_surface, "RMS errors over the course in % of the range, by surface.", "surfaces")
+    with report.figure(size=(13, 8)) as figure:
+        _draw(figure, course, shown, gauges, str(sequences.surfaces[0]))
+    return report.write()
+
+
+def training_presses(data: Sequences, presses: int) -> Scans:
+    """Ends of training presses at forces drawn evenly, read by sensors just zeroed."""
+    data = data.newest(_TAPS)
+    rng = np.random.default_rng([SEED, 1])
+    index = rng.integers(len(data), size=presses)
+    wanted_n = np.full((presses, _TAPS), TEST_FORCE_N)
+    wanted_n[:, 0] = rng.uniform(*_FIT_FORCE_N, presses)
+    readings, patterns = windows(data, index, 1.0, wanted_n, _ZEROED, [SEED, 2])
+    share = data.share_at_force(index, wanted_n)[:, :1]
+    return Scans(readings, data.force_at(index, share)[:, 0], volume_mm3(patterns, data.scale))
+
+
+def _gauges(networks: list[Method]) -> list[Gauge]:
+    def summed(network: Method) -> Callable[[Scans], NDArray[np.floating]]:
+        return lambda scans: volume_mm3(network.patterns(scans.windows), SCALE)
+
+    return [
+        Gauge("summed z", lambda scans: scans.windows[:, 0, 2].sum(axis=(1, 2)), {"parameters": 1, "MMAC": 0.0}),
+        *(Gauge(network.name, summed(network), network.cost) for network in networks),
+        Gauge("true pattern", lambda scans: scans.volume_mm3, {}),
+    ]
+
+
+def _row(condition: str, gauge: Gauge, presses: list[dict[str, float]]) -> Row:
+    taps = np.arange(len(presses))
+    means = {key: np.array([press[key] for press in presses]) for key in presses[0]}
+    columns = {
+        "error": "error %",
+        "own": "with its own factor %",
+        "gated": "behind the threshold %",
+        "loop": "loop %",
+        "rest": "at no load %",
+        "false": "false contact, % of scans",
+        "false gated": "past the threshold, % of scans",
+        "missed": "loaded but missed, % of scans",
+    }
+    return {
+        "nuisances": condition,
+        "model": gauge.name,
+        **{label: with_interval(means[key], taps) for key, label in columns.items()},
+        "N per unit": gauge.newtons_per_unit,
+        **gauge.cost,
+    }
+
+
+def _finding(condition: str, rows: list[Row]) -> str:
+    """The best way to the force, and what keeps it from being better."""
+
+    def mean(row: Row, column: str) -> float:
+        return float(str(row[column]).split()[0])
+
+    real = [row for row in rows if row["model"] != "true pattern"]
+    best = min(real, key=lambda row: mean(row, "error %"))
+    listed = "; ".join(
+        f"{row['model']} {row['error %']} %, loop {mean(row, 'loop %'):.1f} %, false contact "
+        f"{mean(row, 'false contact, % of scans'):.0f} % of scans"
+        for row in real
+    )
+    true = next(row for row in rows if row["model"] == "true pattern")
+    return (
+        f"**{condition}**: least error has {best['model']}. {listed}. A true pattern would be off by "
+        f"{mean(true, 'error %'):.1f} %, as one factor does not suit all shapes. Past the runtime's threshold come "
+        f"{mean(best, 'past the threshold, % of scans'):.0f} % of the scans at no load; it misses "
+        f"{mean(best, 'loaded but missed, % of scans'):.0f} % of those under load."
+    )
+
+
+def _draw(
+    figure: Figure,
+    course: Course,
+    shown: dict[str, tuple[Scans, list[NDArray[np.floating]]]],
+    gauges: list[Gauge],
+    surface: str,
+) -> None:
+    """Force against time, and found against true force, of one press under each condition."""
+    axes = figure.subplots(len(shown), 2, width_ratios=(3, 2), squeeze=False)
+    for (over_time, loop), (condition, (scans, found_n)) in zip(axes, shown.items(), strict=True):
+        over_time.plot(course.time_s, scans.force_n, "k", label="true")
+        loop.plot([0, scans.force_n.max()], [0, scans.force_n.max()], "k", linewidth=0.8)
+        for gauge, force_n in zip(gauges, found_n, strict=True):
+            over_time.plot(course.time_s, force_n, linewidth=1, label=gauge.name)
+            loop.plot(scans.force_n, force_n, linewidth=1)
+        over_time.set(title=f"{surface}, {condition}", xlabel="time [s]", ylabel="force [N]")
+        loop.set(xlabel="true force [N]", ylabel="force found [N]")
+    axes[0, 0].legend()

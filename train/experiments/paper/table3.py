@@ -1,0 +1,129 @@
+"""Table III: all methods at x10, on the same targets, next to the paper's figures."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.evaluation.evaluate import judge
+from edge.evaluation.test_set import FrozenSet
+from edge.terminal.progress_bar import tracked
+from train.data.dataset import Sequences
+from train.experiments.support.methods import classical_methods
+from train.experiments.support.report import Report, Row, bootstrap_interval
+from train.experiments.support.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
+from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells, thinned
+from train.learning.checkpoint import infer
+
+PAPER: Final[Mapping[str, tuple[float, float, float, float]]] = {
+    "bilinear": (17.31, 0.5128, 18.10, 0.5663),
+    "srcnn": (22.17, 0.8277, 21.10, 0.7690),
+    "srgan": (22.05, 0.8241, 21.54, 0.7876),
+    "stsr": (22.71, 0.8373, 22.45, 0.8170),
+    "mtsr2": (24.21, 0.9066, 23.80, 0.8954),
+    "mtsr3": (23.72, 0.8955, 23.73, 0.8907),
+    "mtsr4": (23.91, 0.8980, 23.69, 0.8934),
+    "mtsr5": (23.82, 0.8974, 24.06, 0.9068),
+    "mtsr6": (24.02, 0.9016, 23.93, 0.8984),
+    "mtsr7": (23.72, 0.8981, 24.04, 0.9004),
+}
+"""PSNR in [dB] and SSIM on the validation and the test set (Wu and Liu 2024, Table III): other data, other units."""
+
+SEED_NETWORKS: Final = ("srcnn", "srgan", "stsr", "mtsr2", "mtsr3", "mtsr4", "mtsr5", "mtsr6", "mtsr7")
+CLASSICAL: Final = ("bilinear", "bicubic", "linear map")
+COMPACT_NETWORKS: Final = ("stsr", "mtsr2", "mtsr4", "mtsr7")
+ONE_IN: Final = 8
+"""Of a tap's frames one in so many is judged."""
+
+Sets = Mapping[str, FrozenSet]
+
+
+def run(bench: Workbench, folder: Path) -> Path:
+    """Train what lacks, judge everything, write table and plot."""
+    data = mixed(bench)
+    sets = {split: bench.frozen(split) for split in ("validation", "test")}
+    judged = {split: thinned(frozen, ONE_IN) for split, frozen in sets.items()}
+    rows, test_psnr = [], {}
+    for row, figures in (*_classical(bench, data, judged), *_networks(bench, data, sets["validation"], judged)):
+        rows.append(row)
+        test_psnr[str(row["method"])] = figures["psnr_db"]
+    report = Report("table3", folder, quick=bench.quick)
+    test = judged["test"]
+    report.say(
+        f"{len(test)} frames of {len(test.surface)} taps a set, one in {ONE_IN} evenly over each tap, the same for "
+        f"every row; full scale {test.full_scale_mm} mm. PSNR with its 95 % interval by tap. Run time: one window, "
+        f"torch, one thread. All are trained on the same {len(data)} sequences; training min and steps count those of "
+        "the network that a row's started from. The paper's figures are of real data in other units."
+    )
+    report.say(_epochs(rows, len(data)))
+    report.say(_verdicts(test_psnr, test.tap))
+    report.table(rows, "Validation and test set, x10.")
+    with report.figure(size=(8, 5)) as figure:
+        axes = figure.subplots()
+        for row in rows:
+            name, time_ms = str(row["method"]), float(str(row["run time ms"]))
+            axes.plot(time_ms, test_psnr[name].mean(), "s" if name.startswith("compact") else "o")
+            axes.annotate(
+                name, (time_ms, test_psnr[name].mean()), textcoords="offset points", xytext=(5, 3), fontsize=8
+            )
+        axes.set(xscale="log", xlabel="run time of a window, torch, one thread [ms]", ylabel="test PSNR [dB]")
+        axes.grid(alpha=0.3)
+    return report.write()
+
+
+def _classical(bench: Workbench, data: Sequences, judged: Sets) -> Iterator[tuple[Row, Figures]]:
+    for method in classical_methods(bench, data, CLASSICAL):
+        patterns = {split: method.patterns(frozen.windows(1)) for split, frozen in judged.items()}
+        yield _row(method.name, method.name, judged, patterns, method.contact_level, method.cost)
+
+
+def _networks(bench: Workbench, data: Sequences, validation: FrozenSet, judged: Sets) -> Iterator[tuple[Row, Figures]]:
+    seed_networks = [seed_size(name) for name in (SEED_NETWORKS[1:4] if bench.quick else SEED_NETWORKS)]
+    networks = [(training.network, training, judged["validation"]) for training in (*seed_networks, SEED_STSR_LONGER)]
+    networks += [(name, compact(name), validation) for name in COMPACT_NETWORKS]
+    for network, training, calibrated_on in tracked(networks, "networks", "network"):
+        net, told = trained(bench, training, data, calibrated_on)
+        name = training.name.removeprefix("seed-") if training.network == network else f"compact {network}"
+        patterns = {split: infer(net, frozen.windows(net.taps))[0] for split, frozen in judged.items()}
+        costs = cost_cells(net) | bench.training_cells(told)
+        yield _row(name.removeprefix("quick-"), network, judged, patterns, told["contact_level"], costs)
+
+
+def _row(
+    name: str, paper: str, sets: Sets, patterns: Mapping[str, NDArray], contact_level: float, costs: Row
+) -> tuple[Row, Figures]:
+    figures = {split: judge(patterns[split], frozen, contact_level) for split, frozen in sets.items()}
+    row: Row = {"method": name}
+    for split, frozen in sets.items():
+        row |= error_cells(figures[split], frozen, split)
+    theirs = PAPER.get(paper)
+    row |= {"paper's test PSNR dB": theirs and theirs[2], "paper's test SSIM": theirs and theirs[3]}
+    return row | costs, figures["test"]
+
+
+def _epochs(rows: list[Row], sequences: int) -> str:
+    """How often each network of the paper has seen the data."""
+    of = {
+        str(row["method"]): float(str(row["steps"])) * SEED_BATCH / sequences
+        for row in rows
+        if "steps" in row and not str(row["method"]).startswith("compact")
+    }
+    told = ", ".join(f"{name} {epochs:.2f}" for name, epochs in of.items())
+    return f"The networks of the paper were trained by the clock, on this machine for so many epochs: {told}."
+
+
+def _verdicts(test_psnr: Mapping[str, NDArray[np.float64]], taps: NDArray[np.integer]) -> str:
+    asked = (
+        ("compact stsr", "stsr"),
+        ("compact mtsr4", "mtsr4"),
+        ("mtsr2", "stsr longer"),
+        ("compact mtsr2", "compact stsr"),
+    )
+    lines = []
+    for better, worse in (pair for pair in asked if set(pair) <= set(test_psnr)):
+        gain = test_psnr[better] - test_psnr[worse]
+        low, high = bootstrap_interval(gain, taps)
+        lines.append(f"- {better} over {worse}: {gain.mean():+.2f} dB ({low:+.2f}..{high:+.2f})")
+    return "On the test set, tap by tap:\n\n" + "\n".join(lines)

@@ -1,0 +1,142 @@
+"""What it costs where the pad is not the nominal one: each constant off by so much, the same presses on every pad.
+
+Shapes, poses, depths, drags, friction and every draw of the nuisances are the same on all pads, so that losses are
+press by press. Half of the shapes are the paper's, half random figures.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, cast
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.evaluation.metrics import psnr_db
+from edge.inference.onnx_session import ModelSession
+from edge.terminal.progress_bar import tracked
+from train.data.frozen_presses import FrozenPresses, freeze_presses
+from train.data.generation_config import one_thread
+from train.data.presses import PressSet
+from train.data.world import press_shapes
+from train.experiments.support.report import Report, Row, with_interval
+from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
+from train.experiments.support.workbench import Workbench
+from train.families.catalogue import Tapped, draw_shape
+from train.freeze import SEED
+from train.physics.gripped import GrippedPad
+from train.physics.pads import INPUTS, NOMINAL, Pad
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
+
+SHAPES: Final = 40
+SHAPES_SEED: Final = 4711
+CONSTANTS: Final = (*INPUTS, "pitch_mm", "free_sides")
+PERCENT: Final = (5, 10, 20)
+_MOST_POISSON: Final = 0.499
+_BEFORE: Final = "model before"
+
+
+@dataclass(frozen=True, slots=True)
+class OffPad:
+    """A pad with one constant off: by percent of its nominal value, or of the whole free sides."""
+
+    constant: str
+    percent: int
+
+    @property
+    def pad(self) -> Pad:
+        """The pad."""
+        nominal = getattr(NOMINAL, self.constant)
+        off = self.percent / 100 * (nominal if self.constant != "free_sides" else 1.0)
+        return replace(NOMINAL, **{self.constant: nominal + off})
+
+    @property
+    def can_be(self) -> bool:
+        """Whether there are such pads: rubber does not swell when pressed, and sides do not push back."""
+        pad = self.pad
+        return pad.poisson <= _MOST_POISSON and pad.free_sides >= 0
+
+
+NONE_OFF: Final = OffPad("thickness_mm", 0)
+
+
+def run(bench: Workbench, folder: Path) -> Path:
+    """Press, judge, and write the report `pads`."""
+    percent, count = (PERCENT[-1:], 4) if bench.quick else (PERCENT, SHAPES)
+    names = CONSTANTS[:2] if bench.quick else CONSTANTS
+    off = [OffPad(name, sign * part) for name in names for part in percent for sign in (-1, 1)]
+    off = [NONE_OFF, *(one for one in off if one.can_be)]
+    shapes = draw_shapes(count)
+    pool = joblib.Parallel(n_jobs=-1, return_as="generator")
+    jobs = cast(Iterator[PressSet], pool(joblib.delayed(pressed)(one.pad, shapes) for one in off))
+    read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
+    model = load_shipped(bench.models)
+    scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
+    if bench.before is not None:
+        scores[_BEFORE] = _psnr_db(ModelSession(bench.before), read, NOTHING)
+
+    report = Report("pads", folder, quick=bench.quick)
+    plain = {name: with_interval(psnr[NONE_OFF], np.arange(count)) for name, psnr in scores.items()}
+    report.say(
+        f"`{model.name}` of contract version {model.contract.version} (training "
+        f"{model.contract.training_sha256[:12]}), one tap; {count} shapes, {count // 2} of the paper's surfaces and as "
+        "many random figures, each pressed alike on every pad and read with the same draws of all nuisances. All else "
+        "about a pad is nominal. PSNR on the nominal pad: "
+        + "; ".join(f"{name} {value} dB" for name, value in plain.items())
+        + ". Known: the constants that the model takes, and the gains; pitch and free sides it cannot be given. Free "
+        "sides are off by percent of what finite elements give, upwards alone; a Poisson's ratio 20 % up cannot be."
+    )
+    rows = loss_rows(scores, list(read))
+    report.table(rows, "PSNR lost against the nominal pad in dB, press by press, with 95 % intervals.")
+    with report.figure(size=(10, 5)) as figure:
+        grid = figure.subplots(2, (len(names) + 1) // 2, squeeze=False, sharey=True).ravel()
+        for axes, constant in zip(grid, names, strict=False):
+            mine = sorted((one for one in read if one.constant == constant or one == NONE_OFF), key=lambda o: o.percent)
+            for name, psnr in scores.items():
+                lost = [float((psnr[NONE_OFF] - psnr[one]).mean()) for one in mine]
+                axes.plot([one.percent for one in mine], lost, "o-", label=name, markersize=3)
+            axes.set(title=constant, xlabel="off [%]")
+        grid[0].set_ylabel("PSNR lost [dB]")
+        grid[0].legend(fontsize=7)
+    return report.write()
+
+
+def loss_rows(scores: dict[str, dict[OffPad, NDArray[np.float64]]], off: list[OffPad]) -> list[Row]:
+    """What each method loses on each pad, down and up side by side."""
+    rows: list[Row] = []
+    for constant, percent in dict.fromkeys((one.constant, abs(one.percent)) for one in off if one.percent):
+        row: Row = {"constant": constant, "off by %": percent}
+        for name, psnr in scores.items():
+            for word, sign in (("down", -1), ("up", 1)):
+                lost = psnr.get(OffPad(constant, sign * percent))
+                row[f"{name}, {word}"] = (
+                    None if lost is None else with_interval(psnr[NONE_OFF] - lost, np.arange(len(lost)))
+                )
+        rows.append(row)
+    return rows
+
+
+def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
+    """Shapes under the pad with their families; cells are the same on every pad, and so heights are."""
+    rng = np.random.default_rng(SHAPES_SEED)
+    gripped, error = GrippedPad(NOMINAL), Nuisances()
+    families = [("paper", "glyph", "paper", "polygon")[number % 4] for number in range(count)]
+    sd = (error.pose_error_mm, error.pose_error_deg)
+    return [(family, draw_shape(rng, family, gripped, 1, sd)) for family in families]
+
+
+@one_thread()
+def pressed(pad: Pad, shapes: list[tuple[str, Tapped]]) -> PressSet:
+    """All shapes pressed onto one pad."""
+    rng = np.random.default_rng(SHAPES_SEED + 1)
+    families = np.array([family for family, _ in shapes])
+    return press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes], 0)
+
+
+def _psnr_db(model: ModelSession, read: dict[OffPad, FrozenPresses], known: str) -> dict[OffPad, NDArray[np.float64]]:
+    return {
+        off: psnr_db(infer_presses(model, frozen, known).patterns, frozen.patterns(), MAX_INDENTATION_MM)
+        for off, frozen in read.items()
+    }

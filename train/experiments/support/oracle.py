@@ -1,0 +1,168 @@
+"""What is possible where the surface is known: the simulator itself fitted to each reading, beside the shipped model.
+
+Ten numbers decide a press of a known flat surface on a known pad: x, y, turn, two slopes, depth, slide along x and y,
+twist, and friction. They have the Gaussian prior that they are drawn from; what sensors add to the physics counts as a
+Gaussian error. Gauss-Newton goes to the most probable press, whose pattern is the oracle's.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, cast
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.evaluation.evaluate import judge
+from edge.inference.onnx_session import ModelSession
+from edge.terminal.progress_bar import tracked
+from train.data.frozen_presses import FrozenPresses, freeze_presses
+from train.data.generation_config import one_thread
+from train.data.presses import PressSet, join_presses
+from train.data.world import INDENTATION_MM
+from train.experiments.support.report import Row
+from train.experiments.support.scores import pattern_cells
+from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses
+from train.experiments.support.workbench import Workbench
+from train.physics.gripped import SAMPLES, GrippedPad, Presses
+from train.physics.pads import Pad, constants, draw_pad
+from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.named_surfaces import SURFACES, surface_mesh
+from train.surfaces.poses import as_poses, random_targets, turned_back
+
+PRESSES: Final = 30
+SEED: Final = 31
+STEPS: Final = 4
+_NUDGE: Final = np.array([0.15, 0.15, 1.5, 0.002, 0.002, 0.01, 0.03, 0.03, 0.01, 0.2])
+_PRIOR_SD: Final = np.array([0.5, 0.5, 5.0, 0.005, 0.005, 0.12, 0.15, 0.15, 0.02, 0.4])
+"""Of x and y in [mm], turn in [deg], slopes, depth and slides in [mm], twist in [rad], and friction's logarithm."""
+_PRIOR_MEAN: Final = np.array([0, 0, 0, 0, 0, 0.27, 0, 0, 0, np.log(0.6)])
+"""The place's is where the surface is thought to lie."""
+_DEPTH: Final = 5
+_LEAST_DEPTH_MM: Final = 0.1
+_SHORTER: Final = (1.0, 0.5, 0.2)
+_MODEL_SHARE: Final = 0.03
+"""Of a reading, what hysteresis and cross-talk leave that no press explains."""
+
+
+_Fitted = tuple[FrozenPresses, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class KnownSurface:
+    """One flat surface under one pad.
+
+    Attributes:
+        surface: its name.
+        pad: the sensor's.
+    """
+
+    surface: str
+    pad: Pad
+
+    @cached_property
+    def _relief(self) -> Relief:
+        return Relief(self.surface, surface_mesh(self.surface))
+
+    @cached_property
+    def _gripped(self) -> GrippedPad:
+        return GrippedPad(self.pad)
+
+    def press(self, numbers: NDArray[np.floating]) -> Presses:
+        """Presses of the ten numbers of each, (n, 10)."""
+        pad = self._gripped
+        places = as_poses(numbers[:, :3])
+        heights = -footprints([self._relief] * len(numbers), places, pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm
+        slopes = numbers[:, 3:5, None, None]
+        heights = (heights + slopes[:, 0] * pad.places_mm[0] + slopes[:, 1] * pad.places_mm[1]).astype(np.float32)
+        depth_mm = np.clip(numbers[:, _DEPTH], *INDENTATION_MM)
+        return pad.press(heights, depth_mm, numbers[:, 6:8], numbers[:, 8], np.exp(numbers[:, 9]))
+
+    def fit(self, reading: NDArray[np.floating], start: NDArray[np.floating], steps: int) -> NDArray[np.float32]:
+        """Pattern (H, W) in [mm] of the most probable press.
+
+        Args:
+            reading: (48,) zeroed counts, over the gains.
+            start: the prior's mean, from which it is searched.
+            steps: of Gauss-Newton.
+        """
+        here = start.copy()
+        for _ in range(steps):
+            around = self.press(here + np.concatenate([np.zeros((1, len(here))), np.diag(_NUDGE)]))
+            counts = around.counts.reshape(len(_NUDGE) + 1, -1).astype(np.float64)
+            slope = (counts[1:] - counts[0]).T / _NUDGE
+            weight = np.linalg.inv(error_covariance(counts[0], Nuisances()))
+            information = slope.T @ weight @ slope + np.diag(_PRIOR_SD**-2.0)
+            step = np.linalg.solve(
+                information, slope.T @ weight @ (reading - counts[0]) - (here - start) / _PRIOR_SD**2
+            )
+            tried = here + np.concatenate([[0.0], _SHORTER])[:, None] * step
+            found = self.press(tried).counts.reshape(len(tried), -1)
+            off = reading - found
+            cost = np.einsum("ni,ij,nj->n", off, weight, off) + np.square((tried - start) / _PRIOR_SD).sum(axis=1)
+            here = tried[int(cost.argmin())]
+        return self.press(here[None]).patterns[0]
+
+
+def error_covariance(reading: NDArray[np.floating], nuisances: Nuisances) -> NDArray[np.float64]:
+    """Covariance (48, 48) of what sensors of known gains add to a reading (48,)."""
+    taxels = len(reading) // 3
+    drift = nuisances.thermal_drift_counts * np.repeat((1 / 8, 1 / 8, 1.0), taxels)
+    axis = np.repeat(np.arange(3), taxels)
+    common = axis[:, None] == axis
+    own = nuisances.noise_counts**2 + 1 / 6 + (drift / 4) ** 2 + (_MODEL_SHARE * reading) ** 2
+    earth = 2 / 3 * nuisances.earth_field_counts**2
+    return np.diag(own) + common * (np.outer(drift, drift) + earth) + np.outer(reading, reading) * _MODEL_SHARE**2
+
+
+def oracle_rows(bench: Workbench, model: ModelSession) -> list[Row]:
+    """Errors of the oracle and of the model on the same presses."""
+    count, steps = (2, 1) if bench.quick else (PRESSES, STEPS)
+    pool = joblib.Parallel(n_jobs=-1, return_as="generator")
+    jobs = cast(Iterator[_Fitted], pool(joblib.delayed(_press_and_fit)(number, steps) for number in range(count)))
+    done = [one for _, one in zip(tracked(range(count), "oracle", "press"), jobs, strict=True)]
+    frozen = FrozenPresses(
+        join_presses([one.presses for one, _ in done]), np.concatenate([one.gains for one, _ in done])
+    )
+    patterns = {"oracle": np.stack([pattern for _, pattern in done])}
+    for known in (NOTHING, ALL):
+        patterns[SHORT[known]] = infer_presses(model, frozen, known).patterns
+    truth, groups = frozen.patterns(), np.arange(count)
+    rows: list[Row] = []
+    for name, found in patterns.items():
+        errors = judge(found, frozen.as_frozen_set(), model.contract.contact_level)
+        rows.append({"method": name, "presses": count} | pattern_cells(errors, truth, MAX_INDENTATION_MM, groups))
+    return rows
+
+
+@one_thread()
+def _press_and_fit(number: int, steps: int) -> _Fitted:
+    """One press as its sensor reads it, and the oracle's pattern (H, W) of it."""
+    rng = np.random.default_rng([SEED, number])
+    known = KnownSurface(str(rng.choice(SURFACES)), draw_pad(rng))
+    place = turned_back(random_targets(rng, 1, [known.surface]), 1)[0, 0]
+    thought = _PRIOR_MEAN + np.concatenate([place, np.zeros(7)])
+    numbers = thought + rng.normal(0, _PRIOR_SD).clip(-2 * _PRIOR_SD, 2 * _PRIOR_SD)
+    numbers[_DEPTH] = np.clip(numbers[_DEPTH], _LEAST_DEPTH_MM, INDENTATION_MM[1])
+    frozen = freeze_presses(_as_set(known.press(numbers[None]), known.pad, number), SEED + number)
+    reading = frozen.windows(1, gains_known=True).reshape(-1)
+    return frozen, known.fit(reading, thought, steps)
+
+
+def _as_set(done: Presses, pad: Pad, number: int) -> PressSet:
+    return PressSet(
+        family=np.array(["paper"]),
+        pad=np.array([number]),
+        constants=constants(pad)[None],
+        counts=done.counts[:, None],
+        angle_deg=np.zeros((1, 1), dtype=np.float32),
+        patterns=done.patterns.astype(np.float16),
+        touching=done.touching,
+        traction_kpa=done.traction_kpa.astype(np.float16),
+        force_n=done.force_n,
+        twist_nmm=done.twist_nmm,
+        indentation_mm=done.indentation_mm,
+    )

@@ -1,0 +1,49 @@
+"""How far patterns and forces are off, in the ways that reports of shipped models tell it."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from train.experiments.support.report import Row, with_interval
+from train.experiments.support.workbench import Figures
+
+_MOST_SHARE: Final = 100.0
+_HALVINGS: Final = 50
+
+
+def pooled_db(psnr_db: NDArray[np.floating]) -> float:
+    """PSNR of all frames as one, from each frame's: bad frames weigh more than in the mean."""
+    return float(-10 * np.log10(np.mean(10 ** (-psnr_db / 10))))
+
+
+def own_peak_db(psnr_db: NDArray[np.floating], truth: NDArray[np.floating], full_scale: float) -> NDArray[np.floating]:
+    """PSNR (n,) against each true pattern's own maximum, of truth (n, H, W), instead of the full scale."""
+    return psnr_db + 20 * np.log10(truth.max(axis=(-2, -1)) / full_scale)
+
+
+def pattern_cells(figures: Figures, truth: NDArray[np.floating], full_scale: float, groups: NDArray[np.integer]) -> Row:
+    """Errors of patterns as cells of a row; intervals by group, of which frames are not independent."""
+    psnr_db = figures["psnr_db"]
+    return {
+        "PSNR dB": with_interval(psnr_db, groups),
+        "pooled dB": round(pooled_db(psnr_db), 2),
+        "own peak dB": round(float(own_peak_db(psnr_db, truth, full_scale).mean()), 2),
+        "IoU": round(float(figures["contact_iou"].mean()), 3),
+        "edge mm": round(float(figures["boundary_mm"].mean()), 3),
+        "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
+    }
+
+
+def share_beside(error: NDArray[np.floating], reading: NDArray[np.floating], offset: float) -> float:
+    """The p of 'p % of reading + offset' that errors (n,) keep in the root mean square; 0 where the offset is enough.
+
+    It is the p at which errors over (p / 100 |reading| + offset) have a root mean square of 1.
+    """
+    squares, size = np.square(error), np.abs(reading)
+    low, high = 0.0, _MOST_SHARE
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        over = np.mean(squares / np.square(middle * size + offset)) > 1
+        low, high = (middle, high) if over else (low, middle)
+    return 100 * low

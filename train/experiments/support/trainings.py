@@ -1,0 +1,174 @@
+"""What the experiments train, and on what: one list, so that no network is trained twice."""
+
+from dataclasses import replace
+from typing import Any, Final
+
+from edge.evaluation.test_set import FrozenSet
+from train.data.dataset import Sequences, join
+from train.data.generation_config import Generation, random_figures
+from train.experiments.support.workbench import Workbench
+from train.fit import given_taps
+from train.learning.checkpoint import Training
+from train.learning.training_loop import Recipe
+from train.networks.blocks import PatternNet
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
+
+SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
+"""The 18 surfaces."""
+FIGURES: Final = Generation(surfaces=random_figures(4500, 4500, seed=2), taps=MAX_TAPS, seed=2)
+"""Random figures, each once."""
+SEQUENCES: Final = SEEN.count + FIGURES.count
+"""Of both together: a pass over the mixed data."""
+
+_SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
+"""The STSR as long as the compact one from nothing; srgan on top of srcnn."""
+_SEED_MINUTES_MORE: Final = 4.0
+"""Of every MTSR-K, on top of the STSR. All together two hours of processor time, on two cores."""
+SEED_BATCH: Final = 16
+_SEED_RATE: Final = 5e-4
+_SEED_DECAY: Final = 1e-2
+_ENDLESS: Final = 1_000_000
+BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
+"""The compact STSR on whole taps of the paper's protocol, nothing known of the pad; the bundled ones learn presses."""
+_STAGE_STEPS: Final = 2000
+_STAGE_RATE: Final = 1e-3
+_SCALE_STEPS: Final = 2500
+_ANGLE_STEPS: Final = 1500
+
+
+def mixed(bench: Workbench) -> Sequences:
+    """What the bundled models are trained on: the 18 surfaces and as many random figures."""
+    return join([bench.data("seen", SEEN), bench.data("figures", FIGURES)])
+
+
+def by_angle(bench: Workbench, angle_step_deg: float) -> Sequences:
+    """The same with two taps, turned by another angle."""
+    if angle_step_deg == ANGLE_STEP_DEG:
+        return mixed(bench)
+    parts = {"seen": SEEN, "figures": FIGURES}
+    turned = {name: replace(config, taps=2, angle_step_deg=angle_step_deg) for name, config in parts.items()}
+    return join([bench.data(f"{name}-{angle_step_deg:g}-deg", config) for name, config in turned.items()])
+
+
+def compact(name: str) -> Training:
+    """A compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
+    if name == "stsr":
+        return BASE
+    taps = int(name.removeprefix("mtsr"))
+    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE, given=given_taps(taps))
+    return Training(f"taps-{name}", f"compact-{name}", recipe, start=BASE.name, seed=1 + taps)
+
+
+def at_scale(scale: int) -> Training:
+    """The compact STSR at another scale: the base's trunk, and pixels of its own."""
+    if scale == BASE.scale:
+        return BASE
+    recipe = Recipe(steps=_SCALE_STEPS, learning_rate=1e-3)
+    return Training(f"taps-stsr-x{scale}", "compact-stsr", recipe, scale=scale, start=BASE.name)
+
+
+def at_angle(angle_step_deg: float) -> Training:
+    """The compact MTSR-2 for taps that are turned by an angle, from the STSR, which knows none."""
+    recipe = Recipe(steps=_ANGLE_STEPS, learning_rate=1e-3, given=given_taps(2))
+    return Training(f"taps-mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start=BASE.name, seed=3)
+
+
+def alike(name: str) -> Training:
+    """A compact network trained on from the base for as long as every other of these."""
+    if name != "stsr":
+        return compact(name)
+    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE)
+    return replace(BASE, name=f"{BASE.name}-alike", recipe=recipe, start=BASE.name)
+
+
+def seed_size(network: str) -> Training:
+    """A network of the paper, by the clock."""
+    starts = network.startswith("mtsr")
+    recipe = Recipe(
+        steps=_ENDLESS,
+        batch=SEED_BATCH,
+        learning_rate=_SEED_RATE,
+        weight_decay=_SEED_DECAY,
+        given=given_taps(int(network.removeprefix("mtsr")) if starts else 1),
+        bf16=True,
+        minutes=_SEED_MINUTES.get(network, _SEED_MINUTES_MORE),
+    )
+    start = {"srgan": "seed-srcnn"}.get(network, "seed-stsr" if starts else None)
+    return Training(f"seed-{network}", network, recipe, start=start)
+
+
+SEED_STSR_LONGER: Final = replace(
+    seed_size("stsr"),
+    name="seed-stsr longer",
+    recipe=replace(seed_size("stsr").recipe, minutes=_SEED_MINUTES_MORE),
+    start="seed-stsr",
+)
+"""The STSR trained on for as long as MTSR-2 is from it: what is between the two is the second tap alone."""
+
+OUT_EPOCHS: Final = 40
+"""Passes over the mixed data of an STSR trained out from nothing."""
+OUT_EPOCHS_MORE: Final = 20
+"""Of each network that goes on from it."""
+_OUT_BATCH: Final = 64
+_OUT_RATES: Final = {"paper": (1e-3, 5e-4), "compact": (2e-3, 5e-4)}
+"""Highest learning rate from nothing, and of what goes on. Of the paper's, 5e-4, 1e-3 and 2e-3 were tried."""
+
+
+def from_nothing(network: str, epochs: int) -> Training:
+    """A network of either kind, by the epoch."""
+    return Training(f"out-{network}-{epochs}", network, _out_recipe(network, epochs, goes_on=False))
+
+
+def gone_on(network: str, start: Training, epochs: int) -> Training:
+    """A network of the start's kind, trained on from it."""
+    name = f"out-{network}-{start.name.rpartition('-')[2]}+{epochs}"
+    return Training(name, network, _out_recipe(network, epochs, goes_on=True), start=start.name)
+
+
+def epochs(training: Training) -> float:
+    """Passes over the mixed data, those included that its start has made."""
+    own = training.recipe.steps * training.recipe.batch / SEQUENCES
+    return own + (epochs(_STARTS[training.start]) if training.start else 0.0)
+
+
+def _out_recipe(network: str, epochs: int, *, goes_on: bool) -> Recipe:
+    kind, _, name = network.rpartition("-")
+    return Recipe(
+        steps=epochs * SEQUENCES // _OUT_BATCH,
+        batch=_OUT_BATCH,
+        learning_rate=_OUT_RATES[kind or "paper"][goes_on],
+        weight_decay=0.0 if kind else _SEED_DECAY,
+        given=given_taps(int(name.removeprefix("mtsr")) if name.startswith("mtsr") else 1),
+        bf16=True,
+    )
+
+
+_OUT_STARTS: Final = tuple(from_nothing(network, OUT_EPOCHS) for network in ("stsr", "compact-stsr"))
+OUT: Final = (
+    *(
+        training
+        for start in _OUT_STARTS
+        for training in (
+            from_nothing(start.network, OUT_EPOCHS // 4),
+            start,
+            *(
+                gone_on(start.network.replace("stsr", name), start, OUT_EPOCHS_MORE)
+                for name in ("stsr", "mtsr2", "mtsr4")
+            ),
+        )
+    ),
+    from_nothing("compact-stsr", 4 * OUT_EPOCHS),
+)
+"""The paper's networks and compact ones, trained alike; the compact STSR until it gains little more."""
+
+
+def trained(
+    bench: Workbench, training: Training, data: Sequences, validation: FrozenSet
+) -> tuple[PatternNet, dict[str, Any]]:
+    """A trained network and its report, and before it the one that it starts from."""
+    if training.start:
+        trained(bench, _STARTS[training.start], data, validation)
+    return bench.network(training, data, validation)
+
+
+_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)}

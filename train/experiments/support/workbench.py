@@ -1,0 +1,189 @@
+"""What experiments share: datasets and networks made once and found again, figures of a network, and what it costs."""
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edge.evaluation.test_set import FrozenSet
+from edge.inference.bundled import BUNDLE_DIR
+from firmware_bridge.geometry import USPA44
+from train.data.dataset import Sequences
+from train.data.frozen_presses import FrozenPresses, load_frozen_presses
+from train.data.generation_config import Generation
+from train.data.make_presses import make_presses
+from train.data.presses import PressSet
+from train.data.world import World
+from train.errors import CheckpointError
+from train.experiments.support.report import Row, with_interval
+from train.freeze import SEED, freeze
+from train.generate import generate
+from train.learning.checkpoint import Training, fit_network, load_network
+from train.networks.blocks import PatternNet
+from train.networks.cost import macs, parameters_count
+from train.physics.sensor_noise import Nuisances
+from train.surfaces.named_surfaces import SURFACES
+from train.surfaces.poses import MAX_TAPS, Split
+
+_TIMED_RUNS: Final = 30
+_TIMED_MS: Final = 2000.0
+_QUICK_STEPS: Final = 1
+_QUICK_SEQUENCES: Final = 36
+_QUICK_SURFACES: Final = 2
+_QUICK_PRESSES: Final = 42
+_QUICK_ONE_IN: Final = 12
+_QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
+
+
+@dataclass
+class Workbench:
+    """Where experiments keep what takes long.
+
+    Attributes:
+        data_folder: datasets, by name.
+        checkpoints: trained networks, by name.
+        quick: everything tiny, to see that it runs.
+        found: networks brought from another machine are judged as they are, and those that are not there left out.
+        models: folder of the shipped models.
+        before: file of a model of an earlier release, to be compared with.
+    """
+
+    data_folder: Path = Path("data")
+    checkpoints: Path = Path("checkpoints")
+    quick: bool = False
+    found: bool = False
+    models: Path = BUNDLE_DIR
+    before: Path | None = None
+
+    def presses(self, name: str, world: World) -> PressSet:
+        """Presses of that world: read if they are there, else made."""
+        if self.quick:
+            name, world = f"quick-{name}", replace(world, count=_QUICK_PRESSES, taps=1, per_pad=_QUICK_PRESSES // 2)
+        self.data_folder.mkdir(parents=True, exist_ok=True)
+        return make_presses(world, self.data_folder / f"{name}.npz")
+
+    def wide_test(self) -> FrozenPresses:
+        """The wide frozen set."""
+        wide = load_frozen_presses()
+        return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
+
+    def data(self, name: str, config: Generation) -> Sequences:
+        """A dataset: read if it is there, else made."""
+        if self.quick:
+            name, config = f"quick-{name}", replace(config, count=_QUICK_SEQUENCES, surfaces=config.surfaces[:18])
+        return self._made(name, config)
+
+    def network(self, training: Training, data: Sequences, validation: FrozenSet) -> tuple[PatternNet, dict[str, Any]]:
+        """A trained network and its report: read if it is there and was trained alike on these data, else trained."""
+        if self.quick:
+            training = _quick(training)
+        path = self.checkpoints / f"{training.name}.pt"
+        before = path.stat().st_mtime_ns if path.exists() else None
+        fit_network(training, data, validation, self.checkpoints)
+        net, report = load_network(path)
+        if path.stat().st_mtime_ns != before:
+            sys.stdout.write(f"{training.name}: {report['steps']} steps in {report['elapsed_s']:.0f} s\n")
+        return net, report
+
+    def brought(self, training: Training) -> tuple[PatternNet, dict[str, Any]] | None:
+        """A network trained alike on any machine, where data differ in the last bits and so in their hash; or None."""
+        if self.quick:
+            training = _quick(training)
+        path = self.checkpoints / f"{training.name}.pt"
+        if not path.exists():
+            return None
+        net, report = load_network(path)
+        if report["config"] != json.loads(json.dumps(asdict(training))):
+            raise CheckpointError(f"{path} was trained by another recipe than '{training.name}' has now: delete it")
+        return net, report
+
+    def training_cells(self, report: Mapping[str, Any]) -> Row:
+        """How long a network was trained, those included that it started from, as cells of a row."""
+        steps, elapsed_s = report["steps"], report["elapsed_s"]
+        while (start := report["config"]["start"]) is not None:
+            _, report = load_network(self.checkpoints / f"{start}.pt")
+            steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
+        return {"steps": steps, "training min": round(elapsed_s / 60, 1)}
+
+    def held_out(self, split: Split, surfaces: Sequence[str] = SURFACES, **options: Any) -> Sequences:
+        """Clean sequences at a held-out position: read if they are there, else made."""
+        names = tuple(surfaces[:_QUICK_SURFACES] if self.quick else surfaces)
+        config = Generation(surfaces=names, poses="paper", split=split, taps=MAX_TAPS, seed=SEED, **options)
+        return self._made(f"{split}-{_short_hash(config)}", config)
+
+    def frozen(
+        self,
+        split: Split,
+        surfaces: Sequence[str] = SURFACES,
+        nuisances: Nuisances | None = None,
+        scale: int = 10,
+        **options: Any,
+    ) -> FrozenSet:
+        """A frozen set made as the bundled one; of other surfaces, nuisances, scale or options if asked for."""
+        frozen = freeze(self.held_out(split, surfaces, **options), nuisances or Nuisances(), SEED, scale=scale)
+        return thinned(frozen, 8) if self.quick else frozen
+
+    def _made(self, name: str, config: Generation) -> Sequences:
+        self.data_folder.mkdir(parents=True, exist_ok=True)
+        return generate(config, self.data_folder / f"{name}.npz")
+
+
+Figures = dict[str, NDArray[np.float64]]
+"""Every metric of every frame, (n,) each, as edge.evaluation.evaluate gives them."""
+
+
+def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
+    """Mean errors over a frozen set, PSNR with its interval by tap, as cells of a row."""
+    return {
+        f"{split} PSNR dB": with_interval(figures["psnr_db"], frozen.tap),
+        f"{split} SSIM": round(float(figures["ssim"].mean()), 4),
+        f"{split} SSIM global": round(float(figures["ssim_global"].mean()), 4),
+        f"{split} RMSE %": round(float(figures["rmse_percent"].mean()), 3),
+        f"{split} IoU": round(float(figures["contact_iou"].mean()), 4),
+        f"{split} boundary mm": round(float(figures["boundary_mm"].mean()), 3),
+    }
+
+
+def cost_cells(net: PatternNet) -> Row:
+    """Parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
+    window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    times_ms = []
+    with torch.inference_mode():
+        while len(times_ms) < _TIMED_RUNS and sum(times_ms) < _TIMED_MS:
+            started_s = time.perf_counter()
+            net(window)
+            times_ms.append(1e3 * (time.perf_counter() - started_s))
+    torch.set_num_threads(threads)
+    return {
+        "parameters": parameters_count(net),
+        "MMAC": round(macs(net) / 1e6, 1),
+        "run time ms": round(float(np.median(times_ms[len(times_ms) // 3 :])), 3),
+    }
+
+
+def _quick(training: Training) -> Training:
+    """The same in miniature, under a name of its own."""
+    recipe = replace(training.recipe, steps=_QUICK_STEPS, batch=2, minutes=None)
+    options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
+    start = training.start and f"quick-{training.start}"
+    return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
+
+
+def thinned(frozen: FrozenSet, one_in: int) -> FrozenSet:
+    """A frame in so many, evenly over every tap: networks of the paper's size take long to judge."""
+    frames = ("newest", "tap", "indentation_mm", "force_n")
+    return replace(frozen, **{name: getattr(frozen, name)[one_in // 2 - 1 :: one_in] for name in frames})
+
+
+def _short_hash(config: Generation) -> str:
+    return hashlib.sha256(json.dumps(config.facts(), sort_keys=True).encode()).hexdigest()[:10]
