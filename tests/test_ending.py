@@ -22,7 +22,7 @@ from edge.cli import main as cli
 from edge.sinks.binary_message import unpack
 from edge.terminal.forced_end import EXIT_FORCED
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
 LONG_S = 12.0
 """Two seconds are promised; a busy machine may take longer, and what is mended here took a minute or for ever."""
 EDGE_SR = (sys.executable, "-m", "edge.cli.main")

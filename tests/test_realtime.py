@@ -17,7 +17,7 @@ import os, threading
 import sys, tempfile
 from functools import partial
 from pathlib import Path
-sys.path.insert(0, "tests")
+sys.path.insert(0, "tests/support")
 from edge_samples import make_contract
 from edge.sinks.mcap_writer import McapFile
 from edge.cli.realtime import realtime

@@ -77,8 +77,11 @@ class Listener:
     """A subscriber; its lines are kept as they come."""
 
     def __init__(self, topics, *words):
-        environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
-        command = [sys.executable, str(ROOT / "tests/ros2_listener.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
+        environment = os.environ | {
+            "CYCLONEDDS_URI": LISTENERS_CONFIGURATION,
+            "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}",
+        }
+        command = [sys.executable, str(ROOT / "tests/support/ros2_listener.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
         self.process = subprocess.Popen(
             [*command, json.dumps(topics), *words], env=environment, stdout=subprocess.PIPE, text=True
         )

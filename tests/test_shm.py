@@ -42,7 +42,10 @@ pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="shared me
 
 CONTRACT = make_contract(interval_factor=1.6)
 READS = int(os.environ.get("EDGE_SHM_READS", "20000"))
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}:{ROOT / 'examples'}", "PYTHONUNBUFFERED": ""}
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}:{ROOT / 'tests/support'}:{ROOT / 'examples'}",
+    "PYTHONUNBUFFERED": "",
+}
 PATIENCE_S = 30
 WRITE = """
 import sys, time

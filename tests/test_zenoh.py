@@ -37,7 +37,7 @@ from edge.sinks.zenoh import ZenohSink, chunks
 zenoh = pytest.importorskip("zenoh")
 
 CONTRACT = make_pad_contract(interval_factor=1.6)
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "PYTHONUNBUFFERED": ""}
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}", "PYTHONUNBUFFERED": ""}
 # Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
 CONSUME = """
 import json, sys, time, zenoh

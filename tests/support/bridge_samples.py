@@ -16,7 +16,7 @@ from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import Scan
 
 REAL_RECORDINGS = Path(
-    os.environ.get("TACTILE_RECORDINGS", Path(__file__).parents[2] / "shared" / "recordings" / "imanlab")
+    os.environ.get("TACTILE_RECORDINGS", Path(__file__).parents[3] / "shared" / "recordings" / "imanlab")
 )
 REST_COUNTS = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
 

@@ -26,7 +26,7 @@ from firmware_bridge.links.base import Link
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PERIOD_NS = 10_000_000
 TINY_DOUBT = 0.01
 REST = (
