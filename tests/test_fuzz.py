@@ -1,4 +1,4 @@
-"""A short run of what `python tests/fuzz.py` does at length: by chance, without a guide, the same every time."""
+"""A short run of what `python tests/system/fuzz.py` does at length: by chance, without a guide, the same every time."""
 
 import ast
 

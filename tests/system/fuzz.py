@@ -1,8 +1,8 @@
-"""Fuzz the parsers of tests/fuzz_targets.py: guided by coverage where atheris is installed, by chance alone elsewhere.
+"""Fuzz the parsers of fuzz_targets.py: guided by coverage where atheris is installed, by chance alone elsewhere.
 
-    python tests/fuzz.py --inputs 10000000 --seed 1 --out reports/fuzz.md
-    python tests/fuzz.py --inputs 20000 --blind slcan "ONNX walk"
-    python tests/fuzz.py --replay slcan crash-1234
+    python tests/system/fuzz.py --inputs 10000000 --seed 1 --out reports/fuzz.md
+    python tests/system/fuzz.py --inputs 20000 --blind slcan "ONNX walk"
+    python tests/system/fuzz.py --replay slcan crash-1234
 
 What breaks a promise is kept as a file and ends the run with exit code 1.
 """
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PACKAGES = ["edge", "firmware_bridge", "train"]
 INPUT_LIMIT_S = 10
 MEMORY_LIMIT_MB = 2048
@@ -116,8 +116,9 @@ def page(rows: list[dict[str, object]]) -> str:
     table = "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
     return (
         "# What the parsers were fed\n\n"
-        f"`{' '.join(['python', 'tests/fuzz.py', *sys.argv[1:]])}`, {sum(int(str(row['inputs'])) for row in rows):,} "
-        f"inputs, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores, "
+        f"`{' '.join(['python', 'tests/system/fuzz.py', *sys.argv[1:]])}`, "
+        f"{sum(int(str(row['inputs'])) for row in rows):,} inputs, Python {platform.python_version()}, "
+        f"{platform.machine()}, {os.cpu_count()} cores, "
         f"{time.strftime('%Y-%m-%d')}. Edges and features are of this repository's own code; `held`: no promise was "
         f"broken, no input took {INPUT_LIMIT_S} s or {MEMORY_LIMIT_MB} MB.\n\n{table}\n"
     )

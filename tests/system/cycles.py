@@ -1,6 +1,6 @@
 """Write a report: what scans are worth whose readings name their cycle, by reader and by what goes wrong.
 
-python tests/cycles.py --out reports/cycles.md
+python tests/system/cycles.py --out reports/cycles.md
 """
 
 import argparse
@@ -48,9 +48,9 @@ def main() -> None:
     lines = [
         "# Scans of one cycle",
         "",
-        "Written by `python tests/cycles.py --out reports/cycles.md`. Every reading is the number of its cycle, so a",
-        "scan of two is seen at once. In each cell: whole scans with readings of two cycles, of all whole scans; and",
-        "torn ones.",
+        "Written by `python tests/system/cycles.py --out reports/cycles.md`. Every reading is the number of its",
+        "cycle, so a scan of two is seen at once. In each cell: whole scans with readings of two cycles, of all whole",
+        "scans; and torn ones.",
         "",
         "| | " + " | ".join(reader.name for reader in READERS) + " |",
         "|---" * (1 + len(READERS)) + "|",

@@ -1,4 +1,4 @@
-"""How much of a recording `kill -9` costs: `python tests/kill_loss.py [RUNS]`; what docs/recordings.md tells of it.
+"""How much of a recording `kill -9` costs: `python tests/system/kill_loss.py [RUNS]`; what docs/recordings.md tells.
 
 Beside the recording goes `jsonl:`, which writes each record at once: what it has and the file has not was lost.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording.formats import load_recording
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def loss_ms(folder: Path, after_s: float) -> float:
