@@ -5,8 +5,8 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from dataset_samples import make_sequences
 from onnx import numpy_helper
-from test_dataset import make_sequences
 
 from edge.errors import ModelError
 from edge.evaluation.evaluate import judge, judge_model, mean_error

@@ -5,8 +5,8 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from dataset_samples import make_sequences
 from onnx import helper
-from test_dataset import make_sequences
 from test_export import frozen_at
 from torch import nn
 

@@ -4,8 +4,8 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from dataset_samples import make_sequences
 from onnx import numpy_helper
-from test_dataset import make_sequences
 from test_export import at_frames, frozen_at, save_untrained
 
 from edge.inference.contract import Contract

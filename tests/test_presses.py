@@ -108,7 +108,7 @@ def test_sets_are_joined_with_their_pads_apart():
 
 
 def test_files_of_two_kinds_do_not_mix(tmp_path):
-    from test_dataset import make_sequences
+    from dataset_samples import make_sequences
 
     make_press_set(taps=1).save(tmp_path / "presses.npz")
     make_press_set(taps=2).save(tmp_path / "more.npz")
