@@ -43,7 +43,7 @@ pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="shared me
 CONTRACT = make_contract(interval_factor=1.6)
 READS = int(os.environ.get("EDGE_SHM_READS", "20000"))
 ENVIRONMENT = os.environ | {
-    "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}:{ROOT / 'tests/support'}:{ROOT / 'examples'}",
+    "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/sinks'}:{ROOT / 'tests/support'}:{ROOT / 'examples'}",
     "PYTHONUNBUFFERED": "",
 }
 PATIENCE_S = 30

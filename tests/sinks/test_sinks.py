@@ -544,7 +544,7 @@ class TestNpz:
         path = tmp_path / "out.npz"
         results = make_results()
         script = (
-            "import os, sys; sys.path[:0] = ['tests', 'tests/support']; from test_sinks import *\n"
+            "import os, sys; sys.path[:0] = ['tests/sinks', 'tests/support']; from test_sinks import *\n"
             "sink = NpzSink(Path(sys.argv[1]), *SHAPES)\n"
             "for result in make_results(): sink.write(result, {})\n"
             "os.kill(os.getpid(), 9)"
