@@ -177,7 +177,7 @@ def test_figures_go_to_tensorboard(tmp_path):
 
 WORKER = """
 import os, sys, json, torch
-sys.path[:0] = ["tests", "tests/support"]
+sys.path[:0] = ["tests/training", "tests/support"]
 from pathlib import Path
 from test_loop import batches, new_net, weights, RECIPE
 from train.learning.training_loop import leave_group, rank_and_world, train
