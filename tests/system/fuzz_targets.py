@@ -1,7 +1,7 @@
 """Every parser of what comes from outside: what it may be fed first, and what must be true of whatever it is fed.
 
 A target takes bytes and returns; only the errors that a parser documents are caught. `python tests/system/fuzz.py` runs
-them guided by coverage, tests/test_fuzz.py for some seconds without.
+them guided by coverage, tests/hostile/test_fuzz.py for some seconds without.
 """
 
 import io
