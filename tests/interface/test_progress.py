@@ -15,11 +15,11 @@ from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
+import page_cost as view
 import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, make_contract, write_model
 
-from edge.bench import view
 from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
@@ -200,7 +200,7 @@ def test_what_is_tracked_comes_whole_and_must_tell_how_much_it_is():
 
 
 def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeypatch):
-    """What `python -m export.to_onnx` and `python -m edge.bench.view` do for most of their time."""
+    """What `python -m export.to_onnx` and `python tests/system/page_cost.py` do for most of their time."""
     reached = []
     monkeypatch.setattr(Progress, "advance", lambda bar: reached.append((bar._what, bar._total)))
     monkeypatch.setattr(confidence, "doubts_and_errors", lambda *_: np.ones((3, 40)))

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, ROOT
+from fault_judge import HELD_US
 
-from edge.bench.fault_judge import HELD_US
 from edge.inference.bundled import demo_recording
 from edge.perception.taxel_health import (
     BACK_SCANS,

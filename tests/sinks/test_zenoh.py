@@ -22,10 +22,10 @@ import pytest
 from bridge_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeModel, ended, make_pad_contract, make_scan, write_model
 from test_listening import reachable
+from zenoh_load import PacedLink
+from zenoh_load import _figures as figures_of
 
 from edge import api
-from edge.bench.zenoh import PacedLink
-from edge.bench.zenoh import _figures as figures_of
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
@@ -449,7 +449,7 @@ def test_the_bench_gives_every_sensor_a_scan_a_tick():
 
 def start_bench(*words, **settings):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [sys.executable, "-m", "edge.bench.zenoh", "--sensors", "1", "--processes", "1", *words]
+    command = [sys.executable, str(ROOT / "tests/system/zenoh_load.py"), "--sensors", "1", "--processes", "1", *words]
     return ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, start_new_session=True, **pipes, **settings))
 
 

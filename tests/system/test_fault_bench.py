@@ -14,16 +14,16 @@ import orjson
 import pytest
 from bridge_samples import make_recording, write_recording
 from edge_samples import ROOT
+from fault_accounts import accounts, counted_at_the_end
+from fault_judge import judge
+from fault_outages import seconds_to_use
+from fault_page import promises, show, show_server, vanished_scans
+from fault_played import telling_counts
+from fault_records import Ran, Seen, Size, read_record
+from fault_run import run_among_faults
+from fault_server import ServerRan, judge_server
+from faults import main
 
-from edge.bench.fault_accounts import accounts, counted_at_the_end
-from edge.bench.fault_judge import judge
-from edge.bench.fault_outages import seconds_to_use
-from edge.bench.fault_page import promises, show, show_server, vanished_scans
-from edge.bench.fault_played import telling_counts
-from edge.bench.fault_records import Ran, Seen, Size, read_record
-from edge.bench.fault_run import run_among_faults
-from edge.bench.fault_server import ServerRan, judge_server
-from edge.bench.faults import main
 from edge.sinks.npz import gather
 from firmware_bridge.emulation.fault_log import Told
 from firmware_bridge.emulation.faults.injector import Injector

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from fault_played import TELLING, telling_counts
+from fault_records import Seen, in_thread, keep_lines, read_records
+from fault_run import END_TIMEOUT_S
 
-from edge.bench.fault_played import TELLING, telling_counts
-from edge.bench.fault_records import Seen, in_thread, keep_lines, read_records
-from edge.bench.fault_run import END_TIMEOUT_S
 from edge.bench.program import REST_COUNTS, environment
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from fault_records import Seen
 
-from edge.bench.fault_records import Seen
 from firmware_bridge.emulation.fault_log import Told
 from firmware_bridge.emulation.faults.frames import READ
 from firmware_bridge.emulation.faults.truth import FATES

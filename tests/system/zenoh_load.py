@@ -1,6 +1,6 @@
 """Many emulated sensors over zenoh into one process: latency, loss, and what it costs.
 
-    python -m edge.bench.zenoh [--sensors 32] [--out DIR]
+    python tests/system/zenoh_load.py [--sensors 32] [--out DIR]
 
 Exit code 1 where it cannot be measured, 130 where Ctrl-C ended it: then nothing is written.
 """
@@ -266,7 +266,9 @@ def _cell(values: Sequence[float]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
-    parser = argparse.ArgumentParser(prog="python -m edge.bench.zenoh", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python tests/system/zenoh_load.py", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--sensors", type=whole(1), default=32, metavar="N", help="in all (default 32)")
     parser.add_argument("--processes", type=whole(1), default=4, metavar="N", help="that write (default 4)")
     parser.add_argument("--seconds", type=positive, default=20.0, metavar="T", help="of a run (default 20)")
@@ -283,7 +285,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         zenoh_version = version("eclipse-zenoh")
         if options.out is not None:  # found out before minutes are spent
             options.out.mkdir(parents=True, exist_ok=True)
-        page.say(f"# zenoh\n\n    python -m edge.bench.zenoh {command}\n\n{this_machine()}, zenoh {zenoh_version}\n")
+        page.say(
+            f"# zenoh\n\n    python tests/system/zenoh_load.py {command}\n\n{this_machine()}, zenoh {zenoh_version}\n"
+        )
         page.say(f"{_TEXT.format(**asked)}\n\n{head(_COLUMNS)}")
         runs: dict[str, list[tuple[float, ...]]] = {setup: [] for setup in _SETUPS}
         for setup in page.tracked([one for one in _SETUPS for _ in range(options.runs)], "zenoh", "run"):

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
+from fault_judge import Found
 
-from edge.bench.fault_judge import Found
 from firmware_bridge.emulation.fault_log import Told
 from firmware_bridge.emulation.faults.stretches import LINK_FAULTS, RESET
 

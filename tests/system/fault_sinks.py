@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 import orjson
+from fault_records import Ran
 
-from edge.bench.fault_records import Ran
 from edge.bench.program import CONTROLLERS
 from edge.errors import SinkError
 from edge.sinks.npz import gather, parts_dir

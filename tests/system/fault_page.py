@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from fault_accounts import Account, accounts
+from fault_judge import Found
+from fault_outages import LONGEST_BACK_S, seconds_to_use
+from fault_records import Ran
+from fault_run import CALM_S
+from fault_server import GARBAGE_EVERY, ServerFound, ServerRan
 
-from edge.bench.fault_accounts import Account, accounts
-from edge.bench.fault_judge import Found
-from edge.bench.fault_outages import LONGEST_BACK_S, seconds_to_use
-from edge.bench.fault_records import Ran
-from edge.bench.fault_run import CALM_S
-from edge.bench.fault_server import GARBAGE_EVERY, ServerFound, ServerRan
 from edge.bench.report import head, line
 from edge.bench.soak import slope
 from firmware_bridge.emulation.fault_log import Told

@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from edge.bench.fault_judge import Found
+from fault_judge import Found
+
 from firmware_bridge.emulation.fault_log import Told
 
 

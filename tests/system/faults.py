@@ -1,6 +1,6 @@
 """`edge-sr` among all faults for minutes, held against what the injector knows.
 
-    python -m edge.bench.faults MINUTES --seed N [--out DIR]
+    python tests/system/faults.py MINUTES --seed N [--out DIR]
 
 Exit code 1 where a promise was not kept.
 """
@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from fault_judge import judge
+from fault_page import show, show_server
+from fault_run import CALM_S, run_among_faults
+from fault_server import judge_server, run_against_server
+
 from edge.bench.errors import BenchError
-from edge.bench.fault_judge import judge
-from edge.bench.fault_page import show, show_server
-from edge.bench.fault_run import CALM_S, run_among_faults
-from edge.bench.fault_server import judge_server, run_against_server
 from edge.bench.live_report import Page
 from edge.bench.machine import this_machine
 
@@ -40,7 +41,7 @@ def schedule(seconds: float) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 when every promise was kept, 1 when not."""
-    parser = argparse.ArgumentParser(prog="python -m edge.bench.faults", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python tests/system/faults.py", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("minutes", type=float, metavar="MINUTES", help="how long; a quarter of one at least")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of all chance (default 1)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write faults.md there")
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not 0.25 <= options.minutes < math.inf:
         parser.error(f"MINUTES is {options.minutes:g}, expected .25 or more")
     page = Page(sys.stdout, sys.stderr)
-    command = f"python -m edge.bench.faults {options.minutes:g} --seed {options.seed}"
+    command = f"python tests/system/faults.py {options.minutes:g} --seed {options.seed}"
     page.say(f"# Faults\n\n    {command}\n\n{this_machine()}\n\n{_TEXT}")
     try:
         with tempfile.TemporaryDirectory() as folder:

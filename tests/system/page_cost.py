@@ -1,6 +1,6 @@
 """What the live page costs the loop: the whole program with nobody, one and three who look, in turn.
 
-    python -m edge.bench.view [--rounds 5] [--seconds 10]
+    python tests/system/page_cost.py [--rounds 5] [--seconds 10]
 
 Every scan is in contact and new, so that every scan takes an inference. In each round one program runs without a page,
 and one with it, on which viewers come and go; ratios are to the first, of blocks measured beside each other.
@@ -133,7 +133,7 @@ def _looking(port: int, viewers: int, block: Blocks, seconds: float) -> Iterator
     if not viewers:
         yield
         return
-    command = [sys.executable, "-m", "edge.bench.view", _LOOK, str(port), str(viewers)]
+    command = [sys.executable, __file__, _LOOK, str(port), str(viewers)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield
@@ -173,7 +173,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments[:1] == [_LOOK]:
         asyncio.run(_look(int(arguments[1]), int(arguments[2])))
         return 0
-    parser = argparse.ArgumentParser(prog="python -m edge.bench.view", description="What the live page costs the loop.")
+    parser = argparse.ArgumentParser(
+        prog="python tests/system/page_cost.py", description="What the live page costs the loop."
+    )
     parser.add_argument("--rounds", metavar="N", type=whole(1), default=5, help="of all blocks (default 5)")
     parser.add_argument("--seconds", metavar="T", type=positive, default=10.0, help="a block (default 10)")
     options = parser.parse_args(arguments)

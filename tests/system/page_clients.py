@@ -1,6 +1,6 @@
 """What many clients of the live page leave behind: memory of the whole program before and after each kind of them.
 
-    python -m edge.bench.crowd [--count 100000] [--kinds connect get ...]
+    python tests/system/page_clients.py [--count 100000] [--kinds connect get ...]
 
 Nobody watches meanwhile. Every scan is in contact and new. Clients come one after the other, four at a time;
 those that are cut off for what they send come again, until as much was sent.
@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from page_cost import free_port
 
 from edge.bench.program import Play, Program, edge_sr
 from edge.bench.report import head, line
-from edge.bench.view import free_port
 from edge.terminal.argument_types import whole
 
 WARM_UP_S: Final = 20.0
@@ -122,7 +122,9 @@ def _measured(program: Program, port: int, kind: str, count: int) -> tuple[str, 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; returns an exit code."""
-    parser = argparse.ArgumentParser(prog="python -m edge.bench.crowd", description="What clients of the page leave.")
+    parser = argparse.ArgumentParser(
+        prog="python tests/system/page_clients.py", description="What clients of the page leave."
+    )
     parser.add_argument("--count", metavar="N", type=whole(1), default=100_000, help="of each kind (default 100000)")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="of clients (default all)")
     options = parser.parse_args(arguments)
