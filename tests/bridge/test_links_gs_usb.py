@@ -5,17 +5,17 @@ import random
 import sys
 import threading
 
+import gs_usb_emulator
 import pytest
 import usb.core
 from bridge_samples import make_counts, read_scans
+from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
+from gs_usb_emulator import GsUsbBackend, GsUsbPort
 from usb.backend import libusb1
 
-from firmware_bridge import gs_usb_emulator
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
-from firmware_bridge.gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
-from firmware_bridge.gs_usb_emulator import GsUsbBackend, GsUsbPort
 from firmware_bridge.links import gs_usb_devices, gs_usb_link
 from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
 from firmware_bridge.links.gs_usb_link import GsUsbLink

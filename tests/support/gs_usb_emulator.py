@@ -1,7 +1,6 @@
 """USB with pretended gs_usb adapters, as a backend of pyusb: what libusb would answer, its errors included."""
 
 # What each method is for, pyusb says; and since it is untyped, pyright takes its empty methods to return None.
-# ruff: noqa: D102
 # pyright: reportIncompatibleMethodOverride=false
 
 import errno
@@ -12,8 +11,7 @@ from typing import Any, Final
 
 import usb.backend
 import usb.core
-
-from firmware_bridge.gs_usb_adapter import GsUsbAdapter, StalledError
+from gs_usb_adapter import GsUsbAdapter, StalledError
 
 IO: Final = -1
 ACCESS: Final = -3
