@@ -33,9 +33,10 @@ from train.data.batches import COUNTS_PER_UNIT
 from train.data.dataset import Sequences
 from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
+from train.data.generation_config import SEED
 from train.data.presses import PressSet, load_presses
 from train.errors import CheckpointError, TrainError
-from train.freeze import SEED, held_out
+from train.freeze import held_out
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_calibration import half_width_mm

@@ -20,9 +20,10 @@ from typing import Any, Final
 from train.data.dataset import Sequences
 from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
+from train.data.generation_config import SEED
 from train.data.presses import PressSet, load_presses
 from train.errors import TrainError
-from train.freeze import SEED, freeze, held_out
+from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS

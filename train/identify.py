@@ -25,8 +25,8 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train.data.presses import load_presses
 from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
-from train.physics.contact_mixture import ContactMixture, fit_mixture, load_mixture, normalise
-from train.physics.gain_estimate import Estimate, estimate
+from train.learning.contact_mixture import ContactMixture, fit_mixture, load_mixture, normalise
+from train.learning.gain_estimate import Estimate, estimate
 from train.physics.pads import RANGES, input_scale
 
 _APART: Final = 0.1

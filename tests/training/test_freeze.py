@@ -9,9 +9,9 @@ from edge.perception.tap_tracker import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording
 from train.data.contact_kinds import KINDS, fit_kinds
 from train.data.dataset import Sequences
-from train.data.generation_config import Generation, solve_all
+from train.data.generation_config import SEED, Generation, solve_all
 from train.data.world import World, solve_pad
-from train.freeze import SEED, TEST_FORCE_N, demo_recording, drawn, fit_classical, fit_taxels, freeze, held_out, main
+from train.freeze import TEST_FORCE_N, demo_recording, drawn, fit_classical, fit_taxels, freeze, held_out, main
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
 

@@ -11,8 +11,8 @@ from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
 from train.experiments.sensor import identify as experiment
-from train.physics.contact_mixture import CHANNELS, ContactMixture, Z, load_mixture
-from train.physics.gain_estimate import CONSTANT_SPREAD, estimate
+from train.learning.contact_mixture import CHANNELS, ContactMixture, Z, load_mixture
+from train.learning.gain_estimate import CONSTANT_SPREAD, estimate
 from train.physics.pads import INPUTS
 
 FOLDER = recordings_folder()

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from edge.evaluation.metrics import psnr_db
-from train.data.generation_config import Generation, solve_all
+from train.data.generation_config import SEED, Generation, solve_all
 from train.errors import CheckpointError
 from train.fit import BUNDLED, given_taps, main
-from train.freeze import SEED, freeze, held_out
+from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
 from train.learning.interval_calibration import interval_coverage
 from train.learning.training_loop import Recipe

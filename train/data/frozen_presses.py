@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.scans.pad import Pad
+from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
 from train.errors import TrainError
-from train.freeze import SEED
 from train.physics.pads import input_scale, known_numbers
 from train.physics.sensor_noise import NAMES, Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM

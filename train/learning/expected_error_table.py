@@ -11,7 +11,8 @@ from edge.inference.expected_error import doubt
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences
-from train.freeze import SEED, freeze
+from train.data.generation_config import SEED
+from train.freeze import freeze
 from train.physics.sensor_noise import Nuisances
 
 BINS: Final = 10

@@ -19,6 +19,7 @@ from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences, windows
+from train.data.generation_config import SEED
 from train.experiments.support.course import (
     CLAIM_N,
     HOLD_S,
@@ -37,7 +38,7 @@ from train.experiments.support.methods import Method, compact_methods
 from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.trainings import mixed
 from train.experiments.support.workbench import Workbench
-from train.freeze import SCALE, SEED, TEST_FORCE_N
+from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import TARGET_ANGLES_DEG
 

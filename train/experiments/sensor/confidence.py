@@ -19,12 +19,12 @@ from edge.inference.expected_error import WORTH_A_TAP, expect_of
 from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from train.data.generation_config import random_figures
+from train.data.generation_config import SEED, random_figures
 from train.errors import TrainError
 from train.experiments.paper.unseen import TEST_FIGURES, TEST_SEED
 from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.workbench import Workbench
-from train.freeze import SEED, freeze
+from train.freeze import freeze
 from train.learning.expected_error_table import doubts_and_errors
 from train.physics.sensor_noise import Nuisances
 

@@ -31,10 +31,10 @@ from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
+from train.data.generation_config import SEED
 from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
 from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.workbench import Workbench, thinned
-from train.freeze import SEED
 from train.physics.sensor_noise import LARGEST_COUNTS
 
 MODELS: Final = ("stsr", "mtsr4")

@@ -16,6 +16,7 @@ from edge.evaluation.evaluate import judge
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
+from train.data.generation_config import SEED
 from train.data.world import World
 from train.experiments.support.baselines import Baseline, fit_baselines
 from train.experiments.support.nominal import nominal_rows
@@ -25,7 +26,6 @@ from train.experiments.support.scores import pattern_cells
 from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
-from train.freeze import SEED
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 TRAINING: Final = World(count=34_000, seed=1)

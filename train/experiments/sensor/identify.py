@@ -28,8 +28,8 @@ from train.data.world import World
 from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.identify import distinct, mixture_beside
-from train.physics.contact_mixture import CHANNELS, ContactMixture, Z, normalise
-from train.physics.gain_estimate import Estimate, estimate
+from train.learning.contact_mixture import CHANNELS, ContactMixture, Z, normalise
+from train.learning.gain_estimate import Estimate, estimate
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, constants, draw_pad
 from train.physics.sensor_noise import Nuisances, read_windows

@@ -17,14 +17,13 @@ from edge.evaluation.metrics import psnr_db
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
-from train.data.generation_config import one_thread
+from train.data.generation_config import SEED, one_thread
 from train.data.presses import PressSet
 from train.data.world import press_shapes
 from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
-from train.freeze import SEED
 from train.physics.gripped import GrippedPad
 from train.physics.pads import INPUTS, NOMINAL, Pad
 from train.physics.sensor_noise import Nuisances

@@ -29,6 +29,7 @@ from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
+from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
 from train.data.real_grips import (
@@ -44,7 +45,7 @@ from train.data.real_grips import (
 from train.data.world import World, solve_pad
 from train.experiments.support.report import Report, Row, bootstrap_interval
 from train.experiments.support.workbench import Workbench
-from train.freeze import SCALE, SEED, drawn
+from train.freeze import SCALE, drawn
 from train.physics.sensor_noise import Nuisances
 
 _SCAN_NS: Final = 16_750_000

@@ -28,10 +28,10 @@ from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
+from train.data.generation_config import SEED
 from train.data.real_grips import REST_SCANS, recording_paths, recordings_folder
 from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
-from train.freeze import SEED
 
 MODEL: Final = "stsr-small-int8"
 RATE_HZ: Final = 100

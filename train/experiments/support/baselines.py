@@ -13,10 +13,11 @@ from edge.evaluation.classical_methods import Method, bilinear, fit_gain, fit_li
 from edge.evaluation.metrics import psnr_db
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import FrozenPresses
+from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
 from train.experiments.support.kriging import Kriging
-from train.freeze import SCALE, SEED
+from train.freeze import SCALE
 from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import GrippedPad
 from train.physics.pads import NOMINAL

@@ -11,7 +11,8 @@ from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import TapTracker
 from firmware_bridge.geometry import USPA44
 from train.data.dataset import Sequences, between_frames
-from train.freeze import SEED, TEST_FORCE_N
+from train.data.generation_config import SEED
+from train.freeze import TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
 
 PRESS_S, HOLD_S, RELEASE_S, REST_S = 2.0, 5.0, 1.0, 2.0

@@ -10,8 +10,9 @@ import numpy as np
 
 from edge.evaluation.test_set import FrozenSet
 from train.data.dataset import Sequences
+from train.data.generation_config import SEED
 from train.experiments.support.workbench import Workbench
-from train.freeze import SCALE, SEED, freeze
+from train.freeze import SCALE, freeze
 from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances
 from train.surfaces.poses import ANGLE_STEP_DEG, TARGET_ANGLES_DEG
 

@@ -18,13 +18,13 @@ from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.geometry import USPA44
 from train.data.dataset import Sequences
 from train.data.frozen_presses import FrozenPresses, load_frozen_presses
-from train.data.generation_config import Generation
+from train.data.generation_config import SEED, Generation
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
 from train.data.world import World
 from train.errors import CheckpointError
 from train.experiments.support.report import Row, with_interval
-from train.freeze import SEED, freeze
+from train.freeze import freeze
 from train.generate import generate
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.geometry import AXES, USPA44
 from train.errors import DatasetError
-from train.physics.contact_mixture import CHANNELS, ContactMixture, normalise
+from train.learning.contact_mixture import CHANNELS, ContactMixture, normalise
 from train.physics.pads import INPUTS
 from train.physics.sensor_noise import Nuisances
 
