@@ -433,8 +433,8 @@ class TestEnds:
         assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
 
     def test_models_into_a_closed_pipe_stay_quiet(self, files):
-        script = f"import sys; from edge import bundle, cli; bundle.BUNDLE_DIR = bundle.Path({str(files)!r})\n"
-        script += "sys.exit(cli.main(['models']))"
+        script = "import sys; from edge.cli.main import main; from edge.inference import bundled\n"
+        script += f"bundled.BUNDLE_DIR = bundled.Path({str(files)!r})\nsys.exit(main(['models']))"
         reader, writer = os.pipe()
         os.close(reader)
         environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
