@@ -11,7 +11,7 @@ from train.freeze import fit_classical, fit_taxels
 from train.nuisances import Nuisances
 from train.physics.pads import INPUTS, KNOWN, input_scale
 
-WIDE_SHA256 = "b1476a097b6710464287ada7ab193fdf6f99a324ecefffb1265e3f682ccfd04c"
+WIDE_SHA256 = "edeb2202b59f15f51a49c3e5c96b8a1d752b877ffb50361257bf527b2cbedac2"
 
 
 @pytest.fixture(scope="module")
