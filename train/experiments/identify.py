@@ -17,6 +17,7 @@ from firmware_bridge.geometry import AXES, USPA44
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
 from train.data.world import World
+from train.experiments.families import TRAINING
 from train.experiments.hidden_taxel import (
     ScanSet,
     linear_from_others,
@@ -49,7 +50,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     presses, world = bench.data_folder / "gripped.npz", SENSORS
     if bench.quick:
         presses, world = bench.data_folder / "quick-gripped.npz", replace(SENSORS, count=36, per_pad=12)
-    make_presses(World(count=240, per_pad=120) if bench.quick else World(count=34_000), presses)
+    make_presses(World(count=240, per_pad=120) if bench.quick else TRAINING, presses)
     mixture = mixture_beside(presses)
     name = "quick-sensors.npz" if bench.quick else "sensors.npz"
     sensors = make_presses(world, bench.data_folder / name)
