@@ -44,8 +44,7 @@ from train.training import load_network
 
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1
-"""Largest cost of integers on the frozen test set; .1 before the wide world, whose STSR loses .03 dB on presses of all
-families and .13 on the test set's figures, whatever ranges are taken of (docs/log.md)."""
+"""Largest cost of integers on the frozen test set."""
 FINE_TUNE_STEPS: Final = 500
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02
