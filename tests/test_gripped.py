@@ -109,7 +109,7 @@ def test_a_rigid_figure_gives_what_a_flat_tap_gives(pad, name):
     # The same solver, cells and skin; measured 1.5e-6.
     assert np.abs(done.counts[0] - tap.counts[0, -1]).max() < 1e-4 * np.abs(tap.counts[0, -1]).max()
     assert done.force_n[0, 2] == pytest.approx(tap.force_n[0, -1], rel=1e-4)
-    # Truth is made of places a quarter of a cell apart here, of the figure's outline there. Measured over 30 figures: RMS
+    # Truth is made of places a quarter of a cell apart here, of the outline there. Measured over 30 figures: RMS
     # .015 in the mean and .026 at most, volume within .7 %.
     true = resample(tap.patterns[:, 0], FINE_SCALE, SCALE)
     assert np.sqrt(np.mean((done.patterns - true) ** 2)) < 0.03 * depth_mm
