@@ -12,7 +12,7 @@ RECORDINGS = recordings_folder()
 PATHS = recording_paths(RECORDINGS)
 LEAST_SHARE, MOST_UNEVEN = 0.9, 0.3
 DENTED = "data_sample_2022-02-22-08-10-01"
-"""The weakest grip: on both fingers a dent of at most a tenth of the pad is drawn below half (reports/real.md)."""
+"""The weakest grip: a known fault, on both fingers a dent is drawn that falls below half (docs/log.md)."""
 
 pytestmark = pytest.mark.skipif(not PATHS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
 
