@@ -27,10 +27,12 @@ LEVELS: Final = {
 """What onnxruntime may do to a graph, by name; each does what those before it do. The runtime takes the last."""
 
 TOLERANCE: Final = 1e-5
-"""Largest difference between torch and a float32 graph, as `Difference.relative`.
+"""Largest difference between torch and a float32 graph on readings, as `Difference.relative`.
 
 Both compute in float32 and add in another order. Measured from x4 to x20: compact networks 6e-7, seed-size ones 2e-6.
 """
+EXTREME_TOLERANCE: Final = 5e-5
+"""The same on windows beyond any touch; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""
 FULL_TRACTION_KPA: Final = 100.0
 """Traction of 40 N evenly on the pad: what differences of tractions are a share of, where none is larger."""
 FULL_RANGE_COUNTS: Final = 32768
@@ -149,34 +151,35 @@ def example_pads(count: int, width: int) -> NDArray[np.float32]:
     return pads
 
 
-def check_parity(
-    net: nn.Module, model: onnx.ModelProto, windows: NDArray[np.float32], full_scale: float, level: str = "all"
-) -> float:
-    """Largest relative difference between torch and a float32 graph.
+def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
+    """Largest relative difference between torch and a float32 graph, on readings and beyond any touch.
 
     Args:
         net: in evaluation mode.
         model: its graph.
-        windows: (n, 3K, rows, cols) in network units.
-        full_scale: of the patterns.
-        level: a name in LEVELS.
+        frozen: readings.
+        contract: of the graph.
 
     Raises:
-        ParityError: it is larger than TOLERANCE, or a value is not finite.
+        ParityError: it is larger than TOLERANCE or EXTREME_TOLERANCE, or a value is not finite.
     """
-    run = GraphRun(model, level)
+    run = GraphRun(model)
     width = known_width(net)
-    pads = example_pads(len(windows), width) if width else None
-    known = None if pads is None else torch.from_numpy(pads)
-    expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), known)]
     largest = 0.0
-    for difference in differences(run.outputs, expected, run(windows, pads), full_scale):
-        if not difference.relative <= TOLERANCE:
-            raise ParityError(
-                f"onnxruntime and torch differ by {difference.relative:.2e} in the {difference.output}, expected at "
-                f"most {TOLERANCE:.0e}"
-            )
-        largest = max(largest, difference.relative)
+    for windows, tolerance in (
+        (read_windows(frozen, contract), TOLERANCE),
+        (np.concatenate([*extreme_windows(contract).values()]), EXTREME_TOLERANCE),
+    ):
+        pads = example_pads(len(windows), width) if width else None
+        known = None if pads is None else torch.from_numpy(pads)
+        expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), known)]
+        for difference in differences(run.outputs, expected, run(windows, pads), contract.output_full_scale):
+            if not difference.relative <= tolerance:
+                raise ParityError(
+                    f"onnxruntime and torch differ by {difference.relative:.2e} in the {difference.output}, expected "
+                    f"at most {tolerance:.0e}"
+                )
+            largest = max(largest, difference.relative)
     return largest
 
 

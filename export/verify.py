@@ -29,7 +29,16 @@ from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
 from export.graph import outputs
-from export.parity import LEVELS, TOLERANCE, Difference, GraphRun, differences, extreme_windows, read_windows
+from export.parity import (
+    EXTREME_TOLERANCE,
+    LEVELS,
+    TOLERANCE,
+    Difference,
+    GraphRun,
+    differences,
+    extreme_windows,
+    read_windows,
+)
 from export.recordings import recorded_windows
 from export.reference import contract_in, in_float, network_of, origin_of
 from export.to_onnx import MOST_LOSS_DB
@@ -43,8 +52,6 @@ INT8_READ: Final = 0.25
 .17 on recordings."""
 INT8_EXTREME: Final = 0.75
 """On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
-FLOAT_EXTREME: Final = 2e-5
-"""Of float32 on the same windows; measured: 1.04e-5 at the full range, negative, not optimised."""
 READINGS: Final = ("test set", "recordings")
 PASSES: Final = 1 + len(LEVELS)
 """Over all windows of a model: by torch, and at each level."""
@@ -145,7 +152,7 @@ def _judge(
     if truth is not None:
         change_db = float((psnr_db(given[0], truth, full_scale) - psnr_db(expected[0], truth, full_scale)).mean())
     broken, largest = "", max(found, key=lambda difference: difference.relative)
-    bound = TOLERANCE if windows in READINGS else FLOAT_EXTREME
+    bound = TOLERANCE if windows in READINGS else EXTREME_TOLERANCE
     if contract.arithmetic == "int8":
         bound = INT8_READ if windows in READINGS else INT8_EXTREME
     if not largest.relative <= bound:

@@ -1,24 +1,21 @@
 """Holds the records of a run among faults against the injector's truth, reading by reading."""
 
-from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-import numpy as np
 from fault_records import Seen
+from fault_sent import FLIPPED, STUCK, SentTaxel, handed_on
 
 from firmware_bridge.emulation.fault_log import Told
-from firmware_bridge.emulation.faults.frames import READ
-from firmware_bridge.emulation.faults.truth import FATES
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 STALE_US: Final = 100_000
 """What a record gives as one reading of the pad was on the bus within this time."""
 HELD_US: Final = 150_000
 """Of a taxel that did not come, the last reading is held for as long as that, by times of arrival."""
-_FLIPPED, _STUCK = (FATES.index(name) for name in ("flipped", "stuck"))
+ALL_FRESH: Final = 0xFFFF
+"""Of a whole scan: no taxel is missing."""
 
 
 @dataclass
@@ -33,6 +30,12 @@ class Found:
         false_patterns: neither; why, and of which record.
         flipped_patterns: with a reading in it that a flipped digit changed, which no reader can know.
         stuck_patterns: with a reading in it that a stuck taxel sends again, but that was lost when it sent it first.
+        whole: records of scans without a missing taxel.
+        mixed: of these, with readings of two cycles; which they are, and of which record.
+        flipped_whole: whole ones with a changed digit, judged by their other readings alone.
+        stuck_whole: the same with a reading that a stuck taxel sent more than once.
+        unstamped: whole ones without a time stamp of the adapter, by which a gap that was read late is seen.
+        unstamped_mixed: of these, with readings of two cycles; not among `mixed`.
         made_up: readings in records that were never sent, or sent before one that was shown already.
         shown: readings in records.
         unshown: readings handed on that are in no record, by sensor; open ones at the end are not among them.
@@ -55,6 +58,12 @@ class Found:
     false_patterns: list[str] = field(default_factory=list)
     flipped_patterns: int = 0
     stuck_patterns: int = 0
+    whole: int = 0
+    mixed: list[str] = field(default_factory=list)
+    flipped_whole: int = 0
+    stuck_whole: int = 0
+    unstamped: int = 0
+    unstamped_mixed: int = 0
     made_up: int = 0
     shown: int = 0
     unshown: int = 0
@@ -69,47 +78,9 @@ class Found:
     last_counters: Mapping[str, int] = field(default_factory=dict)
 
 
-class _Taxel:
-    """The readings of one taxel that were handed on, in order, and how far records have shown them."""
-
-    def __init__(self) -> None:
-        self.rows: list[tuple[int, int, int]] = []  # fate, time on the bus in [us], time of handing on in [ns]
-        self._readings: list[tuple[int, int, int]] = []
-        self.next = 0
-        self.shown = -1
-        self._places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
-
-    def add(self, reading: tuple[int, int, int], fate: int, bus_us: int, handed_ns: int) -> None:
-        self._places[reading].append(len(self.rows))
-        self._readings.append(reading)
-        self.rows.append((fate, bus_us, handed_ns))
-
-    def show(self, reading: tuple[int, int, int]) -> bool:
-        """Go on to the next row of this reading; False if there is none."""
-        places = self._places.get(reading, [])
-        at = bisect_left(places, self.next)
-        if at == len(places):
-            return False
-        self.shown, self.next = places[at], places[at] + 1
-        return True
-
-    def catch_up(self, bus_us: int) -> None:
-        """A stuck taxel's readings are all alike, and one that an outage swallowed is not told from the next.
-
-        Args:
-            bus_us: go on, as far as it sent the same again, to the first that was not on the bus before, in [us].
-        """
-        while self.rows[self.shown][1] < bus_us and self.next < len(self.rows) and self._sent_again:
-            self.shown, self.next = self.next, self.next + 1
-
-    @property
-    def _sent_again(self) -> bool:
-        return self.rows[self.next][0] == _STUCK and self._readings[self.next] == self._readings[self.shown]
-
-
 def judge(seen: Sequence[Seen], told: Told) -> Found:
     """What the records are worth, held against the truth."""
-    taxels = _handed_on(told)
+    taxels = handed_on(told)
     found = Found()
     for one in seen:
         found.last_counters = one.head["counters"]
@@ -119,28 +90,17 @@ def judge(seen: Sequence[Seen], told: Told) -> Found:
         _follow(one, taxels, found)
     for rows in taxels.values():
         found.open_at_end += len(rows.rows) - rows.next
-    handed_on = sum(len(rows.rows) for rows in taxels.values())
-    found.unshown = handed_on - found.shown - found.open_at_end
+    found.unshown = sum(len(rows.rows) for rows in taxels.values()) - found.shown - found.open_at_end
     return found
 
 
-def _handed_on(told: Told) -> dict[tuple[str, int], _Taxel]:
-    frames = told.frames[told.frames["fate"] < len(READ)]
-    frames = frames[np.isin(frames["can_id"], list(USPA44_MAP.taxels))]
-    taxels: dict[tuple[str, int], _Taxel] = defaultdict(_Taxel)
-    columns = (frames[name].tolist() for name in ("can_id", "xyz", "fate", "bus_us", "handed_ns"))
-    for can_id, (x, y, z), fate, bus_us, handed_ns in zip(*columns, strict=True):
-        taxels[USPA44_MAP.taxels[can_id]].add((x, y, z), fate, bus_us, handed_ns)
-    return taxels
-
-
-def _follow(one: Seen, taxels: Mapping[tuple[str, int], _Taxel], found: Found) -> None:
+def _follow(one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], found: Found) -> None:
     sensor, fresh, renewed = one.head["sensor"], one.head["fresh"], one.head["renewed"]
     counts = [] if one.counts is None else one.counts.tolist()
     trouble: list[str] = []
     fates: Counter[int] = Counter()
     unheard = 0
-    shown: dict[int, _Taxel] = {}
+    shown: dict[int, SentTaxel] = {}
     for taxel in range(16):
         if not fresh >> taxel & 1:
             found.missing += 1
@@ -158,13 +118,15 @@ def _follow(one: Seen, taxels: Mapping[tuple[str, int], _Taxel], found: Found) -
         rows.catch_up(newest_us - STALE_US)
         fate = rows.rows[rows.shown][0]
         fates[fate] += 1
-        unheard += fate == _STUCK and bool(renewed >> taxel & 1) and str(taxel) not in one.head["dead"]
+        unheard += fate == STUCK and bool(renewed >> taxel & 1) and str(taxel) not in one.head["dead"]
     bus_us = [rows.rows[rows.shown][1] for rows in shown.values()]
     handed = [rows.rows[rows.shown][2] for rows in shown.values()]
     if bus_us:
         found.first_us.setdefault(sensor, min(bus_us))
         found.last_us[sensor] = max(bus_us)
         found.arrivals.append((max(handed), one.head["time_ns"]))
+    if fresh == ALL_FRESH:
+        _count_cycles(one, shown, found)
     if not one.drawn:
         return
     found.patterns += 1
@@ -179,18 +141,36 @@ def _follow(one: Seen, taxels: Mapping[tuple[str, int], _Taxel], found: Found) -
         trouble += _held(one, taxels, max(bus_us), max(handed), found)
     else:
         trouble.append("no reading is fresh")
-    found.flipped_patterns += fates[_FLIPPED] > 0
+    found.flipped_patterns += fates[FLIPPED] > 0
     found.stuck_patterns += unheard > 0
     if trouble:
         found.false_patterns.append(f"sensor {sensor}, scan {one.head['scan']}: {'; '.join(trouble)}")
-    elif fresh == renewed == 0xFFFF and not one.head["dead"]:
+    elif fresh == renewed == ALL_FRESH and not one.head["dead"]:
         found.whole_patterns += 1
     else:
         found.told_patterns += 1
 
 
+def _count_cycles(one: Seen, shown: Mapping[int, SentTaxel], found: Found) -> None:
+    """Count a whole scan, and whether its readings are of one cycle."""
+    unstamped = one.head["device_time_ns"] is None
+    found.whole += 1
+    found.unstamped += unstamped
+    found.flipped_whole += any(rows.flipped for rows in shown.values())
+    found.stuck_whole += any(rows.stuck for rows in shown.values())
+    by_cycle: dict[int, list[int]] = defaultdict(list)
+    for taxel, rows in shown.items():
+        if rows.cycle is not None:
+            by_cycle[rows.cycle].append(taxel)
+    if len(by_cycle) > 1 and unstamped:
+        found.unstamped_mixed += 1
+    elif len(by_cycle) > 1:
+        cycles = "; ".join(f"cycle {cycle}: taxels {taxels}" for cycle, taxels in sorted(by_cycle.items()))
+        found.mixed.append(f"sensor {one.head['sensor']}, scan {one.head['scan']}: {cycles}")
+
+
 def _held(
-    one: Seen, taxels: Mapping[tuple[str, int], _Taxel], newest_us: int, newest_ns: int, found: Found
+    one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], newest_us: int, newest_ns: int, found: Found
 ) -> list[str]:
     """What is wrong with readings that a pattern was made from although they did not come with its scan."""
     trouble: list[str] = []

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from fault_accounts import Account, accounts
+from fault_accounts import CONSISTENT, DIFFERENT, EQUAL, Account, accounts
 from fault_judge import Found
 from fault_outages import LONGEST_BACK_S, seconds_to_use
 from fault_records import Ran
@@ -38,7 +38,7 @@ class Promise:
 def promises(ran: Ran, found: Found, told: Told) -> list[Promise]:
     """All of them, in order of weight."""
     books = accounts(found, told, ran.said)
-    wrong = [book for book in books if not book.exact]
+    wrong = [book.name for book in books if book.verdict == DIFFERENT]
     back_s = seconds_to_use(found, told, LINK_FAULTS)
     sinks = ran.said.count(_GIVEN_UP)
     growth, half = _memory(ran)
@@ -59,10 +59,11 @@ def promises(ran: Ran, found: Found, told: Told) -> list[Promise]:
             found.patterns > 0 and not found.false_patterns,
         ),
         Promise(
-            "losses are counted exactly",
-            f"{len(books) - len(wrong)} of {len(books)} accounts" + _first([book.name for book in wrong]),
-            not wrong,
+            "no whole scan mixes two cycles",
+            f"{len(found.mixed)} of {found.whole - found.unstamped}" + _first(found.mixed),
+            found.whole > found.unstamped and not found.mixed,
         ),
+        Promise("losses are counted: the accounts of both sides agree", _agreement(books) + _first(wrong), not wrong),
         Promise(
             f"a link that is back, its cable in again (under another name too) or its adapter reset, is used within "
             f"{LONGEST_BACK_S:g} s",
@@ -102,7 +103,7 @@ def show(ran: Ran, found: Found, told: Told, say: Callable[[str], object]) -> bo
     say("\n## Faults\n\n" + head(("fault", "times", "frames struck", "used again s p50", "max")))
     for row in _faults(found, told):
         say(line(row))
-    say("\n## Accounts\n\n" + head(("", "injector", "edge-sr", "exact")))
+    say("\n## Accounts\n\n" + head(("", "injector", "edge-sr", "tolerance", "verdict")))
     for book in accounts(found, told, ran.said):
         say(_book_line(book))
     say(_losses(found, told))
@@ -157,7 +158,11 @@ def _patterns(found: Found) -> str:
         f"bus at most {spread_ms:.0f} ms apart; one that `fresh` says is held was at most {held_ms:.0f} ms older.\n\n"
         f"What no reader can know: {found.flipped_patterns} patterns hold a reading in which a digit was changed on "
         f"the way, which the wire has no checksum against; {found.stuck_patterns} one of a stuck taxel that was lost "
-        f"when it was sent first, so that it looked new."
+        f"when it was sent first, so that it looked new. Of {found.whole} whole scans, those without a missing taxel, "
+        f"{found.flipped_whole} hold a changed digit and {found.stuck_whole} a reading that a stuck taxel sent in more "
+        f"than one cycle: their cycle is judged by the other readings. {found.unstamped} came without a time stamp of "
+        f"the adapter, so that a gap which was read late is not seen; of these {found.unstamped_mixed} mix two cycles, "
+        f"which the promise does not count."
     )
 
 
@@ -174,7 +179,14 @@ def _faults(found: Found, told: Told) -> list[tuple[str, ...]]:
 
 
 def _book_line(book: Account) -> str:
-    return line((book.name, str(book.told), str(book.counted), "yes" if book.exact else "no"))
+    return line((book.name, str(book.told), str(book.counted), book.tolerance, book.verdict))
+
+
+def _agreement(books: Sequence[Account]) -> str:
+    verdicts = [book.verdict for book in books]
+    parts = [f"{verdicts.count(EQUAL)} of {len(books)} equal"]
+    parts += [f"{book.name} {CONSISTENT}, {book.tolerance}" for book in books if book.verdict == CONSISTENT]
+    return "; ".join(parts)
 
 
 def _losses(found: Found, told: Told) -> str:

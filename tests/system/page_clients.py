@@ -1,4 +1,4 @@
-"""What many clients of the live page leave behind: memory of the whole program before and after each kind of them.
+"""Memory of the whole program before and after many clients of the live page, kind by kind.
 
     python tests/system/page_clients.py [--count 100000] [--kinds connect get ...]
 

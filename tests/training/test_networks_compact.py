@@ -176,8 +176,8 @@ def test_deviations_learn_where_errors_are():
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     sure, unsure = window(1, taps=1, seed=1), window(1, taps=1, seed=2)
     windows = torch.cat([sure, unsure]).repeat(16, 1, 1, 1)
-    for step in range(400):
-        optimizer.param_groups[0]["lr"] = 3e-3 * (1 - step / 400)
+    for step in range(2000):
+        optimizer.param_groups[0]["lr"] = 3e-3 * (1 - step / 2000)
         truth = torch.full((32, 8, 8), 0.2)
         truth[1::2, :, :3] += 0.1 * torch.randn(16, 8, 3, generator=generator)
         optimizer.zero_grad()

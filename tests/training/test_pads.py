@@ -38,7 +38,7 @@ def test_what_differs_from_magnet_to_magnet_follows_from_the_seed():
     assert not np.array_equal(first.rest(16), DRAWN[1].rest(16))
     assert not perfect.rest(16).any() and (perfect.moments(16) == 1).all()
     moments = np.array([pad.moments(16) for pad in DRAWN])
-    assert moments.std() == pytest.approx(0.026, abs=0.003) and abs(moments - 1).max() <= 0.06 + 1e-9
+    assert moments.std() == pytest.approx(0.013, abs=0.0015) and abs(moments - 1).max() <= 0.03 + 1e-9
 
 
 def test_unevenness_has_the_size_that_it_says():

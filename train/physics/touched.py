@@ -67,7 +67,8 @@ def pressed_in(
     size = cells_mm.shape[1]
     rim, pixels = size - pattern_cells, 2 * pattern_cells
     middle = (slice(None), slice(rim, rim + pixels), slice(rim, rim + pixels))
-    fine_mm, fine_share = (maps[middle] for maps in carrying(depth_mm, 2 * size))
+    fine_mm, fine_share = carrying(depth_mm, 2 * size)
+    fine_mm, fine_share = fine_mm[middle], fine_share[middle]
     indented_mm = indentation_mm[:, None, None]
     close_mm = np.empty_like(pressure_mpa)
     for cover, which in which_of(covers):

@@ -28,7 +28,7 @@ from train.experiments.support.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
-TRAINING: Final = World(count=34_000, seed=1)
+TRAINING: Final = World(count=100_000, seed=1)
 VALIDATION: Final = World(count=1260, taps=4, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)
 """As the Makefile makes data/gripped.npz and data/validation.npz."""
 _MODEL: Final = (NOTHING, ALL)

@@ -23,8 +23,10 @@ from train.data.real_grips import (
     recorded_sets,
     recording_paths,
     recordings_folder,
+    z_of,
 )
 from train.data.world import World
+from train.experiments.sensor.families import TRAINING
 from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.identify import distinct, mixture_beside
@@ -49,7 +51,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     presses, world = bench.data_folder / "gripped.npz", SENSORS
     if bench.quick:
         presses, world = bench.data_folder / "quick-gripped.npz", replace(SENSORS, count=36, per_pad=12)
-    make_presses(World(count=240, per_pad=120) if bench.quick else World(count=34_000), presses)
+    make_presses(World(count=240, per_pad=120) if bench.quick else TRAINING, presses)
     mixture = mixture_beside(presses)
     name = "quick-sensors.npz" if bench.quick else "sensors.npz"
     sensors = make_presses(world, bench.data_folder / name)
@@ -146,7 +148,7 @@ def hidden_z_error(scans: ScanSet, found: Estimate, mixture: ContactMixture) -> 
         filled[:, taxel] = guess[:, taxel]
         scale = np.sqrt((filled**2).mean(axis=1))
         expected = mixture.hidden_z(even / scale[:, None], found.constants, taxel) * scale
-        error[:, taxel] = expected * gains[Z][taxel] - scans.z[:, taxel]
+        error[:, taxel] = expected * gains[Z][taxel] - z_of(scans.counts)[:, taxel]
     return error
 
 
@@ -161,13 +163,16 @@ def _recorded(report: Report, mixture: ContactMixture) -> None:
         found = estimate(distinct(np.concatenate([one.counts for one in others])), mixture)
         even = replace(found, log_gains=np.zeros(CHANNELS))
         gains = np.exp(found.log_gains[Z])
+        z = z_of(scans.counts)
         errors = {
-            "bilinear": neighbours_mean(scans.z) - scans.z,
-            "bilinear, gains": neighbours_mean(scans.z / gains) * gains - scans.z,
+            "bilinear": neighbours_mean(z) - z,
+            "bilinear, gains": neighbours_mean(z / gains) * gains - z,
             "mixture": hidden_z_error(scans, even, mixture),
             "mixture, gains": hidden_z_error(scans, found, mixture),
-            "linear map of the other trials": linear_from_others(np.concatenate([one.z for one in others]), scans.z)
-            - scans.z,
+            "linear map of the other trials": linear_from_others(
+                np.concatenate([z_of(one.counts) for one in others]), z
+            )
+            - z,
         }
         for name, error in errors.items():
             squares.setdefault(name, []).append(error**2)
