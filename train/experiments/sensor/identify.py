@@ -50,7 +50,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """
     presses, world = bench.data_folder / "gripped.npz", SENSORS
     if bench.quick:
-        presses, world = bench.data_folder / "quick-gripped.npz", replace(SENSORS, count=36, per_pad=12)
+        presses, world = bench.data_folder / "quick-identify.npz", replace(SENSORS, count=36, per_pad=12)
     make_presses(World(count=240, per_pad=120) if bench.quick else TRAINING, presses)
     mixture = mixture_beside(presses)
     name = "quick-sensors.npz" if bench.quick else "sensors.npz"
