@@ -13,7 +13,8 @@ HOLD_SCANS: Final = 5
 """A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
 HOLD_NS: Final = 90_000_000
 """And no longer than this from scan to scan, however few came meanwhile: what was pressed half a second ago is another
-press. A reading may have come 60 ms before the end of its scan, the longest pause in one: none is older than 150 ms."""
+press. A reading may have come 60 ms before the end of its scan, the longest pause in one: none is older than 150 ms.
+Held since it was taken, not since it came, which a reader who was kept from running does not know."""
 SILENT_SCANS: Final = 50
 """A taxel not heard for so long is not lost for a moment: the user is told, and zeroing goes on without it."""
 STUCK_SCANS: Final = 20
@@ -138,13 +139,13 @@ class TaxelWatch:
                 and not self._may_be_far(zeroed, largest)
             ):
                 np.copyto(self.held, scan.counts)
-                self._whole_ns = scan.time_ns
+                self._whole_ns = scan.not_before_ns
                 return zeroed
         ends = self._find_saturated(scan, baseline)
         zeroed = None
         if not ends and self._sound and scan.whole:
             np.copyto(self.held, scan.counts)
-            self._whole_ns = scan.time_ns
+            self._whole_ns = scan.not_before_ns
             zeroed = None if baseline is None else deformation(scan.counts, baseline, self._mounting)
             if zeroed is None:
                 return zeroed
@@ -221,7 +222,7 @@ class TaxelWatch:
     def _judge(self, scan: Scan, read: NDArray[np.bool_], zeroed: NDArray[np.float32] | None) -> None:
         self._age += 1
         self._age[read] = 0
-        self._read_ns[read] = scan.time_ns
+        self._read_ns[read] = scan.not_before_ns
         # A scan in which few are new says nothing about one that is not: the adapter repeats itself.
         if 4 * np.count_nonzero(scan.renewed) >= np.count_nonzero(~self.dead) > 0:
             self._still += scan.fresh & ~scan.renewed

@@ -65,6 +65,16 @@ class Scan:
     vendor: VendorReading | None = None
     unread_ns: int = 0
 
+    @property
+    def not_before_ns(self) -> int:
+        """Monotonic time before which none of its readings was taken, as far as is known, in [ns].
+
+        By the device's time stamps, or by when the link was last found empty: the first reading after an opening sets
+        the device's clock, and seems new where nobody read it for long.
+        """
+        since_ns = self.time_ns - self.unread_ns
+        return since_ns if self.device_ns is None else min(self.device_ns, since_ns)
+
     # On sixteen taxels numpy's all() costs ten times what looking for a byte does, and these are asked of every scan.
 
     @property

@@ -2,7 +2,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan, tiny_deviation, tiny_pattern, write_model
+from edge_samples import (
+    BASELINE,
+    PERIOD_NS,
+    REST,
+    FakeModel,
+    make_contract,
+    make_scan,
+    tiny_deviation,
+    tiny_pattern,
+    write_model,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -199,6 +209,20 @@ def test_the_held_reading_is_the_newest_not_the_first():
     for number, press in enumerate([2000, 4000]):
         runtime.push(make_scan(number, press_counts=press))
     assert runtime.push(make_scan(2, absent=(5,))).force_counts == 4000
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_reading_that_came_late_is_held_since_it_was_taken(stamped):
+    """What a reader that was kept from running fetches at once comes together, and was not taken together."""
+    runtime = make_runtime()
+    runtime.push(make_scan(0, press_counts=PRESS))
+    came_ns, late_ns = 50 * PERIOD_NS, 35 * PERIOD_NS
+    late = make_scan(1, press_counts=PRESS, time_ns=came_ns)
+    taken = {"device_ns": came_ns - late_ns} if stamped else {"unread_ns": late_ns}
+    assert "old when it came" in runtime.push(dataclasses.replace(late, **taken)).note
+    torn = make_scan(2, press_counts=PRESS, absent=(0, 1), time_ns=came_ns + PERIOD_NS)
+    result = runtime.push(dataclasses.replace(torn, device_ns=torn.time_ns if stamped else None))
+    assert result.pattern is None and result.dead == {0: "silent", 1: "silent"}
 
 
 def test_a_taxel_never_heard_gives_no_pattern_ever():
