@@ -31,6 +31,9 @@ WRITE_TIMEOUT_S: Final = 1.0
 QUIET_S: Final = 0.02
 """A little over the 16 ms for which an FTDI chip may hold bytes back."""
 LONGEST_SETTLE_S: Final = 0.3
+_LOOK_S: Final = 0.002
+_PIECE_BYTES: Final = 4096
+_MOST_PIECES: Final = 1024
 SLOWEST_STAMPED_BAUD: Final = 1_000_000
 """Two sensors at 100 scans a second are 832 kbit/s of stamped lines, and 704 of plain ones."""
 MOST_SILENT_OPENINGS: Final = 10
@@ -99,6 +102,7 @@ class SlcanSerialLink(Link):
         self._frames_at_opening = 0
         self._late_stamps_from = (0, 0)
         self._received_bytes = 0
+        self._dropped_bytes = 0
         self._unread = Unread()
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
@@ -124,6 +128,7 @@ class SlcanSerialLink(Link):
             for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
                 port.write(command)
                 _wait_until_sent(port)
+            self._dropped_bytes += _take_waiting(port.fileno())  # pyserial's next opening would, and count nothing
         with suppress(*_PORT_ERRORS):
             if port.out_waiting:  # what a dead device does not take would hold up the closing
                 port.reset_output_buffer()
@@ -160,8 +165,9 @@ class SlcanSerialLink(Link):
         return scans
 
     def counters(self) -> dict[str, int]:
-        """Received bytes and the counters of decoder and assembler."""
-        return {"received_bytes": self._received_bytes} | self._scans.counters()
+        """Counters of decoder and assembler, bytes received, and bytes that an opening or a closing dropped."""
+        sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
+        return sizes | self._scans.counters()
 
     def _open_port(self) -> serial.Serial:
         try:
@@ -217,16 +223,31 @@ class SlcanSerialLink(Link):
         _say(port, OPEN)
 
     def _drop_old_bytes(self, port: serial.Serial) -> None:
-        port.timeout = QUIET_S
-        end_s = time.monotonic() + LONGEST_SETTLE_S
-        while port.read(1) and time.monotonic() < end_s:
-            port.reset_input_buffer()
+        """Leave out what arrives before the line falls silent, and count it: so no byte vanishes unseen."""
+        now_s = time.monotonic()
+        quiet_s, end_s = now_s + QUIET_S, now_s + LONGEST_SETTLE_S
+        while now_s < min(quiet_s, end_s):
+            time.sleep(_LOOK_S)
+            dropped = _take_waiting(port.fileno())
+            self._dropped_bytes += dropped
+            now_s = time.monotonic()
+            if dropped:
+                quiet_s = now_s + QUIET_S
 
 
 def _say(port: serial.Serial, command: bytes) -> None:
     with suppress(*_PORT_ERRORS):  # gone, which reading tells, or full, and then nobody would answer
         os.write(port.fileno(), command)
         _wait_until_sent(port)
+
+
+def _take_waiting(descriptor: int) -> int:
+    """Read what waits and return how many bytes that were; of a flood, a bounded part."""
+    taken = 0
+    with suppress(BlockingIOError):  # all is fetched
+        for _ in range(_MOST_PIECES):
+            taken += len(os.read(descriptor, _PIECE_BYTES))
+    return taken
 
 
 def _wait_until_sent(port: serial.Serial) -> None:

@@ -13,7 +13,7 @@ import pytest
 import serial
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
 
-from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import fd_reader as bursts
@@ -44,7 +44,7 @@ def test_every_scan_comes_once_and_in_order(acknowledges, latency_s):
     # The acknowledgement of the opening is seen; those before it are dropped with what is old.
     lines = 2 * 60 * 16
     expected = {"received_bytes": lines * 26 + acknowledges, "frames": lines, "readings": lines, "scans": 120}
-    assert counters == expected | ({"replies": 1} if acknowledges else {})
+    assert counters == expected | ({"replies": 1, "dropped_bytes": 3} if acknowledges else {})
 
 
 def test_it_opens_as_adapters_want_it():
@@ -148,6 +148,25 @@ def test_the_wrong_line_speed_gives_no_scan():
         SlcanSerialLink(emulator.port, 115_200) as link,
     ):
         assert len(read_until_lost(link)) == 20
+
+
+def test_what_lies_there_at_the_end_or_at_an_opening_is_dropped_and_counted():
+    line = encode_frame(CanFrame(0x401, bytes(8)))
+
+    def answer(device):
+        while CLOSE not in os.read(device.device_fd, 64):
+            pass
+        os.write(device.device_fd, 2 * line)
+
+    with SilentDevice() as device:
+        link = SlcanSerialLink(device.port)
+        late = threading.Thread(target=answer, args=[device])
+        late.start()
+        with link:
+            late.join()
+            os.write(device.device_fd, 3 * line)
+        assert link.counters()["dropped_bytes"] == 5 * len(line)
+        assert link.counters()["frames"] == link.counters()["received_bytes"] == 0
 
 
 def test_the_cable_out_is_told_at_once_and_every_time():

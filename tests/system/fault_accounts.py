@@ -18,30 +18,37 @@ class Account:
         name: of what.
         told: by the injector, or found in records.
         counted: by the program.
-        fewer: by how much the first may be less where equality cannot be: what was in records that were left out for
-            a reader that was too slow, here ourselves.
+        fewer: by how much the first may be less where equality cannot be.
+        more: by how much it may be more.
+        why: of what may be fewer or more.
     """
 
     name: str
     told: int
     counted: int
     fewer: int = 0
+    more: int = 0
+    why: str = ""
 
     @property
     def verdict(self) -> str:
         """Equal, consistent, or no."""
         if self.told == self.counted:
             return EQUAL
-        return CONSISTENT if 0 < self.counted - self.told <= self.fewer else DIFFERENT
+        return CONSISTENT if -self.fewer <= self.told - self.counted <= self.more else DIFFERENT
 
     @property
     def tolerance(self) -> str:
         """By how much they may differ."""
-        return f"up to {self.fewer} fewer in records" if self.fewer else "0"
+        return (
+            f"{f'+{self.more}' if self.more else ''}{f'-{self.fewer}' if self.fewer else ''} {self.why}".strip() or "0"
+        )
 
 
 EQUAL, CONSISTENT, DIFFERENT = "equal", "consistent", "no"
 TAXELS: Final = 16
+LINE_BYTES: Final = 26
+"""Of a frame with a time stamp."""
 _RECEIVED = re.compile(r"^received: (.*)$", re.MULTILINE)
 
 
@@ -58,6 +65,10 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     A record that was left out held a reading or a missing taxel in each of its sixteen places. How many of which, the
     program's own count of missing ones alone tells; so that account can be no more than consistent, and with it the
     one of readings closes exactly.
+
+    An opening drops what lies in the terminal. Where the injector did not run meanwhile, it finds nothing there and
+    takes it as read. How many bytes were dropped the program counts, how many of them the injector has as unread it
+    does: what lies between is frames that one side has and the other has not.
     """
     truth: Mapping[str, Any] = told.accounts["counters"]
     counted = {**found.last_counters, **counted_at_the_end(said)}
@@ -66,14 +77,30 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     explained = counted["duplicates"] + counted["unconfirmed"]
     explained += counted.get("abandoned", 0) + counted.get("resynchronised", 0)
     explained += TAXELS * left_out - (counted["missing_taxels"] - found.missing)
+    unread = told.accounts["fates"].get("unread", 0)
+    dropped = max(0, counted.get("dropped_bytes", 0) - LINE_BYTES * unread) // LINE_BYTES
+    cut = LINE_BYTES * min(dropped, counted.get("reopenings", 0))
+    bad_lines = counted["bad_lines"] + counted["non_ascii_lines"]
+
+    def of_what_was_dropped(name: str, handed_on: int, came: int, fewer: int = 0, more: int = dropped) -> Account:
+        return Account(name, handed_on, came, fewer, more, "dropped at openings" if more else "")
+
     return [
-        Account("frames", truth["frames"], counted["frames"]),
-        Account("foreign frames", truth["foreign"], counted["foreign"]),
-        Account("lines that are no frame", truth["bad_lines"], counted["bad_lines"] + counted["non_ascii_lines"]),
-        Account("bytes of no frame", truth["skipped_bytes"], counted["skipped_bytes"]),
-        Account("readings", readings, counted["readings"]),
-        Account("frames twice in a row", truth["duplicates"], counted["duplicates"]),
-        Account("readings in no record", found.unshown, explained),
-        Account("taxels missing in records", found.missing, counted["missing_taxels"], TAXELS * left_out),
+        of_what_was_dropped("frames", truth["frames"], counted["frames"]),
+        of_what_was_dropped("foreign frames", truth["foreign"], counted["foreign"]),
+        of_what_was_dropped("lines that are no frame", truth["bad_lines"], bad_lines),
+        of_what_was_dropped(
+            "bytes of no frame", truth["skipped_bytes"], counted["skipped_bytes"], cut, LINE_BYTES * dropped
+        ),
+        of_what_was_dropped("readings", readings, counted["readings"]),
+        of_what_was_dropped("frames twice in a row", truth["duplicates"], counted["duplicates"]),
+        of_what_was_dropped("readings in no record", found.unshown, explained),
+        Account(
+            "taxels missing in records",
+            found.missing,
+            counted["missing_taxels"],
+            TAXELS * left_out,
+            why="in records left out" if left_out else "",
+        ),
         Account("records of scans", found.records + left_out, counted["scans"]),
     ]
