@@ -11,17 +11,10 @@ NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt c
 run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 	$(BIN)/edge-sr demo --view
 
-# Emulated sensors keep their pace whatever the machine does: where it stood still meanwhile, scans are lost as they are
-# of a device. So what fails on busy cores is run once more with the machine to itself, and has failed if it fails then.
 test: $(VENV)/.dev  ## everything else, all tests; the soak, which mostly waits, beside the others
 	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider & soak=$$!; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak"; tests=$$?; \
-	wait $$soak; soak=$$?; \
-	if [ $$tests = 1 ]; then \
-		OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 0 -x --last-failed --last-failed-no-failures none -m "not soak"; \
-		tests=$$?; \
-	fi; \
-	test $$tests = 0 && test $$soak = 0
+	wait $$soak && test $$tests = 0
 
 lint: $(VENV)/.dev  ## format, lint, types, import rules
 	$(BIN)/ruff format --check .
