@@ -66,6 +66,9 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     program's own count of missing ones alone tells; so that account can be no more than consistent, and with it the
     one of readings closes exactly.
 
+    Lines of events that were left out are counted with those of scans; scans that the program counted and that are in no
+    record nor left out are missed all the same.
+
     An opening drops what lies in the terminal. Where the injector did not run meanwhile, it finds nothing there and
     takes it as read. How many bytes were dropped the program counts, how many of them the injector has as unread it
     does: what lies between is frames that one side has and the other has not.
@@ -73,10 +76,12 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     truth: Mapping[str, Any] = told.accounts["counters"]
     counted = {**found.last_counters, **counted_at_the_end(said)}
     left_out = counted.get("unwritten", 0)
+    events_left_out = min(left_out, max(0, found.records + left_out - counted["scans"]))
+    scans_left_out = left_out - events_left_out
     readings = truth["frames"] - truth["foreign"]
     explained = counted["duplicates"] + counted["unconfirmed"]
     explained += counted.get("abandoned", 0) + counted.get("resynchronised", 0)
-    explained += TAXELS * left_out - (counted["missing_taxels"] - found.missing)
+    explained += TAXELS * scans_left_out - (counted["missing_taxels"] - found.missing)
     unread = told.accounts["fates"].get("unread", 0)
     dropped = max(0, counted.get("dropped_bytes", 0) - LINE_BYTES * unread) // LINE_BYTES
     cut = LINE_BYTES * min(dropped, counted.get("reopenings", 0))
@@ -99,8 +104,14 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
             "taxels missing in records",
             found.missing,
             counted["missing_taxels"],
-            TAXELS * left_out,
-            why="in records left out" if left_out else "",
+            TAXELS * scans_left_out,
+            why="in records left out" if scans_left_out else "",
         ),
-        Account("records of scans", found.records + left_out, counted["scans"]),
+        Account(
+            "records of scans",
+            found.records + left_out,
+            counted["scans"],
+            more=events_left_out,
+            why="events left out" if events_left_out else "",
+        ),
     ]
