@@ -67,7 +67,6 @@ from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:
-    from edge.budgeting.model_steps import Ladder
     from edge.doctor.findings import Finding
     from edge.inference.onnx_session import ModelSession
     from firmware_bridge.links.discovery import Found
@@ -113,13 +112,13 @@ __all__ = [
     "WindowError",
     "Wrench",
     "bundled_models",
+    "choose_model",
     "demo_recording",
     "devices",
     "examine",
     "load_baselines",
     "load_model",
     "load_sensor_file",
-    "open_ladder",
     "open_recording",
     "open_runtime",
     "open_sink",
@@ -186,6 +185,51 @@ def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None
     return ModelSession(find_model(model), threads, stop)
 
 
+def choose_model(
+    model: str | Path,
+    budget_us: float,
+    *,
+    rate_hz: float | None = None,
+    recalibrate: bool = False,
+    stop: threading.Event | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> "ModelSession | None":
+    """Load the model of least error whose run time on this machine is within a budget: `edge-sr --budget-us`.
+
+    Run times are measured here and kept for later starts.
+
+    Args:
+        model: the best that may be used: a file, or the name of a bundled one.
+        budget_us: longest run time of a pattern, in [us].
+        rate_hz: of the sensor, in [Hz]; 100 unless given.
+        recalibrate: measure again although run times are kept.
+        stop: gives up early.
+        tell: receives, a line each, what is measured, what is wrong and what was chosen.
+
+    Returns:
+        The model, or None if it was stopped.
+
+    Raises:
+        ModelError: the model cannot be used, or its contract lacks its error.
+        UsageError: a budget or a rate that cannot be.
+    """
+    check_positive("budget_us", budget_us)
+    if rate_hz is not None:
+        check_positive("rate_hz", rate_hz)
+    from edge.budgeting import budget
+    from edge.budgeting.run_time_cache import cache_path
+
+    return budget.choose_model(
+        find_model(model),
+        budget_us,
+        rate_hz=budget.USUAL_RATE_HZ if rate_hz is None else rate_hz,
+        cache=cache_path(),
+        recalibrate=recalibrate,
+        stop=threading.Event() if stop is None else stop,
+        tell=tell,
+    )
+
+
 def open_runtime(
     model: str | Path | Model,
     source: Source,
@@ -199,7 +243,6 @@ def open_runtime(
     every_scan: bool = False,
     every_tap: bool = False,
     follow_drift: bool = True,
-    most_taps: int = 1,
 ) -> Runtime:
     """What makes results of a source's scans; its defaults are those of `edge-sr`.
 
@@ -218,7 +261,6 @@ def open_runtime(
         every_scan: infer also where nothing has changed since the pattern before.
         every_tap: use also taps that are not expected to help.
         follow_drift: let the rest level follow what a free pad reads.
-        most_taps: taps to remember for a model that may take over.
 
     Raises:
         ModelError: no such model, one that cannot be used, or of another sensor.
@@ -240,7 +282,6 @@ def open_runtime(
         reuse=not every_scan,
         every_tap=every_tap,
         follow_drift=follow_drift,
-        most_taps=most_taps,
         unix_time_s=source.unix_time_s,
     )
 
@@ -297,52 +338,6 @@ def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.
         source=source.kind,
         origin=source.origin,
         stop=stop,
-    )
-
-
-def open_ladder(
-    model: str | Path,
-    budget_us: float,
-    *,
-    rate_hz: float | None = None,
-    recalibrate: bool = False,
-    stop: threading.Event | None = None,
-    tell: Callable[[str], object] = lambda line: None,
-) -> "Ladder | None":
-    """Models that take turns, so that a pattern is made within a budget: `edge-sr --budget-us`.
-
-    Run times are measured here and kept for later starts. Make the runtime of `ladder.model` with `ladder.most_taps`,
-    and give every result to `ladder.steps(runtime)`.
-
-    Args:
-        model: the best that may be used: a file, or the name of a bundled one.
-        budget_us: longest run time of a pattern, in [us].
-        rate_hz: of the sensor, in [Hz]; 100 unless given.
-        recalibrate: measure anew what is kept.
-        stop: gives up early.
-        tell: hears, a line each, what is done, what is wrong and what was chosen.
-
-    Returns:
-        The ladder, or None if it was stopped.
-
-    Raises:
-        ModelError: the model cannot be used, or does not tell its error.
-        UsageError: a budget or a rate that cannot be.
-    """
-    check_positive("budget_us", budget_us)
-    if rate_hz is not None:
-        check_positive("rate_hz", rate_hz)
-    from edge.budgeting import model_steps as ladder
-    from edge.budgeting.run_time_cache import cache_path
-
-    return ladder.open_ladder(
-        find_model(model),
-        budget_us,
-        rate_hz=ladder.USUAL_RATE_HZ if rate_hz is None else rate_hz,
-        cache=cache_path(),
-        recalibrate=recalibrate,
-        stop=threading.Event() if stop is None else stop,
-        tell=tell,
     )
 
 

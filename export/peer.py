@@ -17,8 +17,8 @@ import torch
 from edge.bench.contenders import WEIGHTS_KEY
 from edge.inference.onnx_session import load_session
 from export.errors import ExportError
-from export.graph import to_model
-from export.rounding import folded
+from export.graphs.graph import to_model
+from export.integers.rounding import folded
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.in_place import check_writable, write_in_place
 from train.networks.cost import macs, parameters_count

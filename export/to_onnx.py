@@ -21,12 +21,12 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
-from export.fine_tune import FineTuning, quantised_well
-from export.graph import known_width, outputs, to_model
-from export.int8 import calibration_batch, convolutions, quantised
-from export.parity import check_parity
-from export.rounding import folded
-from export.writing import Writer
+from export.graphs.graph import known_width, outputs, to_model
+from export.graphs.parity import check_parity
+from export.graphs.writing import Writer
+from export.integers.fine_tune import FineTuning, quantised_well
+from export.integers.int8 import calibration_batch, convolutions, quantised
+from export.integers.rounding import folded
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.dataset import Sequences
@@ -40,7 +40,7 @@ from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_calibration import half_width_mm
 from train.networks.blocks import PatternNet
-from train.physics.pads import input_scale
+from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG
 
 OUTPUT_UNIT: Final = "mm"

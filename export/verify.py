@@ -28,8 +28,8 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
-from export.graph import outputs
-from export.parity import (
+from export.graphs.graph import outputs
+from export.graphs.parity import (
     EXTREME_TOLERANCE,
     LEVELS,
     TOLERANCE,
@@ -39,14 +39,15 @@ from export.parity import (
     extreme_windows,
     read_windows,
 )
-from export.recordings import recorded_windows
-from export.reference import contract_in, in_float, network_of, origin_of
+from export.graphs.reference import contract_in, in_float, network_of, origin_of
 from export.to_onnx import MOST_LOSS_DB
+from train.data.real_grips import recorded_sets
 from train.errors import TrainError
 from train.learning.checkpoint import load_network
 from train.networks.blocks import PatternNet
 
 _TORCH_BATCH: Final = 128
+_SCANS_APART: Final = 20
 INT8_READ: Final = 0.25
 """Largest relative difference of integers from their network on readings, in any pixel; measured: .10 on the test set,
 .17 on recordings."""
@@ -132,6 +133,23 @@ def verify(
             given = run(windows)
             yield _judge(path.stem, level, name, contract, expected[name], given, truth if name == "test set" else None)
         on_pass()
+
+
+def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
+    """Return windows (n, 3K, rows, cols) of real recordings, in network units: no truth is known of them.
+
+    They are scans under load, with others of their trial as the taps before.
+
+    Raises:
+        DatasetError: no such folder or no recordings in it, or one cannot be read.
+    """
+    windows = []
+    for scans in recorded_sets(folder):
+        newest = np.arange(0, len(scans.counts), _SCANS_APART)
+        earlier = (newest[:, None] + np.arange(contract.taps) * _SCANS_APART) % len(scans.counts)
+        windows.append(contract.scale_window(scans.counts[earlier].astype(np.float32)))
+    joined = np.concatenate(windows)
+    return joined.reshape(len(joined), *contract.window_shape[1:])
 
 
 def _judge(

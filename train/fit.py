@@ -27,7 +27,7 @@ from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
-from train.physics.pads import KNOWN
+from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
 
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}

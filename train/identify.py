@@ -27,7 +27,7 @@ from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
 from train.learning.contact_mixture import ContactMixture, fit_mixture, load_mixture, normalise
 from train.learning.gain_estimate import Estimate, estimate
-from train.physics.pads import RANGES, input_scale
+from train.physics.pad_draws import RANGES, input_scale
 
 _APART: Final = 0.1
 """Least difference of two contacts that count as two, over the RMS of their z: five times what noise and drift make."""

@@ -1,1 +1,1 @@
-"""The model that fits into a budget of run time, and steps between models while running."""
+"""Choice of the model that fits into a budget of run time."""

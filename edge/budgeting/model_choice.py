@@ -1,4 +1,4 @@
-"""Which model a budget of run time buys, and the ladder of models to step on when it stops fitting."""
+"""Choice of the model of least error whose run time fits a budget."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A model that may run, and what it costs on this machine.
+    """Model that may run, and its cost on this machine.
 
     Attributes:
         name: of the model.
@@ -26,36 +26,21 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What a budget buys.
+    """Chosen model, with the reason.
 
     Attributes:
-        ladder: fastest first; every rung has less error than those below.
-        rung: index of the chosen one.
-        fits: False where none fits, and the fastest was taken.
-        why: in one line.
+        name: of the model.
+        fits: False where no model fits, and the fastest was taken.
+        why: the reason in one line.
     """
 
-    ladder: tuple[Candidate, ...]
-    rung: int
+    name: str
     fits: bool
     why: str
 
 
-def ladder_of(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """Candidates that none is both faster and no worse than, fastest first.
-
-    The order is that of medians: one hiccup of a shared host in a short calibration makes a 99th percentile, and must
-    not take a rung away.
-    """
-    rungs: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda candidate: (candidate.p50_us, -candidate.psnr_db)):
-        if not rungs or candidate.psnr_db > rungs[-1].psnr_db:
-            rungs.append(candidate)
-    return tuple(rungs)
-
-
 def choose(candidates: Iterable[Candidate], budget_us: float) -> Choice:
-    """The candidate of least error whose 99th percentile is within the budget, else the fastest.
+    """Choose the candidate of least error whose 99th percentile is within the budget, else the fastest by its median.
 
     Args:
         candidates: at least one.
@@ -65,15 +50,20 @@ def choose(candidates: Iterable[Candidate], budget_us: float) -> Choice:
         ValueError: no candidates.
     """
     candidates = tuple(candidates)
-    ladder = ladder_of(candidates)
-    if not ladder:
+    if not candidates:
         raise ValueError("no candidates, expected at least one")
-    fitting = [rung for rung, candidate in enumerate(ladder) if candidate.p99_us <= budget_us]
-    rung = fitting[-1] if fitting else 0
+    best = max(candidates, key=_merit)
+    fitting = [candidate for candidate in candidates if candidate.p99_us <= budget_us]
+    # By the median: one hiccup of a shared host in a short calibration makes a 99th percentile.
+    chosen = max(fitting, key=_merit) if fitting else min(candidates, key=lambda one: (one.p50_us, -one.psnr_db))
     if not fitting:
-        why = f"no model fits, {ladder[0]} is the fastest of {len(candidates)}: patterns will be late"
-    elif rung == len(ladder) - 1:
-        why = f"{ladder[rung]} fits, the least error of {len(candidates)}"
+        why = f"no model fits, {chosen} is the fastest of {len(candidates)}: patterns will be late"
+    elif chosen.psnr_db == best.psnr_db:
+        why = f"{chosen} fits, the least error of {len(candidates)}"
     else:
-        why = f"{ladder[rung]} is the least error that fits; {ladder[rung + 1]} does not"
-    return Choice(ladder, rung, bool(fitting), f"budget {budget_us:g} us: {why}")
+        why = f"{chosen} is the least error that fits; {best} does not"
+    return Choice(chosen.name, bool(fitting), f"budget {budget_us:g} us: {why}")
+
+
+def _merit(candidate: Candidate) -> tuple[float, float]:
+    return candidate.psnr_db, -candidate.p50_us

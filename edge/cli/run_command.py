@@ -26,10 +26,10 @@ from edge.api import (
     Source,
     Statistics,
     UsageError,
+    choose_model,
     demo_recording,
     load_baselines,
     load_model,
-    open_ladder,
     open_runtime,
     open_sink,
     pump,
@@ -66,9 +66,10 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
         loops = options.source == [DEMO_LOOP]
         demo = loops or options.source == ["demo"]
         name = (DEMO_MODEL if demo else DEFAULT_MODEL) if options.model is None else options.model
-        ladder = None
-        if options.budget_us is not None:
-            ladder = open_ladder(
+        if options.budget_us is None:
+            model = None if stop.is_set() else load_model(name, stop=stop)
+        else:
+            model = choose_model(
                 name,
                 options.budget_us,
                 rate_hz=options.rate_hz,
@@ -76,9 +77,8 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 stop=stop,
                 tell=lambda line: print(line, file=sys.stderr),
             )
-        if stop.is_set():
+        if model is None:
             return
-        model = load_model(name, stop=stop) if ladder is None else ladder.model
         scores = sys.stderr if stdout_taken else sys.stdout
         score = None
         statistics = Statistics() if statistics is None else statistics
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             contextlib.ExitStack() as closing,
         ):
             hint = _silence_hint(options.source)
-            messages = MessageSink(said=None if ladder is None else ladder.choice.why, hint=hint)
+            messages = MessageSink(hint=hint)
             opener = partial(open_sink, contract=model.contract, source=source, stop=stop)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say)
@@ -110,11 +110,8 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 # The demo is there to show what every scan takes, and what every tap gives.
                 every_scan=options.every_scan or score is not None,
                 every_tap=options.every_tap or score is not None,
-                most_taps=1 if ladder is None else ladder.most_taps,
             )
             sinks: list[Sink] = [] if score is None else [score]
-            if ladder is not None:
-                sinks.append(ladder.steps(runtime))
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)

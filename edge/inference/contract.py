@@ -180,7 +180,7 @@ class Contract:
                 raise ModelError(f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}")
 
     def check_stands_in(self, other: "Contract") -> None:
-        """Refuse to take over from a model whose patterns mean something else.
+        """Refuse to be chosen instead of a model whose patterns mean something else.
 
         Raises:
             ModelError: a key differs; it is named.
@@ -189,7 +189,7 @@ class Contract:
         keys["interval_factor"] = (self.interval_factor is not None, other.interval_factor is not None)
         for key, (got, expected) in keys.items():
             if got != expected:
-                raise ModelError(f"contract key '{key}' is {got!r}, that of the model before {expected!r}")
+                raise ModelError(f"contract key '{key}' is {got!r}, that of the model asked for {expected!r}")
 
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None

@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.errors import ModelError, WindowError
-from edge.inference.contract import MOST, Contract
+from edge.errors import WindowError
+from edge.inference.contract import Contract
 from edge.inference.expected_error import expect
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator
@@ -18,7 +18,7 @@ from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
 from edge.perception.wrench import wrench_of
 from edge.perception.zero_on_demand import REFUSED
-from edge.validation import check_baselines, check_pads, check_positive, check_whole
+from edge.validation import check_baselines, check_pads, check_positive
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.mounting import Mounting
@@ -80,7 +80,6 @@ class Runtime:
         reuse: give the pattern before where nothing has changed beyond noise.
         every_tap: use all taps there are, also those that are not expected to help.
         follow_drift: let the rest level follow what a free pad reads.
-        most_taps: taps to remember for a model that may take over; the model's own if it takes more.
         clock_ns: measures run time.
         unix_time_s: dates baselines that are taken, and tells how old a stored one is when its sensor is first heard;
             ages go on by scan time.
@@ -108,7 +107,6 @@ class Runtime:
         reuse: bool = True,
         every_tap: bool = False,
         follow_drift: bool = True,
-        most_taps: int = 1,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
@@ -120,9 +118,7 @@ class Runtime:
         elif counts_per_newton is not None:
             check_positive("counts_per_newton", counts_per_newton)
         check_pads(pad)
-        check_whole("most_taps", most_taps, 1, MOST["taps"])
         self._model = model
-        self._most_taps = max(most_taps, model.contract.taps)
         self._event: str | None = None
         self._source: SourceKind = source
         self._estimator = estimator
@@ -180,20 +176,6 @@ class Runtime:
 
     def _tell(self, event: str) -> None:
         self._event = event if self._event is None else f"{self._event}; {event}"
-
-    def change_model(self, model: Model, why: str) -> None:
-        """Let another model take over from the next scan on, whose result tells why; taps and zeroing stay.
-
-        Raises:
-            ModelError: its patterns are not of the same meaning and shape, or it takes more taps than are remembered.
-        """
-        model.contract.check_stands_in(self._model.contract)
-        if model.contract.taps > self._most_taps:
-            raise ModelError(f"contract key 'taps' is {model.contract.taps}, but {self._most_taps} are remembered")
-        self._model = model
-        for sensor in self._sensors.values():
-            sensor.take_pad(model.contract)
-        self._tell(why)
 
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan; see `push_together`."""
@@ -375,7 +357,7 @@ class Runtime:
 
     def _new_tracker(self) -> TapTracker:
         grid_shape = (self._geometry.rows, self._geometry.cols)
-        return TapTracker(self._most_taps, *self._thresholds, grid_shape=grid_shape)
+        return TapTracker(self._model.contract.taps, *self._thresholds, grid_shape=grid_shape)
 
 
 def _age_note(scan: Scan) -> str | None:

@@ -63,7 +63,6 @@ class Statistics:
         latency_us: histogram of the time from scan to pattern.
         commands_refused: lines on stdin, and messages of viewers, that were no command.
         model_patterns: of the patterns, how many each model made.
-        model_changes: how often the model was another than before.
         sink_trouble: what is wrong with the sinks at last; None while all is well.
     """
 
@@ -85,10 +84,7 @@ class Statistics:
         self.latency_us = Histogram()
         self.commands_refused = 0
         self.model_patterns: dict[str, int] = {}
-        self.model_changes = 0
         self.sink_trouble: str | None = None
-        self._model: str | None = None
-        self._last_event: str | None = None
         self._spans: dict[str, _Span] = {}
         self._zeroed: dict[str, Result] = {}
         self._farthest: dict[str, Result] = {}
@@ -108,10 +104,6 @@ class Statistics:
         if result.run_time_us is not None:
             self.run_time_us.add(result.run_time_us)
             self.model_patterns[result.model] = self.model_patterns.get(result.model, 0) + 1
-        if self._model not in (None, result.model):
-            self.model_changes += 1
-            self._last_event = result.event
-        self._model = result.model
         if result.latency_us is not None:
             self.latency_us.add(result.latency_us)
         if result.baseline is not None:
@@ -153,9 +145,6 @@ class Statistics:
             p50_us, p99_us = times.quantile(0.5), times.quantile(0.99)
             if p50_us is not None and p99_us is not None:
                 lines.append(f"{name}: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {times.max:.0f} us{more}")
-        if self.model_changes:
-            patterns = ", ".join(f"{name} {count}" for name, count in self.model_patterns.items())
-            lines.append(f"model changes: {self.model_changes} (patterns: {patterns}); at last {self._last_event}")
         lines += self._without_pattern()
         rates = [
             f"{rate_hz:.1f} Hz (sensor {name})"

@@ -21,7 +21,6 @@ class MessageSink(Sink):
         self,
         stream: TextIO | None = None,
         *,
-        said: str | None = None,
         hint: str = "",
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -29,24 +28,20 @@ class MessageSink(Sink):
 
         Args:
             stream: written to; stderr unless given.
-            said: what was said before the first result, which tells it once more, such as why it is this model.
             hint: what to do while no scan has come at all; it is said ever more seldom.
             clock_s: monotonic, in [s].
         """
         self._stream = sys.stderr if stream is None else stream
-        self._said = said
         self._hint = hint
         self._clock_s = clock_s
         self._begun_s = clock_s()
         self._patience_s = FIRST_HINT_S
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Say what happened before this scan, but for what was said already."""
-        event, said, self._said, self._hint = result.event, self._said, None, ""
-        if event is not None and said is not None:
-            event = f"{event}; ".removeprefix(f"{said}; ").removesuffix("; ")
-        if event:
-            self._say(event)
+        """Say what happened before this scan."""
+        self._hint = ""
+        if result.event:
+            self._say(result.event)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Say what happened."""

@@ -27,14 +27,13 @@ from websockets.protocol import State
 from edge.errors import SinkError
 from edge.view.access import SOCKET, Access
 from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
-from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
+from edge.view.frames import Frames, Run, hello, refused, state
 from edge.view.run_snapshot import Heard
 from edge.view.static_page import load_page
 from edge.view.viewer_commands import LONGEST_BYTES, Asked
 from edge.view.viewer_connection import Attended
 from firmware_bridge.links.base import SourceKind
 
-PERIOD_S: Final = 1 / MAX_FPS
 STATE_S: Final = 1.0
 TIDY_S: Final = 10.0
 TIDY_CONNECTIONS: Final = 64

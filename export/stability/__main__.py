@@ -17,7 +17,7 @@ from export.errors import ExportError
 from export.stability import pareto
 from export.stability.case import Case
 from train.errors import TrainError
-from train.experiments.support.report import Report, Row
+from train.report import Report, Row
 
 PARTS: Final = (
     *("layer_contact", "curved_contact", "finite_elements", "magnets", "psf"),

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from train.experiments.support.report import Row
+from train.report import Row
 
 _T = TypeVar("_T")
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from export.stability.case import Case, refused, timed
 from firmware_bridge.geometry import USPA44
-from train.experiments.support.referee import REFEREE_POISSON, Mesh
 from train.physics.elastic_layer import Layer
+from train.physics.fem_cache import REFEREE_POISSON, Mesh
 from train.physics.fem_reference import FemPad, FemPresses, NoEquilibriumError
 
 PART: Final = "FEM referee"

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from edge.inference.bundled import bundled_models
 from edge.inference.contract import DEVIATION_NAME, Contract
 from export.errors import ParityError
-from export.graph import outputs
-from export.parity import Difference, GraphRun, differences, extreme_windows
-from export.reference import contract_in, in_float, network_of
+from export.graphs.graph import outputs
+from export.graphs.parity import Difference, GraphRun, differences, extreme_windows
+from export.graphs.reference import contract_in, in_float, network_of
 from export.stability.case import Case, timed
 from train.networks.blocks import PatternNet
 

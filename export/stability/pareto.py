@@ -17,12 +17,12 @@ from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
 from export.stability.case import timed
 from firmware_bridge.geometry import USPA44
-from train.experiments.support.report import Row
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.resample import resample
 from train.physics.taxel_response import Skin
 from train.physics.tpsf import tpsf_pattern
+from train.report import Row
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, footprints
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 

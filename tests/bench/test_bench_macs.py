@@ -12,9 +12,9 @@ from edge.bench.peak import peak_gmac_s, product_model
 from edge.errors import ModelError
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
+from export.graphs.reference import network_of
 from export.peer import export_peer
 from export.peer import main as peer_main
-from export.reference import network_of
 from train.networks.cost import macs
 from train.networks.registry import build
 from train.networks.symmetric import write_out

@@ -16,7 +16,7 @@ from train.errors import TrainError
 from train.experiments.sensor import families, pads, wrench
 from train.experiments.support import baselines, kriging, nominal, oracle, scores, shipped
 from train.physics.gripped import GrippedPad
-from train.physics.pads import NOMINAL
+from train.physics.pad_draws import NOMINAL
 from train.physics.sensor_noise import Nuisances
 
 

@@ -3,8 +3,8 @@ import pytest
 
 pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
 
-from train.experiments.support import referee
-from train.experiments.support.referee import Mesh, press_or_recall
+from train.physics import fem_cache as referee
+from train.physics.fem_cache import Mesh, press_or_recall
 
 STEPS_MM = np.array([0.1, 0.2])
 COARSE = Mesh(2, 1)

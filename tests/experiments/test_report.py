@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from train.experiments.support.report import Report, bootstrap_interval, with_interval
+from train.report import Report, bootstrap_interval, with_interval
 
 
 def test_frames_of_one_tap_are_not_independent():

@@ -15,8 +15,8 @@ from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, Contract
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
 from export.errors import ExportError, ParityError
-from export.graph import to_model
-from export.parity import GraphRun, differences, read_windows
+from export.graphs.graph import to_model
+from export.graphs.parity import GraphRun, differences, read_windows
 from export.to_onnx import export, main
 from firmware_bridge.geometry import USPA44
 from train.errors import CheckpointError
@@ -135,7 +135,7 @@ def test_a_model_is_replaced_by_one_that_loads_and_stays_as_bak(folder, frozen, 
     path.write_bytes(b"the one before")
     refused = ModelError("it does not load")
     with monkeypatch.context() as unloadable, pytest.raises(ModelError, match="it does not load"):
-        unloadable.setattr("export.writing.load_session", lambda draft: (_ for _ in ()).throw(refused))
+        unloadable.setattr("export.graphs.writing.load_session", lambda draft: (_ for _ in ()).throw(refused))
         export(folder / "sure.pt", tmp_path, frozen)
     assert path.read_bytes() == b"the one before" and [one.name for one in tmp_path.iterdir()] == ["sure.onnx"]
     export(folder / "sure.pt", tmp_path, frozen)

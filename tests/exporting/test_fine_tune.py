@@ -11,11 +11,11 @@ from test_export import frozen_at
 from torch import nn
 
 from export.errors import ExportError
-from export.fine_tune import FineTuning, fine_tuned, graph_psnr_db, quantised_well, recalibrated
-from export.graph import outputs, to_model
-from export.int8 import integer_nodes, quantised
-from export.parity import GraphRun
-from export.rounding import folded, integer_convolutions, rounded
+from export.graphs.graph import outputs, to_model
+from export.graphs.parity import GraphRun
+from export.integers.fine_tune import FineTuning, fine_tuned, graph_psnr_db, quantised_well, recalibrated
+from export.integers.int8 import integer_nodes, quantised
+from export.integers.rounding import folded, integer_convolutions, rounded
 from firmware_bridge.geometry import USPA44
 from train.data.batch import Batch
 from train.data.batches import network_input

@@ -11,10 +11,10 @@ from test_export import at_frames, frozen_at, save_untrained
 from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
-from export.graph import to_model
-from export.int8 import calibration_batch, convolutions, integer_nodes, quantised
-from export.parity import GraphRun
-from export.rounding import folded
+from export.graphs.graph import to_model
+from export.graphs.parity import GraphRun
+from export.integers.int8 import calibration_batch, convolutions, integer_nodes, quantised
+from export.integers.rounding import folded
 from export.to_onnx import export
 from firmware_bridge.geometry import USPA44
 from train.data.batch import Batch

@@ -18,10 +18,10 @@ from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
 from export import verify as verify_module
 from export.errors import ExportError, ParityError
-from export.graph import outputs
-from export.int8 import convolutions
-from export.parity import FULL_TRACTION_KPA, LEVELS, GraphRun, differences, extreme_windows, read_windows
-from export.reference import network_of
+from export.graphs.graph import outputs
+from export.graphs.parity import FULL_TRACTION_KPA, LEVELS, GraphRun, differences, extreme_windows, read_windows
+from export.graphs.reference import network_of
+from export.integers.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 

@@ -25,7 +25,6 @@ def test_what_is_begun_with_is_kept_too(name):
 
 
 LOADERS = {"numpy.load": ("allow_pickle", False), "torch.load": ("weights_only", True)}
-MAY_UNPICKLE = {"train/data/plain_pickle.py"}
 
 
 def test_nothing_is_loaded_that_could_run():
@@ -41,7 +40,5 @@ def test_nothing_is_loaded_that_could_run():
                 told = {word.arg: ast.unparse(word.value) for word in node.keywords}
                 assert told.get(option) == str(value), f"{name}:{node.lineno}: {key} without {option}={value}"
             imported = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            assert name in MAY_UNPICKLE or not {"pickle", "marshal", "shelve", "dill", "joblib.load"} & set(imported), (
-                name
-            )
+            assert not {"pickle", "marshal", "shelve", "dill", "joblib.load"} & set(imported), name
     assert calls >= 4

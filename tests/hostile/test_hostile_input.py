@@ -28,7 +28,6 @@ from firmware_bridge.recording import formats as recording
 from firmware_bridge.recording.formats import CSV_HEADER, load_recording
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
-from train.data.authors_files import load_authors_taps
 from train.data.dataset import load_sequences
 from train.errors import CheckpointError, DatasetError
 from train.learning.checkpoint import load_network
@@ -96,7 +95,7 @@ class TestPickles:
                 read(path)
             assert one_line(raised) and not harm.exists()
 
-    def test_nor_do_checkpoints_and_the_authors_files(self, tmp_path):
+    def test_nor_do_checkpoints(self, tmp_path):
         harm = tmp_path / "harm"
         path = tmp_path / "stsr.pt"
         path.write_bytes(pickle.dumps(Harm(harm)))
@@ -105,27 +104,6 @@ class TestPickles:
         with pytest.raises(CheckpointError) as raised:
             load_network(path)
         assert one_line(raised) and not harm.exists()
-        with (tmp_path / "C.npy").open("wb") as file:
-            np.save(file, np.array([Harm(harm)], dtype=object), allow_pickle=True)
-        with pytest.raises(DatasetError, match="no array needs") as raised:
-            load_authors_taps(tmp_path / "C.npy")
-        assert one_line(raised) and not harm.exists()
-
-    @pytest.mark.parametrize(
-        ("body", "complaint"),
-        [
-            (b"r\xff\xff\xff\x7f", "kept in place 2147483647"),  # the memo would take 32 GB
-            (b"\x96" + (1 << 40).to_bytes(8, "little"), "expected 1099511627776 bytes"),
-            (b"P1\n", "PERSID, which no array needs"),
-            (b"\x82\x01", "EXT1, which no array needs"),
-        ],
-    )
-    def test_a_pickle_that_claims_much_is_refused_before_it_is_run(self, tmp_path, bounded_memory, body, complaint):
-        file = io.BytesIO()
-        np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": (1,)})
-        (tmp_path / "C.npy").write_bytes(file.getvalue() + b"\x80\x04]" + body + b".")
-        with pytest.raises(DatasetError, match=complaint):
-            load_authors_taps(tmp_path / "C.npy")
 
 
 class TestArchives:

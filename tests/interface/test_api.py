@@ -176,8 +176,12 @@ def stream(source, model=None, **settings):
         (lambda: api.examine("demo", baselines={"4": 1}), UsageError, "baseline of sensor 4 is a int, expected"),
         (lambda: api.examine("demo", "demo"), UsageError, "^2 sources, expected one: examine them one after"),
         (lambda: load_model("stsr", threads=-1), UsageError, "threads is -1, expected a whole number from 1"),
-        (lambda: api.open_ladder("stsr", NAN), UsageError, "budget_us is nan, expected a positive number"),
-        (lambda: api.open_ladder("stsr", 9e3, rate_hz="50"), UsageError, "rate_hz is '50', expected a positive number"),
+        (lambda: api.choose_model("stsr", NAN), UsageError, "budget_us is nan, expected a positive number"),
+        (
+            lambda: api.choose_model("stsr", 9e3, rate_hz="50"),
+            UsageError,
+            "rate_hz is '50', expected a positive number",
+        ),
         (lambda: load_model("nothing"), ModelError, r"no model 'nothing': .*bundled: .*stsr-int8\.onnx"),
     ],
 )
@@ -195,8 +199,6 @@ def test_what_cannot_be_is_one_line(ask, error, words):
         (lambda source: open_runtime(FakeModel(), source, counts_per_newton={"6": NAN}), "newton of sensor 6 is nan"),
         (lambda source: open_runtime(FakeModel(), source, baselines={"4": 1}), "baseline of sensor 4 is a int"),
         (lambda source: open_runtime(FakeModel(), source, baselines=[BASELINE]), "baselines are a list, expected"),
-        (lambda source: open_runtime(FakeModel(), source, most_taps=0), "most_taps is 0, expected .* from 1 to 64$"),
-        (lambda source: open_runtime(FakeModel(), source, most_taps=99), "most_taps is 99"),
         (lambda source: stream(source, duration_s=-1), "duration_s is -1, expected a positive number"),
         (lambda source: take_baselines(source, scans=0), "scans is 0, expected a whole number from 100"),
         (lambda source: take_baselines(source, skip=-1), "skip is -1, expected a whole number from 0"),
@@ -358,13 +360,8 @@ def test_devices_are_listed(monkeypatch):
     assert api.devices() == (["found"], ["note"])
 
 
-def test_models_that_take_turns(files, tmp_path, monkeypatch):
+def test_a_model_within_a_budget(files, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    said = []
-    ladder = api.open_ladder(files / "tiny.onnx", 1e6, rate_hz=1000, tell=said.append)
-    with open_source(f"replay:{files}/taps.npz", rate_hz=1000) as source:
-        runtime = open_runtime(ladder.model, source, most_taps=ladder.most_taps)
-        steps, results = ladder.steps(runtime), Stream(source, runtime)
-        for result in results:
-            steps.write(result, results.counters)
-            assert result.event == (said[-1] if result.scan.number == 0 else None)
+    lines = []
+    model = api.choose_model(files / "tiny.onnx", 1e6, rate_hz=1000, tell=lines.append)
+    assert model is not None and model.name == "tiny" and lines[-1].startswith("budget 1e+06 us: tiny (")

@@ -392,56 +392,6 @@ def test_taxels_that_are_silent_are_named_beside_one_at_the_end_of_its_range():
     assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")
 
 
-def fake(name, **changes):
-    model = FakeModel(make_contract(**changes))
-    model.name = name
-    return model
-
-
-class TestChangeModel:
-    def test_it_takes_over_between_scans_with_the_taps_there_were(self):
-        four, one = fake("four"), fake("one", taps=1)
-        runtime = make_runtime(one, most_taps=4)
-        for number, press in enumerate([2000, 2500, 0, 3000]):
-            result = runtime.push(make_scan(number, press_counts=press))
-        assert (result.model, result.taps_used, result.event) == ("one", 1, None)
-        assert [window.shape for window in one.windows] == [(1, 3, 4, 4)] * 3
-        runtime.change_model(four, "for a reason")
-        result = runtime.push(make_scan(4, press_counts=3500))
-        assert (result.model, result.taps_used, result.event) == ("four", 2, "for a reason")
-        assert four.windows[-1][:, 2, 1, 1].tolist() == [3.5, 2.5, 0.0, 0.0]
-        runtime.change_model(one, "for another")
-        result = runtime.push(make_scan(5, press_counts=4000))
-        assert (result.model, result.taps_used, result.event) == ("one", 1, "for another")
-        assert one.windows[-1][:, 2, 1, 1].tolist() == [4.0]
-        assert runtime.push(make_scan(6)).event is None
-
-    def test_without_contact_it_is_told_too(self):
-        runtime = make_runtime()
-        runtime.change_model(fake("other"), "for a reason")
-        assert runtime.push(make_scan()).event == "for a reason"
-
-    @pytest.mark.parametrize(
-        ("key", "value"),
-        [
-            ("scale", 5), ("angle_step_deg", 4.0), ("output_unit", "N"), ("output_full_scale", 0.5),
-            ("sensor", "other"), ("rows", 5), ("cols", 5), ("pitch_mm", 5.0), ("interval_factor", 1.6),
-        ],
-    )  # fmt: skip
-    def test_patterns_of_another_meaning_are_refused(self, key, value):
-        runtime = make_runtime()
-        with pytest.raises(ModelError, match=rf"contract key '{key}' is .*, that of the model before "):
-            runtime.change_model(fake("other", **{key: value}), "for a reason")
-        result = runtime.push(make_scan())
-        assert (result.model, result.event) == ("fake", None)
-
-    def test_more_taps_than_are_remembered_are_refused(self):
-        runtime = make_runtime(fake("one", taps=1), most_taps=2)
-        runtime.change_model(fake("two", taps=2), "for a reason")
-        with pytest.raises(ModelError, match=r"'taps' is 3, but 2 are remembered"):
-            runtime.change_model(fake("three", taps=3), "for a reason")
-
-
 def test_two_scans_of_one_sensor_in_one_call_get_patterns_of_their_own():
     model = FakeModel()
     runtime = Runtime(model, source="device", baselines={"4": BASELINE})

@@ -137,17 +137,3 @@ def test_summary_of_nothing():
         "x: 0 scans, 0 patterns (0 reused), 0 dropped, 0 overrun, 0 missed",
         "torn: 0 on the wire, 0 renewed in part; 0 repeated",
     ]
-
-
-def test_a_change_of_model_is_counted_and_told():
-    statistics = Statistics()
-    for number, (model, event) in enumerate(
-        [("a", "chosen"), ("a", None), ("b", "stepped down"), ("b", None), ("a", "stepped up"), ("a", None)]
-    ):
-        statistics.add(Result(make_scan(number), "device", model, "contact", run_time_us=9.0, event=event))
-    assert statistics.model_changes == 2 and statistics.model_patterns == {"a": 4, "b": 2}
-    lines = statistics.summary(source="x").splitlines()
-    assert "model changes: 2 (patterns: a 4, b 2); at last stepped up" in lines
-    statistics = Statistics()
-    statistics.add(Result(make_scan(), "device", "a", "contact", run_time_us=9.0, event="chosen"))
-    assert "model changes" not in statistics.summary(source="x")

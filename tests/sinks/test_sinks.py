@@ -58,27 +58,13 @@ def make_sure_results(count=6, **settings):
     return make_results(count, Runtime(FakeModel(make_contract(interval_factor=1.6)), **settings))
 
 
-class TestModelChange:
-    def results(self, name):
-        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
-        runtime.push(make_scan(0))
-        other = FakeModel()
-        other.name = name
-        runtime.change_model(other, "for a reason")
-        return [runtime.push(make_scan(number)) for number in (1, 2)]
-
-    def test_the_first_record_of_a_model_tells_why(self):
-        records = [json.loads(record_line(result, RUN)) for result in self.results("other")]
-        assert [(record["model"], record["event"]) for record in records] == [
-            ("other", "for a reason"),
-            ("other", None),
-        ]
-
-    def test_an_npz_tells_the_model_of_each_row_however_long_its_name(self, tmp_path):
-        sink = NpzSink(tmp_path / "out.npz", *SHAPES)
-        sink.write(self.results("n" * 100)[0], RUN)
-        sink.close()
-        assert np.load(tmp_path / "out.npz")["model"].tolist() == ["n" * npz.MODEL_CHARACTERS]
+def test_an_npz_keeps_the_model_of_each_row_however_long_its_name(tmp_path):
+    model = FakeModel()
+    model.name = "n" * 100
+    sink = NpzSink(tmp_path / "out.npz", *SHAPES)
+    sink.write(Runtime(model, source="device", baselines={"4": BASELINE}).push(make_scan(0)), RUN)
+    sink.close()
+    assert np.load(tmp_path / "out.npz")["model"].tolist() == ["n" * npz.MODEL_CHARACTERS]
 
 
 class TestJsonLines:
@@ -437,21 +423,12 @@ def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
     assert stream.getvalue().splitlines() == hints
 
 
-@pytest.mark.parametrize(
-    ("events", "lines"),
-    [
-        (["zeroing refused: no sensor was heard yet"], ["zeroing refused: no sensor was heard yet"]),
-        (["slow, so small"], []),
-        (["slow, so small; zeroing refused"], ["zeroing refused"]),
-        ([None, "slow, so small"], ["slow, so small"]),
-    ],
-)
-def test_of_the_first_event_only_what_was_said_before_is_left_out(events, lines):
+def test_the_event_of_a_result_is_a_line():
     stream = io.StringIO()
-    messages = MessageSink(stream, said="slow, so small")
-    for number, event in enumerate(events):
+    messages = MessageSink(stream)
+    for number, event in enumerate([None, "zeroing refused"]):
         messages.write(Result(make_scan(number), "device", "tiny", "idle", event=event), {})
-    assert stream.getvalue().splitlines() == [f"edge-sr: {line}" for line in lines]
+    assert stream.getvalue() == "edge-sr: zeroing refused\n"
 
 
 class TestNpz:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from train.data.presses import PressSet
-from train.physics.pads import INPUTS
+from train.physics.pad_draws import INPUTS
 
 
 def make_press_set(count=12, taps=2, seed=0, per_pad=4) -> PressSet:

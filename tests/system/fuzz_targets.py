@@ -7,7 +7,6 @@ them guided by coverage, tests/hostile/test_fuzz.py for some seconds without.
 import io
 import json
 import os
-import pickle
 import re
 import struct
 import tempfile
@@ -50,7 +49,6 @@ from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
-from train.data.authors_files import load_authors_taps
 from train.data.dataset import Sequences, load_sequences
 from train.errors import DatasetError
 from train.physics.simulated_sensor import FRAMES
@@ -574,25 +572,6 @@ def sequences_seeds() -> list[bytes]:
     return [(FOLDER / "taps.npz").read_bytes()]
 
 
-def authors(data: bytes) -> None:
-    """Pickles of the authors' files, of which nothing is run."""
-    taps = refused(lambda: load_authors_taps(as_file("C.npy", data)), DatasetError)
-    if taps is not None:
-        assert taps.counts.shape[1:] == (16, 3, 4, 4) and np.isfinite(taps.counts).all()
-
-
-def authors_seeds() -> list[bytes]:
-    record = {"sample_idx": 3, "depth": np.ones((2, 2)), "LRs": np.ones((2, 48))}
-    made = []
-    for protocol in (2, 4):
-        file = io.BytesIO()
-        header = {"descr": "|O", "fortran_order": False, "shape": (1,)}
-        np.lib.format.write_array_header_1_0(file, header)
-        records = np.array([record], dtype=object)
-        made.append(file.getvalue() + pickle.dumps(records, protocol=protocol))
-    return made
-
-
 def bench(data: bytes) -> None:
     """An earlier bench, read and held against a new one."""
     told = refused(lambda: read_record(as_file("bench.json", data)), BenchError)
@@ -642,6 +621,5 @@ TARGETS = {
         Target("ONNX model", model, model_seeds, 8192, 10),
         Target("frozen set", frozen, frozen_seeds, 8192, 10),
         Target("sequences", sequences, sequences_seeds, 8192, 10),
-        Target("authors' files", authors, authors_seeds, 4096, 10),
     )
 }

@@ -11,7 +11,7 @@ from train.families.faces import SLOPE, flat
 from train.families.shape import NOWHERE_MM, Lie, log_uniform
 from train.physics.covers import BARE
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.physics.pads import NOMINAL
+from train.physics.pad_draws import NOMINAL
 
 STILL = (0.0, 0.0)
 """No error of where a tap lands."""

@@ -5,7 +5,7 @@ import torch
 from firmware_bridge.geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.free_sides import FreeSides
+from train.physics.side_correction import FreeSides
 from train.physics.taxel_response import Skin
 
 SIZE, CELL_MM = 42, 0.47

@@ -8,7 +8,7 @@ from train.data.frozen_presses import freeze_presses, load_frozen_presses, main
 from train.data.presses import PressSet
 from train.families.catalogue import SHARES
 from train.freeze import fit_classical, fit_taxels
-from train.physics.pads import INPUTS, KNOWN, input_scale
+from train.physics.pad_draws import INPUTS, KNOWN, input_scale
 from train.physics.sensor_noise import Nuisances
 
 WIDE_SHA256 = "edeb2202b59f15f51a49c3e5c96b8a1d752b877ffb50361257bf527b2cbedac2"

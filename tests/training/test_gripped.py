@@ -11,7 +11,7 @@ from train.families.shape import NOWHERE_MM
 from train.physics.covers import BARE, Cover
 from train.physics.elastic_layer import surface_compliance
 from train.physics.gripped import MOST_FORCE_N, SAMPLES, SCALE, TRACTION_SCALE, GrippedPad, PressError
-from train.physics.pads import NOMINAL
+from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
 from train.physics.simulated_sensor import FINE_SCALE, SimulatedSensor
 from train.surfaces.depth_image import Pose, Relief, footprints

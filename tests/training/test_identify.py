@@ -10,10 +10,10 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
-from train.experiments.sensor import identify as experiment
+from train.experiments.sensor import gains_from_contacts as experiment
 from train.learning.contact_mixture import CHANNELS, ContactMixture, Z, load_mixture
 from train.learning.gain_estimate import CONSTANT_SPREAD, estimate
-from train.physics.pads import INPUTS
+from train.physics.pad_draws import INPUTS
 
 FOLDER = recordings_folder()
 

@@ -8,7 +8,7 @@ import pytest
 from edge.inference.contract import Contract
 from firmware_bridge.scans.pad import PAD_RANGES
 from firmware_bridge.scans.pad import Pad as KnownPad
-from train.physics.pads import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
+from train.physics.pad_draws import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
 
 DRAWN = [draw_pad(np.random.default_rng([7, number])) for number in range(300)]
 

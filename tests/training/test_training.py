@@ -14,7 +14,7 @@ from train.learning.checkpoint import Training, best_contact_level, fit_network,
 from train.learning.interval_calibration import interval_coverage
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
-from train.physics.pads import KNOWN
+from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
 
 SMALL = {"channels": 16, "blocks": 1}

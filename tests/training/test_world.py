@@ -20,7 +20,7 @@ from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import MOST_FORCE_N
-from train.physics.pads import INPUTS, Pad, constants
+from train.physics.pad_draws import INPUTS, Pad, constants
 
 SMALL = World(count=14, taps=2, per_pad=5, seed=5)
 

@@ -18,7 +18,7 @@ from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
 from train.errors import TrainError
-from train.physics.pads import input_scale, known_numbers
+from train.physics.pad_draws import input_scale, known_numbers
 from train.physics.sensor_noise import NAMES, Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
@@ -48,7 +48,7 @@ class FrozenPresses:
         return windows / self.gains[:, None] if gains_known else windows
 
     def pads(self, *, known: bool) -> NDArray[np.float32]:
-        """The pads as a network takes them, (n, train.physics.pads.KNOWN): all of each with its gains, or nothing."""
+        """The pads as a network takes them, (n, `pad_draws.KNOWN`): all of each with its gains, or nothing."""
         flags = np.full(self.presses.constants.shape, known)
         return known_numbers(self.presses.constants, flags, flags[:, 0])
 

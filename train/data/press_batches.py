@@ -11,7 +11,7 @@ from train.data.batch import Batch
 from train.data.batches import network_input
 from train.data.presses import PressSet
 from train.errors import DatasetError
-from train.physics.pads import known_numbers
+from train.physics.pad_draws import known_numbers
 from train.physics.sensor_noise import Nuisances, read_windows
 
 _NOTHING: Final = 0.35

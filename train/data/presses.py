@@ -41,7 +41,7 @@ class PressSet:
     Attributes:
         family: (n,) names, see train.families.catalogue.
         pad: (n,), number of the pad within the set.
-        constants: (n, p) of the pads, over their spread, see train.physics.pads.
+        constants: (n, p) of the pads, over their spread, see train.physics.pad_draws.
         counts: (n, K, 3, rows, cols), zeroed, without nuisances.
         angle_deg: (n, K), turn of the pad.
         patterns: (n, H, W) in [mm].

@@ -13,7 +13,7 @@ from train.data.presses import VERSION, PressSet
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import GrippedPad
-from train.physics.pads import INPUTS, RANGES, Pad, constants, draw_pad
+from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
 from train.physics.sensor_noise import Nuisances
 from train.surfaces.named_surfaces import surface_mesh
 from train.surfaces.poses import MAX_TAPS

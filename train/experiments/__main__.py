@@ -46,11 +46,14 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Those in train.experiments.paper; the others are in train.experiments.sensor."""
+_FILES: Final = {"identify": "gains_from_contacts"}
+"""File names that differ from the experiment's: train.identify is the command of a user's own sensor."""
 
 
 def module_of(name: str) -> str:
     """Return the module of an experiment."""
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
+    file = _FILES.get(name, name.replace("-", "_"))
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{file}"
 
 
 def main(arguments: list[str] | None = None) -> None:

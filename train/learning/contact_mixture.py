@@ -1,7 +1,7 @@
 """What any pad may read in a contact: a mixture of Gaussians, each linear in the pad's constants.
 
 A contact's 48 readings over the root mean square of its z do not depend on its force. Within a component they are
-normal about a mean that is linear in the constants that networks take (train.physics.pads.INPUTS, over their spread).
+normal about a mean that is linear in the constants that networks take (`pad_draws.INPUTS`, over their spread).
 """
 
 from dataclasses import dataclass, fields
@@ -15,7 +15,7 @@ from firmware_bridge.geometry import AXES, USPA44
 from firmware_bridge.recording.npz_reader import read_npz
 from train.data.presses import PressSet
 from train.errors import DatasetError
-from train.physics.pads import INPUTS
+from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, read_windows
 
 CHANNELS: Final = len(AXES) * USPA44.taxel_count

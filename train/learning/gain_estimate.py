@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import AXES, USPA44
 from train.errors import DatasetError
 from train.learning.contact_mixture import CHANNELS, ContactMixture, normalise
-from train.physics.pads import INPUTS
+from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
 PLACE_SPREAD: Final = 0.08
@@ -49,7 +49,7 @@ class Estimate:
     Attributes:
         contacts: how many were strong enough to be used.
         log_gains: (channels,); the mean of each axis is 0.
-        constants: (p,) over their spread, in the order of train.physics.pads.INPUTS.
+        constants: (p,) over their spread, in the order of train.physics.pad_draws.INPUTS.
         deviations: (channels + p,), standard deviations of both.
     """
 

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from train.physics.elastic_layer import Layer, surface_compliance
-from train.physics.free_sides import FreeSides, SideGive
+from train.physics.side_correction import FreeSides, SideGive
 
 _MAX_STEPS: Final = 200
 _DIES_WITHIN: Final = 8

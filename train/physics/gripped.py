@@ -22,7 +22,7 @@ from train.physics.contact import ContactSolver
 from train.physics.covers import BARE, Cover
 from train.physics.curved_patterns import heights_pattern
 from train.physics.friction import FrictionSolver
-from train.physics.pads import Pad
+from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.physics.taxel_response import Skin

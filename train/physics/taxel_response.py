@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from firmware_bridge.geometry import SensorGeometry
 from train.physics.elastic_layer import Layer
-from train.physics.free_sides import FreeSides
 from train.physics.magnet_response import pressure_response, traction_response
 from train.physics.magnets import Magnet, MagnetArray
+from train.physics.side_correction import FreeSides
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
 IN_PLANE_SHARE: Final = 0.4

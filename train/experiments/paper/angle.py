@@ -7,10 +7,10 @@ import numpy as np
 
 from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
-from train.experiments.support.report import Report, Row, bootstrap_interval
 from train.experiments.support.trainings import at_angle, by_angle, compact, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
+from train.report import Report, Row, bootstrap_interval
 
 ANGLES_DEG: Final = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import AXES
-from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.trainings import compact, mixed, trained
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N
@@ -25,6 +24,7 @@ from train.learning.checkpoint import infer
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
+from train.report import Report, Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, as_poses, paper_targets, turned_back
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from train.experiments.support.referee import CENTRE, FINEST, SCALE, Mesh, press_or_recall, relief
-from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.curved_patterns import PLANES, heights_pattern
 from train.physics.elastic_layer import Layer
+from train.physics.fem_cache import CENTRE, FINEST, SCALE, Mesh, press_or_recall, relief
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.physics.tpsf import tpsf_pattern
+from train.report import Report, Row
 from train.surfaces.depth_image import depth_image
 
 SURFACES: Final = ("sphere:10", "cylinder:10")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from firmware_bridge.geometry import USPA44
-from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.physics.resample import resample
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, SimulatedSensor, Taps
+from train.report import Report, Row
 from train.surfaces.poses import random_targets
 
 SURFACES: Final = ("large circle", "small circle")

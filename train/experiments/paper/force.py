@@ -22,12 +22,12 @@ from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences, windows
 from train.data.generation_config import SEED
 from train.experiments.support.methods import Method, classical_methods, compact_methods
-from train.experiments.support.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.support.trainings import mixed
 from train.experiments.support.workbench import Figures, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.report import Report, Row, bootstrap_interval, with_interval
 
 EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
 _DRAWS: Final = 4

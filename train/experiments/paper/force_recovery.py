@@ -35,11 +35,11 @@ from train.experiments.support.course import (
     volume_mm3,
 )
 from train.experiments.support.methods import Method, compact_methods
-from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.trainings import mixed
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances
+from train.report import Report, Row, with_interval
 from train.surfaces.poses import TARGET_ANGLES_DEG
 
 _RATE_HZ: Final = 100.0

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
-from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.physics.tpsf import Kernel, spread, spread_by_fft
+from train.report import Report, Row
 
 _SCALE = 10
 LEAST_TIMES = 100

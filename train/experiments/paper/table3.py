@@ -12,10 +12,10 @@ from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences
 from train.experiments.support.methods import classical_methods
-from train.experiments.support.report import Report, Row, bootstrap_interval
 from train.experiments.support.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
 from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells, thinned
 from train.learning.checkpoint import infer
+from train.report import Report, Row, bootstrap_interval
 
 PAPER: Final[Mapping[str, tuple[float, float, float, float]]] = {
     "bilinear": (17.31, 0.5128, 18.10, 0.5663),

@@ -5,10 +5,10 @@ from typing import Final
 
 from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
-from train.experiments.support.report import Report, Row
 from train.experiments.support.trainings import at_scale, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
+from train.report import Report, Row
 
 PAPER: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: (22.45, 0.8170), 20: (22.56, 0.8219)}
 """Scale to PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table IV)."""

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
-from train.experiments.support.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.support.trainings import OUT, OUT_EPOCHS, OUT_EPOCHS_MORE, SEQUENCES, epochs, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.learning.checkpoint import Training, infer
 from train.networks.blocks import PatternNet
+from train.report import Report, Row, bootstrap_interval, with_interval
 
 Psnr = dict[str, NDArray[np.float64]]
 """Of every frame of the test set, (n,) in [dB], by network."""

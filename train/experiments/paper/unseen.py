@@ -22,13 +22,13 @@ from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences, join
 from train.data.generation_config import random_figures
 from train.experiments.support.intervals import intervals
-from train.experiments.support.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.support.trainings import FIGURES, SEEN
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
+from train.report import Report, Row, bootstrap_interval, with_interval
 from train.surfaces.named_surfaces import SURFACES
 
 HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")

@@ -20,11 +20,11 @@ from train.data.generation_config import random_figures
 from train.experiments.paper.unseen import TEST_FIGURES, TEST_SEED
 from train.experiments.support.band_limit import WAVELENGTHS_MM, edge_distance_mm, gratings, kept_back, let_through
 from train.experiments.support.intervals import Intervals, intervals
-from train.experiments.support.report import Cell, Report, Row, with_interval
 from train.experiments.support.trainings import compact, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells
 from train.learning.interval_calibration import LEVEL
 from train.networks.blocks import PatternNet
+from train.report import Cell, Report, Row, with_interval
 
 NAMES: Final = ("stsr", "mtsr2", "mtsr4")
 LEVELS: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)

@@ -22,11 +22,11 @@ from edge.terminal.progress_bar import tracked
 from train.data.generation_config import SEED, random_figures
 from train.errors import TrainError
 from train.experiments.paper.unseen import TEST_FIGURES, TEST_SEED
-from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.workbench import Workbench
 from train.freeze import freeze
 from train.learning.expected_error_table import doubts_and_errors
 from train.physics.sensor_noise import Nuisances
+from train.report import Report, Row, with_interval
 
 PARTS: Final = 8
 """Bins of equally many frames, by what is expected of them."""

@@ -33,9 +33,9 @@ from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.generation_config import SEED
 from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
-from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.workbench import Workbench, thinned
 from train.physics.sensor_noise import LARGEST_COUNTS
+from train.report import Report, Row, with_interval
 
 MODELS: Final = ("stsr", "mtsr4")
 MOST_DEAD: Final = 8

@@ -21,12 +21,12 @@ from train.data.world import World
 from train.experiments.support.baselines import Baseline, fit_baselines
 from train.experiments.support.nominal import nominal_rows
 from train.experiments.support.oracle import oracle_rows
-from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.scores import pattern_cells
 from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.report import Report, Row, with_interval
 
 TRAINING: Final = World(count=100_000, seed=1)
 VALIDATION: Final = World(count=1260, taps=4, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)

@@ -16,13 +16,13 @@ from scipy.optimize import least_squares
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
-from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.free_sides import Drift, FreeSides, Give
 from train.physics.magnets import MOVEMENT, Magnet, MagnetArray
+from train.physics.side_correction import Drift, FreeSides, Give
 from train.physics.taxel_response import IN_PLANE_SHARE, Skin
+from train.report import Report, Row
 
 POISSONS: Final = (0.45, 0.48, 0.49, 0.495)
 PUNCH_MM: Final = 2.5

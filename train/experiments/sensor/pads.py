@@ -20,14 +20,14 @@ from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED, one_thread
 from train.data.presses import PressSet
 from train.data.world import press_shapes
-from train.experiments.support.report import Report, Row, with_interval
 from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.physics.gripped import GrippedPad
-from train.physics.pads import INPUTS, NOMINAL, Pad
+from train.physics.pad_draws import INPUTS, NOMINAL, Pad
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.report import Report, Row, with_interval
 
 SHAPES: Final = 40
 SHAPES_SEED: Final = 4711

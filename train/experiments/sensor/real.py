@@ -43,10 +43,10 @@ from train.data.real_grips import (
     z_of,
 )
 from train.data.world import World, solve_pad
-from train.experiments.support.report import Report, Row, bootstrap_interval
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, drawn
 from train.physics.sensor_noise import Nuisances
+from train.report import Report, Row, bootstrap_interval
 
 _SCAN_NS: Final = 16_750_000
 _TAXELS: Final = USPA44.taxel_count

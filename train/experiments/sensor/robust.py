@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from edge.terminal.progress_bar import tracked
 from train.experiments.support.methods import Method, classical_methods, compact_methods
-from train.experiments.support.report import Report, Row, bootstrap_interval, with_interval
 from train.experiments.support.sweeps import Sweep, all_sweeps, plain_set
 from train.experiments.support.trainings import mixed
 from train.experiments.support.workbench import Figures, Workbench
+from train.report import Report, Row, bootstrap_interval, with_interval
 
 _NETWORKS: Final = ("stsr", "mtsr4")
 _CLASSICAL: Final = ("linear map", "bilinear")

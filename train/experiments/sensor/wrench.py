@@ -13,12 +13,12 @@ from train.data.frozen_presses import FrozenPresses
 from train.errors import TrainError
 from train.experiments.sensor.families import TRAINING
 from train.experiments.support.baselines import read_newest
-from train.experiments.support.report import Report, Row
 from train.experiments.support.scores import share_beside
 from train.experiments.support.shipped import FORCE, KNOWN, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Workbench
 from train.physics.gripped import TRACTION_SCALE
-from train.physics.pads import NOMINAL
+from train.physics.pad_draws import NOMINAL
+from train.report import Report, Row
 
 OFFSET_N: Final = 0.05
 _RIDGE: Final = 1e-4

@@ -30,8 +30,8 @@ from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.generation_config import SEED
 from train.data.real_grips import REST_SCANS, recording_paths, recordings_folder
-from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
+from train.report import Report, Row
 
 MODEL: Final = "stsr-small-int8"
 RATE_HZ: Final = 100

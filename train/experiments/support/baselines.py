@@ -20,7 +20,7 @@ from train.experiments.support.kriging import Kriging
 from train.freeze import SCALE
 from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import GrippedPad
-from train.physics.pads import NOMINAL
+from train.physics.pad_draws import NOMINAL
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 

@@ -15,12 +15,12 @@ from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.geometry import USPA44
 from train.data.dataset import Sequences
 from train.errors import TrainError
-from train.experiments.support.report import Row
 from train.experiments.support.trainings import compact, trained
 from train.experiments.support.workbench import Figures, Workbench, cost_cells
 from train.freeze import CLASSICAL_WINDOWS, SCALE, fit_classical
 from train.learning.checkpoint import infer
 from train.networks.blocks import PatternNet
+from train.report import Row
 
 _QUICK_WINDOWS: Final = 300
 _TIMED_RUNS: Final = 30

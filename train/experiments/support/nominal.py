@@ -12,12 +12,12 @@ from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.scans.pad import GAINS, Pad
 from train.data.generation_config import random_figures
-from train.experiments.support.report import Row
 from train.experiments.support.scores import pattern_cells
 from train.experiments.support.shipped import ALL, NOTHING, PAD, infer
 from train.experiments.support.workbench import Workbench, thinned
-from train.physics.pads import INPUTS, NOMINAL
+from train.physics.pad_draws import INPUTS, NOMINAL
 from train.physics.sensor_noise import Nuisances
+from train.report import Row
 
 TEST_FIGURES: Final = 24
 TEST_SEED: Final = 999

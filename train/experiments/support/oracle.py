@@ -21,14 +21,14 @@ from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import one_thread
 from train.data.presses import PressSet, join_presses
 from train.data.world import INDENTATION_MM
-from train.experiments.support.report import Row
 from train.experiments.support.scores import pattern_cells
 from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses
 from train.experiments.support.workbench import Workbench
 from train.physics.gripped import SAMPLES, GrippedPad, Presses
-from train.physics.pads import Pad, constants, draw_pad
+from train.physics.pad_draws import Pad, constants, draw_pad
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.report import Row
 from train.surfaces.depth_image import Relief, footprints
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import as_poses, random_targets, turned_back

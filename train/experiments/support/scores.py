@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.experiments.support.report import Row, with_interval
 from train.experiments.support.workbench import Figures
+from train.report import Row, with_interval
 
 _MOST_SHARE: Final = 100.0
 _HALVINGS: Final = 50

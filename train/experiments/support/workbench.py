@@ -23,13 +23,13 @@ from train.data.make_presses import make_presses
 from train.data.presses import PressSet
 from train.data.world import World
 from train.errors import CheckpointError
-from train.experiments.support.report import Row, with_interval
 from train.freeze import freeze
 from train.generate import generate
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.physics.sensor_noise import Nuisances
+from train.report import Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import MAX_TAPS, Split
 

@@ -15,7 +15,7 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ParityError
-from export.graph import known_width, outputs
+from export.graphs.graph import known_width, outputs
 
 LEVELS: Final = {
     "none": onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL,

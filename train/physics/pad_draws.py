@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.physics.elastic_layer import Layer
-from train.physics.free_sides import FreeSides
 from train.physics.magnets import Magnet
+from train.physics.side_correction import FreeSides
 from train.physics.taxel_response import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
 
 _UNEVEN_MM: Final = 0.015

@@ -13,7 +13,7 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.progress_bar import tracked
-from export.reference import origin
+from export.graphs.reference import origin
 from firmware_bridge.in_place import write_in_place
 from train.learning.expected_error_table import fit_confidence
 

@@ -13,10 +13,10 @@ import onnx
 
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet
-from export.graph import to_model
-from export.int8 import quantised
-from export.parity import GraphRun
-from export.rounding import integer_convolutions, rounded
+from export.graphs.graph import to_model
+from export.graphs.parity import GraphRun
+from export.integers.int8 import quantised
+from export.integers.rounding import integer_convolutions, rounded
 from firmware_bridge.geometry import SensorGeometry
 from train.data.batch import Batch
 from train.data.batches import network_input
@@ -76,7 +76,7 @@ def fine_tuned(
     plain weights, to be exported and quantised anew with ranges measured again, and then `recalibrated`.
 
     Args:
-        net: without batch normalisation, see `export.rounding.folded`.
+        net: without batch normalisation, see `export.integers.rounding.folded`.
         model: its graph in float.
         quantised_model: its graph in integers.
         sequences: training taps, of at least as many taps as it takes.
@@ -152,9 +152,9 @@ def quantised_well(
     Weights that are no better for it are not taken.
 
     Args:
-        net: without batch normalisation, see `export.rounding.folded`.
+        net: without batch normalisation, see `export.integers.rounding.folded`.
         geometry: of the sensor.
-        seen: of which ranges are taken, see `export.int8.quantised`.
+        seen: of which ranges are taken, see `export.integers.int8.quantised`.
         sequences: training taps.
         tuning: how it is trained on, or None for never.
         most_loss_db: what integers may cost.

@@ -27,14 +27,14 @@ from train.data.real_grips import (
 )
 from train.data.world import World
 from train.experiments.sensor.families import TRAINING
-from train.experiments.support.report import Report, Row
 from train.experiments.support.workbench import Workbench
 from train.identify import distinct, mixture_beside
 from train.learning.contact_mixture import CHANNELS, ContactMixture, Z, normalise
 from train.learning.gain_estimate import Estimate, estimate
 from train.physics.gripped import GrippedPad
-from train.physics.pads import INPUTS, constants, draw_pad
+from train.physics.pad_draws import INPUTS, constants, draw_pad
 from train.physics.sensor_noise import Nuisances, read_windows
+from train.report import Report, Row
 
 SENSORS: Final = World(count=4800, per_pad=200, seed=9015)
 """Other pads than those of seed 9014, on which what the estimate holds for sure was set."""

@@ -1,92 +1,25 @@
-"""`--budget-us`: the models that may take turns, loaded and calibrated, and who changes them while it runs."""
+"""`--budget-us`: calibrate a model and its alternatives on this machine, and choose the one that fits the budget."""
 
 import threading
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from edge.budgeting.model_choice import Candidate, Choice, choose
+from edge.budgeting.model_choice import Candidate, choose
 from edge.budgeting.run_time_cache import CalibrationCache
 from edge.budgeting.run_times import ROUND_TICKS, ROUNDS, RunTime, calibrate
-from edge.budgeting.step_rule import Governor
 from edge.errors import ModelError
 from edge.inference.bundled import alternatives, bundled_models
 from edge.inference.expected_error import is_number
 from edge.inference.onnx_session import ModelSession
-from edge.perception.result import Result, age_text
-from edge.perception.runtime import Model, Runtime
-from edge.pipeline.sink import Sink
-from firmware_bridge.schedule import Clock
+from edge.perception.result import age_text
 
 USUAL_RATE_HZ: Final = 100.0
 UNEVEN: Final = 3.0
 """99th percentile over median, 1.2 to 1.4 on a quiet machine. What a busy one gives holds for now, not for months."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ladder:
-    """Models that may take turns, loaded, so that a step costs nothing.
-
-    Attributes:
-        choice: the rungs, and which of them to begin with.
-        budget_us: longest run time of a pattern, in [us].
-        models: by name, one for each rung.
-    """
-
-    choice: Choice
-    budget_us: float
-    models: Mapping[str, Model]
-
-    @property
-    def model(self) -> Model:
-        """The one to begin with."""
-        return self.models[self.choice.ladder[self.choice.rung].name]
-
-    @property
-    def most_taps(self) -> int:
-        """Taps that the largest of them takes."""
-        return max(model.contract.taps for model in self.models.values())
-
-    def steps(self, runtime: Runtime) -> Sink:
-        """What changes the runtime's model between results; give it every one."""
-        return ModelSteps(self, runtime)
-
-
-class ModelSteps(Sink):
-    """Hears of every pattern, and changes the runtime's model when the governor says so.
-
-    It is a sink because that is where results are heard, one by one and between scans.
-    """
-
-    def __init__(self, ladder: Ladder, runtime: Runtime, clock_ns: Clock = time.monotonic_ns) -> None:
-        """Start with the model chosen; the runtime's first result will tell why.
-
-        Args:
-            ladder: whose models take turns.
-            runtime: whose model is changed.
-            clock_ns: monotonic, in [ns].
-        """
-        self._governor = Governor(ladder.choice.ladder, ladder.choice.rung, ladder.budget_us)
-        self._models = ladder.models
-        self._runtime = runtime
-        self._clock_ns = clock_ns
-        runtime.change_model(ladder.model, ladder.choice.why)
-
-    def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Hear of one result; one without a pattern, or of a model that is not on any more, tells nothing."""
-        if result.run_time_us is None or result.model != self._governor.present.name:
-            return
-        step = self._governor.watch(self._clock_ns(), result.run_time_us)
-        if step is not None:
-            self._runtime.change_model(self._models[self._governor.present.name], step.why)
-
-    def close(self) -> None:
-        """Nothing to finish."""
-
-
-def open_ladder(
+def choose_model(
     model: Path,
     budget_us: float,
     *,
@@ -95,23 +28,23 @@ def open_ladder(
     recalibrate: bool,
     stop: threading.Event,
     tell: Callable[[str], object],
-) -> Ladder | None:
-    """Load a model and what may stand in for it, and choose by run times measured here, now or at an earlier start.
+) -> ModelSession | None:
+    """Load a model and its alternatives, and return the one that run times measured on this machine choose.
 
     Args:
         model: file of the one asked for.
         budget_us: longest run time of a pattern, in [us].
         rate_hz: of the sensor, in [Hz].
         cache: file that run times are kept in; None keeps nothing.
-        recalibrate: measure anew what is kept.
+        recalibrate: measure again although run times are kept.
         stop: gives up early.
-        tell: hears, a line each, what is done, what is wrong and what was chosen.
+        tell: receives, a line each, what is measured, what is wrong and what was chosen.
 
     Returns:
-        The ladder, or None if it was stopped.
+        The loaded model, or None if it was stopped.
 
     Raises:
-        ModelError: the model cannot be used, or does not tell its error.
+        ModelError: the model cannot be used, or its contract lacks its error.
     """
     sessions = candidate_sessions(model, tell, stop)
     kept = CalibrationCache(cache, rate_hz)
@@ -136,8 +69,7 @@ def open_ladder(
     choice = choose([_candidate(session, run_times[path]) for path, session in sessions.items()], budget_us)
     age = f" (calibrated {age_text(max(age_s for _, age_s in found.values()))} ago)" if found else ""
     tell(f"{'' if choice.fits else 'warning: '}{choice.why}{age}")
-    names = {candidate.name for candidate in choice.ladder}
-    return Ladder(choice, budget_us, {one.name: one for one in sessions.values() if one.name in names})
+    return next(session for session in sessions.values() if session.name == choice.name)
 
 
 def candidate_sessions(
