@@ -20,6 +20,8 @@ MOST_BYTES: Final = 1 << 28
 """A hundred times the largest bundled model, ten times the paper's network."""
 MOST_FIELDS: Final = 1 << 20
 """Some seconds of walking; the bundled models have a thousand and a half."""
+MOST_NODES: Final = 5000
+"""Thirty times as many as the largest bundled model has; onnxruntime goes over all of them again and again."""
 MOST_DIMS: Final = 64
 """Of weights: the product of a million dimensions takes hours."""
 _NAMES: Final = """
@@ -94,12 +96,15 @@ def check_plain(content: bytes) -> None:
 
     Raises:
         ModelError: weights in another file, sparse or of more elements than the file can hold; graphs within the
-            graph; an operator that is not one of OPERATORS; or not the encoding that ONNX has.
+            graph; an operator that is not one of OPERATORS, or too many; or not the encoding that ONNX has.
     """
     waiting: list[tuple[_Message, int, int]] = [(_MODEL, 0, len(content))]
-    fields = 0
+    fields = nodes = 0
     while waiting:
         message, start, end = waiting.pop()
+        nodes += message is _NODE
+        if nodes > MOST_NODES:
+            raise ModelError(f"has more than {MOST_NODES} operators, expected a smaller graph")
         dims: list[int] = []
         for field in _fields(content, start, end):
             fields += 1

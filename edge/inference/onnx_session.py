@@ -30,6 +30,9 @@ WARM_UP_RUNS: Final = 10
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
 """Of onnxruntime, which may quote a whole graph."""
+NOT_WHILE_LOADING: Final = ["ConstantFolding"]
+"""Work on constants, of which a stranger's file may ask hours, and which no flag ends. In a run it can be ended; the
+bundled models have none, and give the same to the bit."""
 _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
@@ -87,10 +90,11 @@ class ModelSession:
         except UnicodeDecodeError as error:
             raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
         self._runs: dict[int, _Run] = {}
+        self._options = onnxruntime.RunOptions()
         self._deviation: NDArray[np.float32] | None = None
         self._traction: NDArray[np.float32] | None = None
         self._unknown_pad = self.contract.pad_row(None)
-        within_limit(self._warm_up, path, stop)
+        within_limit(self._warm_up, path, stop, give_up=self._end_run)
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
@@ -157,7 +161,9 @@ class ModelSession:
             if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
                 expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
                 raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
-        run = self._runs.get(count) or self._runs.setdefault(count, _Run(self._session, self.contract, count))
+        run = self._runs.get(count) or self._runs.setdefault(
+            count, _Run(self._session, self._options, self.contract, count)
+        )
         for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
             run.window[index] = window.reshape(run.window.shape[1:])
             if run.pad is not None:
@@ -181,6 +187,9 @@ class ModelSession:
         for _ in range(WARM_UP_RUNS):
             self.run(np.zeros(self._shape, dtype=np.float32))
 
+    def _end_run(self) -> None:
+        self._options.terminate = True  # looked at before each operator
+
     @property
     def _shape(self) -> tuple[int, int, int, int]:
         return (self.contract.taps, 3, self.contract.rows, self.contract.cols)
@@ -189,13 +198,15 @@ class ModelSession:
 class _Run:
     """Arrays for so many windows, and what fills them."""
 
-    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int) -> None:
+    def __init__(
+        self, session: onnxruntime.InferenceSession, options: onnxruntime.RunOptions, contract: Contract, count: int
+    ) -> None:
         inputs, outputs = (
             {name: np.zeros((count, *shape[1:]), dtype=np.float32) for name, shape in shapes.items()}
             for shapes in (contract.input_shapes, contract.output_shapes)
         )
         at_once = count if contract.batch == ANY_BATCH else 1
-        self._session = session
+        self._session, self._options = session, options
         self._bindings = [session.io_binding() for _ in range(0, count, at_once)]
         for index, binding in enumerate(self._bindings):
             part = slice(index * at_once, (index + 1) * at_once)
@@ -213,7 +224,7 @@ class _Run:
 
     def __call__(self) -> None:
         for binding in self._bindings:
-            self._session.run_with_iobinding(binding)
+            self._session.run_with_iobinding(binding, self._options)
 
 
 def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
@@ -249,7 +260,13 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
 
     def load() -> onnxruntime.InferenceSession:
         # Its fallback tries the same again, and prints on stdout, where records go.
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
+        return onnxruntime.InferenceSession(
+            content,
+            options,
+            providers=["CPUExecutionProvider"],
+            enable_fallback=0,
+            disabled_optimizers=NOT_WHILE_LOADING,
+        )
 
     try:
         return within_limit(load, path, stop)

@@ -1,7 +1,7 @@
 """Load a model within a time limit, on a thread that can be left behind.
 
-While onnxruntime loads a graph, and while it runs it first, it cannot be interrupted, and Python handles no signal on
-the thread that asked for it. So that thread only waits, and gives up in time.
+While onnxruntime loads a graph, and while it runs it first, Python handles no signal on the thread that asked for it.
+So that thread only waits, and gives up in time.
 """
 
 import threading
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 LOAD_LIMIT_S: Final = 60.0
 """A thousand times what the bundled models take, and enough for a network fifty times as large on a busy machine."""
-STOP_S: Final = 1.0
-"""Time that a load may still take after a stop was asked for: any usual one is done by then."""
+STOP_S: Final = 0.5
+"""Time that each part of a load may still take after a stop was asked for: any usual one is done by then, and two
+in a row before a program is ended by force."""
 _POLL_S: Final = 0.1
 _THREAD: Final = "edge: loading a model"
 _IDENTITY: Final = (
@@ -34,15 +35,21 @@ _IDENTITY: Final = (
 Made = TypeVar("Made")
 
 
-def within_limit(work: Callable[[], Made], path: Path, stop: threading.Event | None = None) -> Made:
+def within_limit(
+    work: Callable[[], Made],
+    path: Path,
+    stop: threading.Event | None = None,
+    give_up: Callable[[], object] = lambda: None,
+) -> Made:
     """Do a part of loading a model on another thread, and return or raise what it returns or raises.
 
-    Work that is given up goes on until it ends or the program does; nothing can end it sooner. See `unfinished_load`.
+    Work that is given up goes on until it ends, `give_up` ends it, or the program ends. See `unfinished_load`.
 
     Args:
         work: what is to be done.
         path: of the model, for the message.
         stop: gives up early.
+        give_up: asks the work to end, and does not wait for it.
 
     Raises:
         ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
@@ -65,8 +72,10 @@ def within_limit(work: Callable[[], Made], path: Path, stop: threading.Event | N
         if asked_s is None and stop is not None and stop.is_set():
             asked_s = now_s
         if asked_s is not None and now_s > asked_s + STOP_S:
+            give_up()
             raise ModelError(f"{path}: stopped before it was loaded")
         if now_s > until_s:
+            give_up()
             raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
     if failed:
         raise failed[0]

@@ -200,9 +200,12 @@ def gather(path: Path) -> int:
     A last row that a crash left incomplete is left out.
 
     Raises:
-        SinkError: there are no rows, or no room, or the file exists.
+        SinkError: there are no rows, or no room, or the file exists already.
     """
     parts, draft = parts_dir(path), draft_of(path)
+    if not parts.exists():
+        what = "is finished, and can be read as it is" if path.exists() else "is not there, finished or not"
+        raise SinkError(f"{path} {what}: a recording that a crash left behind has {parts}")
     if path.exists():
         raise SinkError(f"{path} exists, and is not replaced by what {parts} holds: move it away, then {_remedy(path)}")
     try:

@@ -4,6 +4,7 @@ import builtins
 import errno
 import random
 import threading
+import time
 from functools import partial
 from pathlib import Path
 
@@ -397,3 +398,16 @@ def test_read_ends_with_the_scan_though_more_time_is_left(bus):
         (scan,) = link.read(100.0)
         sender.join()
         assert scan.complete
+
+
+def test_what_lay_there_because_nobody_read_is_marked_old(bus):
+    with link_to(bus) as link:
+        for frame in frames_of(2):
+            bus.send(message_of(frame))
+        time.sleep(0.6)
+        first, second = read_scans(link, 2)
+        assert first.unread_ns > 500_000_000 < second.unread_ns
+        assert link.read(0.0) == []
+        for frame in frames_of(1, seed=1):
+            bus.send(message_of(frame))
+        assert [scan.unread_ns for scan in read_scans(link, 1)] == [0]

@@ -4,6 +4,7 @@ import errno
 import random
 import sys
 import threading
+import time
 
 import gs_usb_emulator
 import pytest
@@ -510,3 +511,16 @@ def test_a_short_packet_ends_a_transfer():
         scans = read_scans(link, 3)
         assert [int(scan.fresh.sum()) for scan in scans] == [16, 15, 16]
         assert link.counters()["skipped_bytes"] == 13 and link.counters()["bus_off"] == 0
+
+
+@pytest.mark.parametrize("features", [0x03, CANDLELIGHT.features])
+def test_what_lay_there_because_nobody_read_is_marked_old(features):
+    port, link = opened(GsUsbPort(lambda: GsUsbAdapter(CANDLELIGHT._replace(features=features))))
+    with link:
+        port.adapter.hear(*frames_of(2))
+        time.sleep(0.6)
+        first, second = read_scans(link, 2)
+        assert first.unread_ns > 500_000_000 < second.unread_ns
+        assert link.read(0.0) == []
+        port.adapter.hear(*frames_of(1, seed=1))
+        assert [scan.unread_ns for scan in read_scans(link, 1)] == [0]

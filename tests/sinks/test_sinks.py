@@ -564,7 +564,7 @@ class TestNpz:
 
     def test_gathering_what_is_not_there_is_told(self, tmp_path, capsys):
         assert npz.main([str(tmp_path / "none.npz")]) == 1
-        assert "none.npz.parts: No such file" in capsys.readouterr().err
+        assert "none.npz is not there, finished or not: a recording that a crash" in capsys.readouterr().err
         with pytest.raises(SystemExit):
             npz.main([])
         NpzSink(tmp_path / "empty.npz", *SHAPES)
@@ -573,6 +573,17 @@ class TestNpz:
         (parts_dir(tmp_path / "empty.npz") / npz.LAYOUT).write_text("{")
         with pytest.raises(SinkError, match=r"layout.json cannot be read"):
             gather(tmp_path / "empty.npz")
+
+    def test_a_whole_file_needs_no_gathering_and_is_not_to_be_moved_away(self, tmp_path, capsys):
+        path = tmp_path / "out.npz"
+        sink = NpzSink(path, *SHAPES)
+        sink.write(make_results(1)[0], {})
+        sink.close()
+        content = path.read_bytes()
+        assert npz.main([str(path)]) == 1
+        words = capsys.readouterr().err
+        assert words.startswith(f"{path} is finished, and can be read as it is: ") and "move" not in words
+        assert path.read_bytes() == content
 
     def test_what_cannot_be_recorded_into_is_told_at_the_start(self, tmp_path):
         with pytest.raises(SinkError, match="is a directory"):

@@ -375,19 +375,21 @@ class TestMany:
             wait_for(lambda: page.view._server._connections.granted == 2)
             assert viewers(page) == 0 and refused_with(page) == 503
 
-    def test_who_says_nothing_makes_room_for_the_next(self, page, monkeypatch):
+    def test_who_says_nothing_makes_room_for_the_next(self, tmp_path, monkeypatch):
         """Idle connections lock nobody out; those of viewers are not theirs to take."""
         monkeypatch.setattr(connections, "MOST_CONNECTIONS", 4)
-        with page.viewer() as viewer, ExitStack() as strangers:
-            idle = [strangers.enter_context(page.stranger()) for _ in range(10)]
+        monkeypatch.setattr(server, "OPEN_S", 600.0)  # they make room, and not because they said nothing for so long
+        with live_page(tmp_path) as page:
+            with page.viewer() as viewer, ExitStack() as strangers:
+                idle = [strangers.enter_context(page.stranger()) for _ in range(10)]
+                assert get(page)[0] == 200
+                for evicted in idle[:6]:
+                    assert evicted.recv(1) == b""
+                wait_for(lambda: len(page.view._server._connections) <= 4)
+                with page.viewer() as another:
+                    assert frame(another)[0]["kind"] == frame(viewer)[0]["kind"] == "hello"
+            wait_for(lambda: not page.view._server._connections)
             assert get(page)[0] == 200
-            for evicted in idle[:6]:
-                assert evicted.recv(1) == b""
-            wait_for(lambda: len(page.view._server._connections) <= 4)
-            with page.viewer() as another:
-                assert frame(another)[0]["kind"] == frame(viewer)[0]["kind"] == "hello"
-        wait_for(lambda: not page.view._server._connections)
-        assert get(page)[0] == 200
 
     @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
     def test_what_ends_the_server_is_told_and_the_run_goes_on(self, page, monkeypatch):
