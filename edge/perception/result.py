@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -127,4 +128,9 @@ def age_text(age_s: float) -> str:
 
 def mask_bits(taxels: NDArray[np.bool_]) -> int:
     """A (rows, cols) mask as a number: bit i is taxel i, row-major from the top left."""
-    return int.from_bytes(np.packbits(taxels, axis=None, bitorder="little").tobytes(), "little")
+    return _bits(taxels.tobytes())
+
+
+@lru_cache(maxsize=256)  # most scans have one of a few masks, and numpy takes ten times as long on sixteen taxels
+def _bits(taxels: bytes) -> int:
+    return int.from_bytes(np.packbits(np.frombuffer(taxels, dtype=np.bool_), bitorder="little").tobytes(), "little")

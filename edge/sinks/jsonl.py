@@ -9,24 +9,20 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
+from edge.perception.field import Columns
 from edge.perception.result import Result
+from edge.perception.result_fields import MAPS
 from edge.pipeline.sink import Sink
 from edge.sinks.json_record import event_record, record
 from edge.sinks.pipe_capacity import has_room, widen
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
-_DECIMALS: Final = 7
-"""Of maps in [mm]: what is less than a nanometre apart is noise of the arithmetic."""
-_TRACTION_DECIMALS: Final = 4
-"""Of [kPa], a tenth of a pascal."""
-
-
+_MAP_NAMES: Final = tuple(field.name for field in MAPS)
+_MAPS: Final = Columns(field.in_record() for field in MAPS)
 _ROOM_S: Final = 0.002
 """Between two looks whether a slow reader has made room; a pipe holds more than is made meanwhile."""
 
@@ -103,18 +99,13 @@ class JsonLinesSink(Sink):
 def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
     """A result as one line of JSON, its maps last."""
     line = record(result, counters)
-    line["pattern"], line["deviation"] = _map(result.pattern), _map(result.deviation)
-    line["traction"] = _map(result.traction, _TRACTION_DECIMALS)
+    line.update(zip(_MAP_NAMES, _MAPS.of(result), strict=True))
     return orjson.dumps(line, option=_OPTIONS)
 
 
 def event_line(event: Event, counters: Mapping[str, int], source: str | None) -> bytes:
     """An event as one line of JSON."""
     return orjson.dumps(event_record(event, counters, source), option=orjson.OPT_APPEND_NEWLINE)
-
-
-def _map(values: NDArray[np.float32] | None, decimals: int = _DECIMALS) -> NDArray[np.float32] | None:
-    return None if values is None else np.round(values, decimals)
 
 
 def _open(target: str) -> BufferedWriter:

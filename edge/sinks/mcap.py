@@ -12,6 +12,7 @@ from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result
+from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
 from edge.sinks.json_record import record
 from edge.sinks.mcap_writer import McapFile
@@ -131,9 +132,8 @@ class McapSink(Sink):
                 self._baselines[sensor] = result.baseline
             self._add(sensor, "scan", SCAN, unix_ns, encode_scan(scan, unix_ns, said["fresh"], said["renewed"]))
             self._add(sensor, "result", RESULT, unix_ns, result_message(result, said, unix_ns))
-            for name in ("pattern", "deviation", "traction"):
-                if (values := getattr(result, name)) is not None:
-                    self._add(sensor, name, IMAGE, unix_ns, image(values, frame_of(result), unix_ns))
+            for name, values in maps_of(result).items():
+                self._add(sensor, name, IMAGE, unix_ns, image(values, frame_of(result), unix_ns))
             force = wrench(result, unix_ns)
             if force is not None:
                 self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)

@@ -19,7 +19,9 @@ from numpy.lib import format as npy
 from numpy.typing import ArrayLike
 
 from edge.errors import SinkError
+from edge.perception.field import Columns, Out
 from edge.perception.result import Result
+from edge.perception.result_fields import FIELDS
 from edge.pipeline.sink import Sink
 from edge.terminal.forced_end import finishing
 from edge.terminal.progress_bar import Progress
@@ -29,23 +31,12 @@ from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 LAYOUT: Final = "layout.json"
 ROWS: Final = "rows"
 CHUNK_SCANS: Final = 256
-MODEL_CHARACTERS: Final = 32
-"""Of a model's name: files may have longer ones, and a record must not fail for that."""
-_NO_WRENCH: Final = (np.nan,) * 6
-_NO_CENTRE: Final = (np.nan,) * 2
 
 
 class NpzSink(Sink):
     """Records into `path`, by way of parts beside it.
 
-    Arrays, one row a scan: sensor, scan, time_ns, device_time_ns (-1 unknown), counts (3, rows, cols; -1
-    absent), source, origin (the same, but of a replay that of what is played), state, model, contact (-1 unknown),
-    taps_used, force_counts (NaN unknown), has_pattern, pattern (H, W; zeros where there is none), deviation (the same,
-    only if the model gives it), traction (3, h, w; likewise), wrench (force x, y, z in [N], torque x, y, z in [N mm]),
-    centre_of_pressure_mm (x, y), interval_mm, expected_rmse_mm and run_time_us (NaN where there is none), wrench_origin
-    (or empty), another_tap and reused_from (-1 where there is none), dead (bit i: taxel i is not believed), filled
-    (what stood for them, or empty), baseline (its id, or empty), baseline_age_s (NaN without) and baseline_counts
-    (3, rows, cols, what was subtracted, drift and all; NaN without, and where a taxel was not zeroed).
+    Arrays have one row a scan; docs/formats.md lists them.
     """
 
     def __init__(
@@ -75,40 +66,24 @@ class NpzSink(Sink):
         self._scans = 0
         self._failed = False
         self._origin = origin
-        self._no_pattern = np.zeros(pattern_shape, dtype=np.float32)
-        self._no_traction = np.zeros(traction_shape or 0, dtype=np.float32)
-        self._no_baseline = np.full(scan_shape, np.nan, dtype=np.float32)
-        self._layout: dict[str, tuple[str, tuple[int, ...]]] = {
-            "sensor": ("<U64", ()),
-            "scan": ("<i8", ()),
-            "time_ns": ("<i8", ()),
-            "device_time_ns": ("<i8", ()),
-            "counts": ("<i4", scan_shape),
-            "source": ("<U8", ()),
-            "origin": ("<U8", ()),
-            "state": ("<U10", ()),
-            "model": (f"<U{MODEL_CHARACTERS}", ()),
-            "contact": ("|i1", ()),
-            "taps_used": ("<i2", ()),
-            "force_counts": ("<f4", ()),
-            "has_pattern": ("|b1", ()),
-            "pattern": ("<f4", pattern_shape),
-            **({"deviation": ("<f4", pattern_shape)} if deviations else {}),
-            **({"traction": ("<f4", traction_shape)} if traction_shape else {}),
-            "wrench": ("<f4", (6,)),
-            "centre_of_pressure_mm": ("<f4", (2,)),
-            "wrench_origin": ("<U10", ()),
-            "interval_mm": ("<f4", ()),
-            "expected_rmse_mm": ("<f4", ()),
-            "another_tap": ("|i1", ()),
-            "reused_from": ("<i8", ()),
-            "run_time_us": ("<f4", ()),
-            "dead": ("<u8", ()),
-            "filled": ("<U10", ()),
-            "baseline": ("<U16", ()),
-            "baseline_age_s": ("<f4", ()),
-            "baseline_counts": ("<f4", scan_shape),
+        shapes = {
+            "": (),
+            "scan": scan_shape,
+            "pattern": pattern_shape,
+            "deviation": pattern_shape if deviations else None,
+            "traction": traction_shape,
         }
+        self._layout: dict[str, tuple[str, tuple[int, ...]]] = {}
+        columns = []
+        for field in FIELDS:
+            shape, column = shapes[field.kind.shape], field.in_array()
+            if Out.NPZ in field.out and shape is not None:
+                kind = field.kind.array
+                self._layout[field.name] = (kind, (len(field.parts),) if field.parts else shape)
+                columns.append(column._replace(unknown=np.full(shape, column.unknown, kind)) if shape else column)
+        self._columns = Columns(columns)
+        self._layout["origin"] = self._layout["source"]
+        self._cells = [(name, np.dtype(kind), shape) for name, (kind, shape) in self._layout.items()]
         parts = parts_dir(path)
         if path.is_dir():
             raise SinkError(f"cannot record into {path}: it is a directory")
@@ -127,39 +102,8 @@ class NpzSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Add one row to every array."""
-        scan, pattern, baseline, wrench = result.scan, result.pattern, result.baseline, result.wrench
-        row: dict[str, ArrayLike] = {
-            "sensor": scan.sensor,
-            "scan": scan.number,
-            "time_ns": scan.time_ns,
-            "device_time_ns": -1 if scan.device_ns is None else scan.device_ns,
-            "counts": scan.counts,
-            "source": result.source,
-            "origin": self._origin or result.source,
-            "state": result.state,
-            "model": result.model[:MODEL_CHARACTERS],
-            "contact": -1 if result.contact is None else result.contact,
-            "taps_used": result.taps_used,
-            "force_counts": np.nan if result.force_counts is None else result.force_counts,
-            "has_pattern": pattern is not None,
-            "pattern": self._no_pattern if pattern is None else pattern,
-            "deviation": self._no_pattern if result.deviation is None else result.deviation,
-            "traction": self._no_traction if result.traction is None else result.traction,
-            "wrench": _NO_WRENCH if wrench is None else (*wrench.force_n, *wrench.torque_n_mm),
-            "centre_of_pressure_mm": _NO_CENTRE if wrench is None else wrench.centre_of_pressure_mm or _NO_CENTRE,
-            "wrench_origin": result.wrench_origin or "",
-            "interval_mm": np.nan if result.interval_mm is None else result.interval_mm,
-            "expected_rmse_mm": np.nan if result.expected_rmse_mm is None else result.expected_rmse_mm,
-            "another_tap": -1 if result.another_tap is None else result.another_tap,
-            "reused_from": -1 if result.reused_from is None else result.reused_from,
-            "run_time_us": np.nan if result.run_time_us is None else result.run_time_us,
-            "dead": sum(1 << taxel for taxel in result.dead),
-            "filled": result.filled or "",
-            "baseline": "" if baseline is None else baseline.id,
-            "baseline_age_s": np.nan if result.baseline_age_s is None else result.baseline_age_s,
-            "baseline_counts": self._no_baseline if baseline is None else baseline.counts,
-        }
-        data = b"".join(_row_bytes(name, row[name], kind, shape) for name, (kind, shape) in self._layout.items())
+        row = [*self._columns.of(result), self._origin or result.source]
+        data = b"".join(_row_bytes(*cell, value) for cell, value in zip(self._cells, row, strict=True))
         try:
             while data:  # a disk that fills takes a part of it, and refuses the rest
                 data = data[self._rows.write(data) :]
@@ -248,11 +192,11 @@ def _read_layout(parts: Path) -> dict[str, tuple[str, list[int]]]:
         raise SinkError(f"{parts / LAYOUT} cannot be read: these parts cannot be gathered") from error
 
 
-def _row_bytes(name: str, value: ArrayLike, kind: str, shape: tuple[int, ...]) -> bytes:
+def _row_bytes(name: str, kind: np.dtype, shape: tuple[int, ...], value: ArrayLike) -> bytes:
     row = np.asarray(value, dtype=kind)
     if row.shape != shape:
         raise SinkError(f"{name} has shape {row.shape}, expected {shape}")
-    if isinstance(value, str) and str(row) != value:
+    if isinstance(value, str) and row.item() != value:
         raise SinkError(f"{name} {value!r} is too long to record")
     return row.tobytes()
 

@@ -17,30 +17,29 @@ import numpy as np
 from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
-from edge.perception.result import Result, mask_bits
+from edge.perception.field import Column, Columns
+from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.sinks.shm_layout import (
-    FIELDS,
-    FILLED,
     FOLDER,
     HEADER,
     HEADER_BYTES,
     HEARTBEAT_AT,
+    IN_MEMORY,
     LINE_BYTES,
     MAGIC,
-    MODEL_BYTES,
+    MAPS_IN_MEMORY,
+    MEMBERS,
     SLOTS,
-    SOURCES,
-    STATES,
-    WRENCH_ORIGINS,
     Layout,
     offsets_of,
     struct_of,
 )
 
-_HEAD: Final = struct_of(FIELDS)
+_HEAD: Final = struct_of(MEMBERS)
+_COLUMNS: Final = Columns(field.in_memory() for field in IN_MEMORY)
 _WRITER_PID_AT: Final = offsets_of(HEADER)["writer_pid"]
-_CHECKED_FROM: Final = offsets_of(FIELDS)["sequence"]
+_CHECKED_FROM: Final = offsets_of(MEMBERS)["sequence"]
 _WORD: Final = 8
 
 
@@ -87,6 +86,9 @@ class SharedMemorySink(Sink):
             map_name: np.frombuffer(self._draft, kind, math.prod(shape), at).reshape(shape)
             for map_name, (kind, shape, at) in self._layout.maps.items()
         }
+        self._map_columns = Columns(
+            Column(field.attribute, field.make, math.nan) for field in MAPS_IN_MEMORY if field.name in self._maps
+        )
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Replace what there is of this sensor.
@@ -133,31 +135,10 @@ class SharedMemorySink(Sink):
         return slot_at
 
     def _fill(self, result: Result, sequence: int) -> None:
-        scan, wrench = result.scan, result.wrench
-        x_mm, y_mm = (None, None) if result.centroid_mm is None else result.centroid_mm
-        _HEAD.pack_into(
-            self._draft,
-            0,
-            *(0, 0, sequence, scan.time_ns, scan.number, _or_less(scan.device_ns), _or_less(result.reused_from)),
-            *(SOURCES.index(result.source) + 1, STATES.index(result.state) + 1, _or_less(result.contact)),
-            *(result.taps_used, result.pattern is not None, result.deviation is not None),
-            _or_less(result.another_tap),
-            0 if result.filled is None else FILLED.index(result.filled) + 1,
-            *(sum(1 << taxel for taxel in result.dead), mask_bits(scan.fresh), mask_bits(scan.renewed)),
-            *map(_or_nan, (result.force_counts, result.force_n, result.area_mm2, x_mm, y_mm, result.interval_mm)),
-            *map(_or_nan, (result.expected_rmse_mm, result.baseline_age_s, result.run_time_us, result.latency_us)),
-            scan.sensor.encode(),
-            _cut(result.model, MODEL_BYTES),
-            0 if result.wrench_origin is None else WRENCH_ORIGINS.index(result.wrench_origin) + 1,
-            result.traction is not None,
-            *((math.nan,) * 6 if wrench is None else (*wrench.force_n, *wrench.torque_n_mm)),
-            *((None if wrench is None else wrench.centre_of_pressure_mm) or (math.nan, math.nan)),
-        )
-        self._maps["counts"][:] = scan.counts
+        _HEAD.pack_into(self._draft, 0, 0, 0, sequence, *_COLUMNS.flat(result))
         # Where there is none, none must be left standing from before.
-        for name in self._maps.keys() - {"counts"}:
-            values = getattr(result, name)
-            self._maps[name][:] = np.nan if values is None else values
+        for place, values in zip(self._maps.values(), self._map_columns.of(result), strict=True):
+            place[:] = values
         checksum = zlib.crc32(memoryview(self._draft)[_CHECKED_FROM:])
         self._draft[:4] = checksum.to_bytes(4, "little")
 
@@ -218,16 +199,3 @@ class SharedMemorySink(Sink):
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), self._path.stat()):
                 self._path.unlink()
-
-
-def _or_less(value: int | None) -> int:
-    return -1 if value is None else value
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _cut(text: str, most_bytes: int) -> bytes:
-    """The beginning of a text in UTF-8, never half a character."""
-    return text.encode()[:most_bytes].decode(errors="ignore").encode()

@@ -13,6 +13,9 @@ from typing import Final
 
 import numpy as np
 
+from edge.perception.field import PLACE_IN_HEADER
+from edge.perception.result_fields import FIELDS
+
 FOLDER: Final = "/dev/shm"
 MAGIC: Final = b"TESR-SHM"
 VERSION: Final = 1
@@ -21,9 +24,6 @@ LINE_BYTES: Final = 64
 """Of a cache line: what different processes write and read often lies in lines of its own."""
 HEADER_BYTES: Final = 192
 HEARTBEAT_AT: Final = 128
-SENSOR_BYTES: Final = 256
-"""Of a name of 64 characters, at most four bytes each."""
-MODEL_BYTES: Final = 64
 
 HEADER: Final = (
     ("magic", "8s"),
@@ -53,55 +53,14 @@ HEADER: Final = (
 from `wrench_origin` on.
 """
 
-FIELDS: Final = (
-    ("checksum", "I"),
-    ("reserved", "I"),
-    ("sequence", "Q"),
-    ("time_ns", "q"),
-    ("scan", "q"),
-    ("device_time_ns", "q"),
-    ("reused_from", "q"),
-    ("source", "i"),
-    ("state", "i"),
-    ("contact", "i"),
-    ("taps_used", "i"),
-    ("has_pattern", "i"),
-    ("has_deviation", "i"),
-    ("another_tap", "i"),
-    ("filled", "i"),
-    ("dead", "Q"),
-    ("fresh", "Q"),
-    ("renewed", "Q"),
-    ("force_counts", "d"),
-    ("force_n", "d"),
-    ("area_mm2", "d"),
-    ("centroid_x_mm", "d"),
-    ("centroid_y_mm", "d"),
-    ("interval_mm", "d"),
-    ("expected_rmse_mm", "d"),
-    ("baseline_age_s", "d"),
-    ("run_time_us", "d"),
-    ("latency_us", "d"),
-    ("sensor", f"{SENSOR_BYTES}s"),
-    ("model", f"{MODEL_BYTES}s"),
-    ("wrench_origin", "i"),
-    ("has_traction", "i"),
-    ("force_x_n", "d"),
-    ("force_y_n", "d"),
-    ("force_z_n", "d"),
-    ("torque_x_n_mm", "d"),
-    ("torque_y_n_mm", "d"),
-    ("torque_z_n_mm", "d"),
-    ("centre_of_pressure_x_mm", "d"),
-    ("centre_of_pressure_y_mm", "d"),
+IN_MEMORY: Final = sorted((field for field in FIELDS if (field.byte or 0) > 0), key=lambda field: field.byte or 0)
+"""Single values and vectors of a result, in the order of their bytes."""
+MEMBERS: Final = (
+    *(("checksum", "I"), ("reserved", "I"), ("sequence", "Q")),
+    *((name, field.kind.packed) for field in IN_MEMORY for name in field.names),
 )
-"""Name and struct's character of each field of a half; its maps follow."""
-
-SOURCES: Final = ("device", "replay", "emulated")
-STATES: Final = ("zeroing", "incomplete", "idle", "contact", "dropped")
-FILLED: Final = ("rest", "neighbours")  # the first only by earlier releases
-WRENCH_ORIGINS: Final = ("nominal", "calibrated")
-# Told by their place, from 1: memory that nobody wrote must not pass for a sensor's.
+"""Name and struct's character of each member of a half; its maps follow."""
+MAPS_IN_MEMORY: Final = tuple(field for field in FIELDS if field.byte == PLACE_IN_HEADER)
 
 
 def struct_of(fields: tuple[tuple[str, str], ...]) -> struct.Struct:
@@ -131,17 +90,18 @@ class Layout:
     @property
     def maps(self) -> dict[str, tuple[np.dtype, tuple[int, ...], int]]:
         """Type, shape and place in a half of each map, by name."""
-        scan, pattern = (3, self.rows, self.cols), (self.height, self.width)
-        at, maps = struct_of(FIELDS).size, {}
-        for name, kind, shape in (
-            ("zeroed", "<f4", scan),
-            ("counts", "<i4", scan),
-            ("pattern", "<f4", pattern),
-            ("deviation", "<f4", pattern),
-            *([] if self.traction_shape is None else [("traction", "<f4", self.traction_shape)]),
-        ):
-            maps[name] = (np.dtype(kind), shape, at)
-            at = _aligned(at + int(np.prod(shape)) * 4, 8)
+        pattern = (self.height, self.width)
+        shapes = {
+            "scan": (3, self.rows, self.cols),
+            "pattern": pattern,
+            "deviation": pattern,
+            "traction": self.traction_shape,
+        }
+        at, maps = struct_of(MEMBERS).size, {}
+        for field in MAPS_IN_MEMORY:
+            if (shape := shapes[field.kind.shape]) is not None:
+                maps[field.name] = (np.dtype(field.kind.array), shape, at)
+                at = _aligned(at + int(np.prod(shape)) * 4, 8)
         return maps
 
     @property

@@ -18,6 +18,7 @@ import orjson
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
+from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
 from edge.sinks.binary_message import pack
 from edge.sinks.json_record import event_record, record
@@ -97,8 +98,7 @@ class ZenohSink(Sink):
         self._read = any(map(_matched, (*publishers, self._events)))
         self._put(publishers[0], orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
         if result.pattern is not None and result.reused_from is None:
-            maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
-            self._put(publishers[1], pack(said, {name: one for name, one in maps.items() if one is not None}))
+            self._put(publishers[1], pack(said, maps_of(result)))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Put an event.

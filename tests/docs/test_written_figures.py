@@ -6,7 +6,9 @@ import re
 import tomllib
 from dataclasses import fields
 
+import field_tables
 import numpy as np
+import pytest
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
 
@@ -47,6 +49,12 @@ def told(heading: str) -> set[str]:
     section = FORMATS.split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
     first = [re.split(r"(?<!\\)\|", line)[1] for line in section.splitlines() if line.startswith("| `")]
     return {key for cell in first for key in re.findall(r"`([\w.]+)`", cell)}
+
+
+@pytest.mark.parametrize("page", sorted({page for page, _ in field_tables.TABLES}))
+def test_tables_of_fields_are_those_of_the_code(page):
+    written = (field_tables.DOCS / page).read_text()
+    assert written == field_tables.with_tables(page), "write them: python tests/docs/field_tables.py"
 
 
 def test_keys_of_a_record(tmp_path):

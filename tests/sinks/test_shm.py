@@ -32,7 +32,7 @@ from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.sinks.registry import open_sink
 from edge.sinks.shm import SharedMemorySink
-from edge.sinks.shm_layout import FIELDS, HEADER, HEARTBEAT_AT, SLOTS, Layout, offsets_of, struct_of
+from edge.sinks.shm_layout import HEADER, HEARTBEAT_AT, IN_MEMORY, MEMBERS, SLOTS, Layout, offsets_of, struct_of
 
 sys.path.append(str(ROOT / "examples"))
 import shm_read
@@ -46,6 +46,49 @@ ENVIRONMENT = os.environ | {
     "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/sinks'}:{ROOT / 'tests/support'}:{ROOT / 'examples'}",
     "PYTHONUNBUFFERED": "",
 }
+VERSION_1 = {
+    "checksum": (0, "I"),
+    "reserved": (4, "I"),
+    "sequence": (8, "Q"),
+    "time_ns": (16, "q"),
+    "scan": (24, "q"),
+    "device_time_ns": (32, "q"),
+    "reused_from": (40, "q"),
+    "source": (48, "i"),
+    "state": (52, "i"),
+    "contact": (56, "i"),
+    "taps_used": (60, "i"),
+    "has_pattern": (64, "i"),
+    "has_deviation": (68, "i"),
+    "another_tap": (72, "i"),
+    "filled": (76, "i"),
+    "dead": (80, "Q"),
+    "fresh": (88, "Q"),
+    "renewed": (96, "Q"),
+    "force_counts": (104, "d"),
+    "force_n": (112, "d"),
+    "area_mm2": (120, "d"),
+    "centroid_x_mm": (128, "d"),
+    "centroid_y_mm": (136, "d"),
+    "interval_mm": (144, "d"),
+    "expected_rmse_mm": (152, "d"),
+    "baseline_age_s": (160, "d"),
+    "run_time_us": (168, "d"),
+    "latency_us": (176, "d"),
+    "sensor": (184, "256s"),
+    "model": (440, "64s"),
+    "wrench_origin": (504, "i"),
+    "has_traction": (508, "i"),
+    "force_x_n": (512, "d"),
+    "force_y_n": (520, "d"),
+    "force_z_n": (528, "d"),
+    "torque_x_n_mm": (536, "d"),
+    "torque_y_n_mm": (544, "d"),
+    "torque_z_n_mm": (552, "d"),
+    "centre_of_pressure_x_mm": (560, "d"),
+    "centre_of_pressure_y_mm": (568, "d"),
+}
+"""Byte and struct's character of what programs in the field read, as version 1 was published."""
 PATIENCE_S = 30
 WRITE = """
 import sys, time
@@ -87,8 +130,8 @@ def writing(memory: memoryview, within_s: float = 0.5) -> bool:
 
 
 def fields(half: bytes) -> dict:
-    names = [name for name, _ in FIELDS]
-    return dict(zip(names, struct_of(FIELDS).unpack_from(half), strict=True))
+    names = [name for name, _ in MEMBERS]
+    return dict(zip(names, struct_of(MEMBERS).unpack_from(half), strict=True))
 
 
 def values(half: bytes, name: str) -> np.ndarray:
@@ -201,13 +244,25 @@ class TestWhatIsThere:
 class TestLayout:
     def test_every_number_lies_at_a_multiple_of_its_size(self):
         sizes = {"I": 4, "i": 4, "Q": 8, "q": 8, "d": 8}
-        for table in (HEADER, FIELDS):
+        for table in (HEADER, MEMBERS):
             offsets = offsets_of(table)
             assert not [field for field, kind in table if offsets[field] % sizes.get(kind, 8)]
         for layout in (Layout(4, 4, 40, 40), Layout(3, 5, 9, 5)):
             assert not [at for _, _, at in layout.maps.values() if at % 8]
             assert layout.half_bytes % 64 == 0 and layout.slot_bytes % 64 == 0
         assert struct_of(HEADER).size <= HEARTBEAT_AT
+
+    def test_what_readers_of_version_1_know_lies_where_it_did(self):
+        offsets, kinds = offsets_of(MEMBERS), dict(MEMBERS)
+        assert {name: (offsets[name], kinds[name]) for name in VERSION_1} == VERSION_1
+        assert [field.byte for field in IN_MEMORY] == [offsets[field.names[0]] for field in IN_MEMORY], "no gap"
+        choices = {field.name: field.kind.words for field in IN_MEMORY if field.kind.words}
+        assert choices == {
+            "source": ("device", "replay", "emulated"),
+            "state": ("zeroing", "incomplete", "idle", "contact", "dropped"),
+            "filled": ("rest", "neighbours"),
+            "wrench_origin": ("nominal", "calibrated"),
+        }
 
     def test_the_header_tells_where_maps_lie(self, sink, name):
         memory = attach(name)
@@ -225,7 +280,7 @@ class TestLayout:
         names = {"I": "u32", "i": "i32", "Q": "u64", "q": "i64", "d": "f64"}
         tables = [
             (str(offsets_of(table)[field]), field, names.get(kind) or f"char[{kind[:-1]}]")
-            for table in (HEADER, FIELDS)
+            for table in (HEADER, MEMBERS)
             for field, kind in table
         ]
         heartbeat = (str(HEARTBEAT_AT), "heartbeat_ns", "i64")

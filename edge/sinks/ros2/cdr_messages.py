@@ -13,7 +13,9 @@ import orjson
 from numpy.typing import NDArray
 
 from edge.perception.event import Event
+from edge.perception.field import Columns, Out
 from edge.perception.result import Result
+from edge.perception.result_fields import FIELDS
 from firmware_bridge.recording.cdr import STD_HEADER, TIME, MessageType, stamp
 
 IMAGE: Final = MessageType(
@@ -36,32 +38,16 @@ LOG: Final = MessageType(
     "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line",
     TIME,
 )
-_NUMBERS: Final = (
-    *("force_counts", "force_n", "area_mm2", "interval_mm", "expected_rmse_mm", "run_time_us", "latency_us"),
-    "baseline_age_s",
-)
+_FIELDS: Final = tuple(field for field in FIELDS if Out.ROS in field.out)
+_NAMES: Final = tuple(name for field in _FIELDS for name in field.names)
+_COLUMNS: Final = Columns(field.in_message() for field in _FIELDS)
+_MEMBERS: Final = "\n".join(f"{field.kind.message} {name}" for field in _FIELDS for name in field.names)
 RESULT: Final = MessageType(
     "tactile_edge_sr/msg/Result",
-    """\
-# What was made of one scan, without its maps. NaN: not known.
+    f"""\
+# What was made of one scan, without its maps. Not known: NaN of numbers, -1 of contact.
 std_msgs/Header header     # wall clock time of the scan; frame_id as of images
-int64 time_ns              # of the scan, monotonic
-int64 scan                 # its number
-string source              # device, replay or emulated
-string state
-string model
-int8 contact               # 1, 0, or -1: not known
-int32 taps_used
-float64 force_counts
-float64 force_n
-float64 area_mm2
-float64 centroid_x_mm
-float64 centroid_y_mm
-float64 interval_mm
-float64 expected_rmse_mm
-float64 run_time_us
-float64 latency_us
-float64 baseline_age_s
+{_MEMBERS}
 string record              # all of it as JSON, as in a line of jsonl:
 """,
     STD_HEADER,
@@ -140,24 +126,10 @@ def wrench(result: Result, unix_ns: int) -> bytes | None:
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
     """A result without its maps; `record` is what edge.sinks.json_record says of it."""
-    x_mm, y_mm = result.centroid_mm or (math.nan, math.nan)
-    numbers = {name: math.nan if (value := getattr(result, name)) is None else value for name in _NUMBERS}
-    return RESULT.encode(
-        {
-            "header": {"stamp": stamp(unix_ns), "frame_id": frame_of(result)},
-            "time_ns": result.scan.time_ns,
-            "scan": result.scan.number,
-            "source": result.source,
-            "state": result.state,
-            "model": result.model,
-            "contact": -1 if result.contact is None else result.contact,
-            "taps_used": result.taps_used,
-            **numbers,
-            "centroid_x_mm": x_mm,
-            "centroid_y_mm": y_mm,
-            "record": orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode(),
-        }
-    )
+    values = dict(zip(_NAMES, _COLUMNS.flat(result), strict=True))
+    values["header"] = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
+    values["record"] = orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode()
+    return RESULT.encode(values)
 
 
 def log_message(event: Event, unix_ns: int) -> bytes:

@@ -5,13 +5,10 @@ from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 from edge.perception.result import Result
+from edge.sinks.json_record import record
 
 SILENCE_S: Final = 1.0
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
-_TOLD: Final = (
-    *("state", "source", "model", "contact", "force_counts", "force_n", "expected_rmse_mm", "interval_mm"),
-    *("wrench_origin", "latency_us", "pattern_unit", "filled", "baseline_age_s", "note"),
-)
 
 
 class Level(IntEnum):
@@ -78,14 +75,10 @@ def _findings(result: Result, silence_s: float | None, trouble: str | None) -> l
 
 
 def _values(result: Result, counters: Mapping[str, int], silence_s: float | None) -> dict[str, str]:
-    values = {name: _text(getattr(result, name)) for name in _TOLD if getattr(result, name) is not None}
-    values["sensor"] = result.scan.sensor
+    values = {name: _text(value) for name, value in record(result, {}).items() if isinstance(value, str | float | int)}
     if silence_s is not None:
         values["scan_age_s"] = _text(silence_s)
     values["dead"] = ", ".join(f"{taxel}: {reason}" for taxel, reason in result.dead.items())
-    if result.baseline is not None:
-        values["baseline"] = result.baseline.id
-        values["baseline_origin"] = result.baseline.origin
     if result.force_n is None and result.wrench is None:
         values["force"] = "counts only, so there is no wrench: --counts-per-newton gives newtons"
     return values | {name: str(count) for name, count in counters.items() if count}

@@ -1,0 +1,197 @@
+"""Description of one field of a result: its kind, and how each output writes it."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Flag, auto
+from functools import partial
+from operator import attrgetter
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from edge.perception.result import Result
+
+Function = Callable[[Any], Any]
+PLACE_IN_HEADER: Final = -1
+"""Stands for the byte of a map in shared memory: it follows from the map's size, so the header gives it."""
+
+
+class Out(Flag):
+    """Outputs that hold a field, besides shared memory, where a field has a byte.
+
+    Attributes:
+        RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
+        NPZ: arrays of a recording.
+        ROS: members of tactile_edge_sr/msg/Result.
+        MAP: maps beside the record: in lines of JSON, in packed messages and as images of MCAP.
+        ALL: all but maps.
+    """
+
+    RECORD = auto()
+    NPZ = auto()
+    ROS = auto()
+    MAP = auto()
+    ALL = RECORD | NPZ | ROS
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """Type of a value in each output.
+
+    Attributes:
+        label: name of the type in JSON.
+        array: numpy's type, in npz.
+        packed: struct's character, in shared memory.
+        message: ROS's type.
+        unknown: stands for an unknown value where there is no null; None where the value is always known.
+        words: the values of a choice. In shared memory they are numbered from 1, so that memory that nobody wrote is
+            none of them, and the order is part of the format.
+        shape: of a map, the name of its shape: "scan", "pattern", "deviation" or "traction".
+        cut: npz cuts a text that is too long, rather than refuse it.
+    """
+
+    label: str
+    array: str = ""
+    packed: str = ""
+    message: str = ""
+    unknown: Any = None
+    words: tuple[str, ...] = ()
+    shape: str = ""
+    cut: bool = False
+
+
+class Column(NamedTuple):
+    """One value to read from a result.
+
+    Attributes:
+        attribute: dotted path from the result.
+        make: makes the value of what the attribute holds, unless that is None.
+        unknown: stands for None.
+    """
+
+    attribute: str
+    make: Function | None
+    unknown: Any
+
+
+class Columns:
+    """Values of several fields of a result, read with one call for all plain attributes."""
+
+    def __init__(self, columns: Iterable[Column]) -> None:
+        columns = tuple(columns)
+        self._get = attrgetter(*(column.attribute for column in columns))
+        self._made = tuple((index, one.make) for index, one in enumerate(columns) if one.make is not None)
+        self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
+        # From the last to the first, so that a vector that is spread out moves none that is still to be.
+        self._vectors = tuple(
+            index for index, _ in reversed(self._unknown) if isinstance(columns[index].unknown, tuple)
+        )
+
+    def of(self, result: Result) -> list[Any]:
+        """Return the values, in the order of the columns."""
+        values = list(self._get(result))
+        for index, make in self._made:
+            if (value := values[index]) is not None:
+                values[index] = make(value)
+        for index, unknown in self._unknown:
+            if values[index] is None:
+                values[index] = unknown
+        return values
+
+    def flat(self, result: Result) -> list[Any]:
+        """Return the values with each vector replaced by its components."""
+        values = self.of(result)
+        for index in self._vectors:
+            values[index : index + 1] = values[index]
+        return values
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of a result, in every output that holds it.
+
+    Attributes:
+        name: in every output; ends with the unit where there is one.
+        kind: type of the value, or of each component of a vector.
+        attribute: dotted path from the result to what the value is made of.
+        text: what it is, for the pages.
+        make: makes the value of the attribute, unless that is None; None takes it as it is.
+        decimals: of a number in JSON.
+        parts: names of a vector's components, where an output holds them one by one.
+        json: makes the value in JSON of the attribute, where `make` and `decimals` do not.
+        out: outputs that hold it.
+        byte: where it begins in a half of shared memory. The layout only grows at its end.
+        left_out: a record has no such key while the value is unknown.
+    """
+
+    name: str
+    kind: Kind
+    attribute: str
+    text: str
+    make: Function | None = None
+    decimals: int | None = None
+    parts: tuple[str, ...] = ()
+    json: Function | None = None
+    out: Out = Out.ALL
+    byte: int | None = None
+    left_out: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its components, or its own."""
+        return self.parts or (self.name,)
+
+    def in_record(self) -> Column:
+        """Return the column of the JSON record, where null stands for what is unknown."""
+        make = self.json
+        if make is None and self.decimals is not None:
+            make = _then(self.make, self._rounding(self.decimals))
+        return Column(self.attribute, make or self.make, None)
+
+    def _rounding(self, decimals: int) -> Function:
+        if self.kind.shape:
+            return lambda values: np.round(values, decimals)
+        if self.parts:
+            return lambda values: [round(value, decimals) for value in values]
+        # Not a partial with a keyword, which costs twice as much: a record rounds a dozen numbers.
+        return lambda value: round(value, decimals)
+
+    def in_array(self) -> Column:
+        """Return the column of the npz; a vector is a tuple."""
+        column = self.in_message()
+        if not self.kind.cut:
+            return column
+        characters = int(self.kind.array.removeprefix("<U"))
+        return column._replace(make=_then(self.make, lambda text: text[:characters]))
+
+    def in_message(self) -> Column:
+        """Return the column of ROS messages; a vector is a tuple."""
+        unknown = self.kind.unknown
+        return Column(self.attribute, self.make, (unknown,) * len(self.parts) if self.parts else unknown)
+
+    def in_memory(self) -> Column:
+        """Return the column of shared memory, as struct packs it; a vector is a tuple."""
+        kind = self.kind
+        if kind.words:
+            numbers = {word: number for number, word in enumerate(kind.words, 1)}
+            return Column(self.attribute, _then(self.make, numbers.__getitem__), None if kind.unknown is None else 0)
+        if kind.packed.endswith("s"):
+            return Column(self.attribute, _then(self.make, partial(_utf8, most_bytes=int(kind.packed[:-1]))), None)
+        return self.in_message()
+
+
+def _then(first: Function | None, second: Function) -> Function:
+    """Join two functions; the second sees no None."""
+    if first is None:
+        return second
+
+    def joined(value: Any) -> Any:
+        made = first(value)
+        return None if made is None else second(made)
+
+    return joined
+
+
+def _utf8(text: str, most_bytes: int) -> bytes:
+    """Return the beginning of a text, never half a character."""
+    return text.encode()[:most_bytes].decode(errors="ignore").encode()

@@ -1,0 +1,202 @@
+"""Table of the fields of a result: every output, and the pages that describe them, are made from it.
+
+A new field is one row here, and the attribute or the function that gives its value. By default it is then in the JSON
+record, the npz and the ROS message, and with a `byte` in shared memory; `python tests/docs/field_tables.py` writes it
+into the pages.
+"""
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from operator import attrgetter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
+from edge.perception.result import Result, mask_bits
+from edge.perception.wrench import Wrench
+from firmware_bridge.scans.scan import Scan, VendorReading
+from firmware_bridge.zeroing.drift_tracker import Drift
+
+
+def _text(characters: int, packed_bytes: int, *, cut: bool = False) -> Kind:
+    return Kind("text", f"<U{characters}", f"{packed_bytes}s", "string", cut=cut)
+
+
+def _one_of(*words: str, unknown: str | None = None) -> Kind:
+    return Kind("text", f"<U{max(map(len, words))}", "i", "string", unknown, words)
+
+
+_REAL: Final = Kind("number", "<f4", "d", "float64", math.nan)
+_NUMBER: Final = Kind("integer", "<i8", "q", "int64")
+_NUMBER_OR_NOT: Final = Kind("integer", "<i8", "q", "int64", -1)
+_SMALL: Final = Kind("integer", "<i2", "i", "int32")
+_BITS: Final = Kind("integer", "<u8", "Q", "uint64")
+_YES_OR_NO: Final = Kind("boolean", "|i1", "i", "int8", -1)
+_IS_THERE: Final = Kind("boolean", "|b1", "i", "bool", False)
+_ID: Final = Kind("text", "<U16", unknown="")
+_TEXT: Final = Kind("text")
+_OBJECT: Final = Kind("object")
+_COUNTS: Final = Kind("array", "<i4", unknown=-1, shape="scan")
+_SCAN: Final = Kind("array", "<f4", unknown=math.nan, shape="scan")
+_PATTERN: Final = Kind("array", "<f4", unknown=0.0, shape="pattern")
+_DEVIATION: Final = Kind("array", "<f4", unknown=0.0, shape="deviation")
+_TRACTION: Final = Kind("array", "<f4", unknown=0.0, shape="traction")
+
+
+def _there(_: object) -> bool:
+    return True
+
+
+def _readings(scan: Scan) -> NDArray[np.int32] | list[list[list[int | None]]]:
+    if scan.complete:
+        return np.ascontiguousarray(scan.counts)
+    readings = scan.counts.astype(object)
+    readings[:, ~scan.fresh] = None
+    return readings.tolist()
+
+
+def _temperature(vendor: VendorReading) -> float | None:
+    return None if vendor.temperature_k is None else float(np.nanmean(vendor.temperature_k))
+
+
+def _dead_bits(dead: Mapping[int, str]) -> int:
+    return sum(1 << taxel for taxel in dead)
+
+
+def _dead_reasons(dead: Mapping[int, str]) -> dict[str, str]:
+    return {str(taxel): reason for taxel, reason in dead.items()}
+
+
+@lru_cache(maxsize=64)  # the same for many scans of a sensor in a row
+def _drift(drift: Drift) -> dict[str, Any]:
+    common = [round(counts, 2) for counts in drift.common_counts]
+    return {"common": common, "own": round(drift.own_counts, 2), "step": round(drift.step_counts, 1)}
+
+
+def _force_and_torque(wrench: Wrench) -> tuple[float, ...]:
+    return wrench.force_n + wrench.torque_n_mm
+
+
+def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
+    centre = wrench.centre_of_pressure_mm
+    return {
+        "force_n": [round(value, 4) for value in wrench.force_n],
+        "torque_n_mm": [round(value, 3) for value in wrench.torque_n_mm],
+        "centre_of_pressure_mm": None if centre is None else [round(value, 3) for value in centre],
+    }
+
+
+_RECORD_NPZ: Final = Out.RECORD | Out.NPZ
+_RECORD_ROS: Final = Out.RECORD | Out.ROS
+_NONE: Final = Out(0)
+_WRENCH_PARTS: Final = (
+    *("force_x_n", "force_y_n", "force_z_n"),
+    *("torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm"),
+)
+_CENTRE_PARTS: Final = ("centre_of_pressure_x_mm", "centre_of_pressure_y_mm")
+
+# fmt: off
+FIELDS: Final = (
+    Field("time_ns", _NUMBER, "scan.time_ns", "monotonic time of arrival (`CLOCK_MONOTONIC`)", byte=16),
+    Field("sensor", _text(64, 256), "scan.sensor", "name of the sensor, such as its controller id",
+          out=_RECORD_NPZ, byte=184),
+    Field("scan", _NUMBER, "scan.number", "number of the scan, of this sensor", byte=24),
+    Field("device_time_ns", _NUMBER_OR_NOT, "scan.device_ns",
+          "when its last reading was on the bus, by the device's own time stamps on the same clock",
+          out=_RECORD_NPZ, byte=32),
+    Field("source", _one_of("device", "replay", "emulated"), "source",
+          "kind of source: a robot acts on `device` alone", byte=48),
+    Field("state", _one_of("zeroing", "incomplete", "idle", "contact", "dropped"), "state",
+          "`incomplete`: a taxel has not arrived yet, or more are dead than can be estimated; "
+          "`dropped`: a newer scan was already waiting", byte=52),
+    Field("model", _text(32, 64, cut=True), "model", "name of the model; npz and shared memory cut a long one",
+          byte=440),
+    Field("fresh", _BITS, "scan.fresh", "bit i: taxel i (row-major from the top left) arrived in this scan",
+          make=mask_bits, out=Out.RECORD, byte=88),
+    Field("renewed", _BITS, "scan.renewed", "bit i: and differs from its reading before",
+          make=mask_bits, out=Out.RECORD, byte=96),
+    Field("contact", _YES_OR_NO, "contact", "whether something touches", byte=56),
+    Field("taps_used", _SMALL, "taps_used", "taps that the pattern was made from", byte=60),
+    Field("has_pattern", _IS_THERE, "pattern", "whether there is a pattern", make=_there, out=Out.NPZ, byte=64),
+    Field("has_deviation", _IS_THERE, "deviation", "whether there is a deviation", make=_there, out=_NONE, byte=68),
+    Field("has_traction", _IS_THERE, "traction", "whether there is a traction", make=_there, out=_NONE, byte=508),
+    Field("force_counts", _REAL, "force_counts", "summed z over the baseline", decimals=1, byte=104),
+    Field("force_n", _REAL, "force_n",
+          "the same in newtons, with `--counts-per-newton`; else the vendor's z force, where its server gives one",
+          decimals=4, out=_RECORD_ROS, byte=112),
+    Field("area_mm2", _REAL, "area_mm2", "touched area", decimals=3, out=_RECORD_ROS, byte=120),
+    Field("centroid_mm", _REAL, "centroid_mm", "centroid of the touched area, from the pad's centre, x right, y down",
+          decimals=4, parts=("centroid_x_mm", "centroid_y_mm"), out=_RECORD_ROS, byte=128),
+    Field("interval_mm", _REAL, "interval_mm",
+          "how far off a touched pixel may be: half of the interval that holds the truth of 90 % of pixels, mean over "
+          "the touched area", decimals=5, byte=144),
+    Field("expected_rmse_mm", _REAL, "expected_rmse_mm",
+          "RMS error, over all pixels, that patterns of the same uncertainty had on taps not trained on",
+          decimals=5, byte=152),
+    Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of it; unknown "
+          "where the model takes no further one", out=_RECORD_NPZ, byte=72),
+    Field("wrench", _REAL, "wrench", "force x, y, z on the pad in N, torque about x, y, z in N mm: see "
+          "[Wrench](formats.md#wrench)", make=_force_and_torque, parts=_WRENCH_PARTS, json=_wrench, out=_RECORD_NPZ,
+          byte=512),
+    Field("centre_of_pressure_mm", _REAL, "wrench", "from the pad's centre, x right, y down; in records part of "
+          "`wrench`", make=attrgetter("centre_of_pressure_mm"), parts=_CENTRE_PARTS, out=Out.NPZ, byte=560),
+    Field("wrench_origin", _one_of("nominal", "calibrated", unknown=""), "wrench_origin",
+          "whether newtons are this sensor's own: see [Wrench](formats.md#wrench)", out=_RECORD_NPZ, byte=504),
+    Field("reused_from", _NUMBER_OR_NOT, "reused_from",
+          "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
+    Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "
+          "pattern was there already", decimals=1, byte=168),
+    Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",
+          decimals=1, out=_RECORD_ROS, byte=176),
+    Field("baseline", _ID, "baseline", "id of the baseline", make=attrgetter("id"), out=_RECORD_NPZ),
+    Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`", make=attrgetter("origin"),
+          out=Out.RECORD),
+    Field("baseline_age_s", _REAL, "baseline_age_s", "how old the baseline is; unknown where the clock was wrong when "
+          "it was stored", decimals=1, byte=160),
+    Field("drift_counts", _OBJECT, "drift", "followed since: `common` on x, y, z, and the largest of a taxel's `own` "
+          "beyond it; `step`: the largest step in rest level that was not followed", json=_drift, out=Out.RECORD),
+    Field("dead", _BITS, "dead", "taxels that are not believed, and why: `{\"3\": \"stuck\", \"7\": \"silent\"}`, "
+          "`saturated`, `far`, `unzeroed`; elsewhere bit i: taxel i. A pattern is then made without them",
+          make=_dead_bits, json=_dead_reasons, out=_RECORD_NPZ, byte=80),
+    Field("filled", _one_of("rest", "neighbours", unknown=""), "filled",
+          "what stands for the dead taxels: an estimate from their `neighbours` "
+          "(`rest` only by earlier releases); unknown while none "
+          "is dead, or no pattern can be made",
+          out=_RECORD_NPZ, byte=76),
+    Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
+          "what is wrong with the baseline", out=Out.RECORD),
+    Field("event", _TEXT, "event", "what happened before this scan: another model and why, what came of zeroing "
+          "again, a step in rest level", out=Out.RECORD),
+    Field("vendor_force_n", _REAL, "scan.vendor_force_n", "force x, y, z on the pad by the vendor's server, while "
+          "every taxel arrives; no such key without", decimals=4, parts=("x", "y", "z"), out=Out.RECORD,
+          left_out=True),
+    Field("temperature_k", _REAL, "scan.vendor", "mean of the sensor's thermometers by the vendor's server; no such "
+          "key without", make=_temperature, decimals=2, out=Out.RECORD, left_out=True),
+    Field("pattern_unit", _TEXT, "pattern_unit", "unit of the pattern and its deviation", out=Out.RECORD),
+    Field("zeroed", _SCAN, "zeroed", "counts over the baseline", out=_NONE, byte=PLACE_IN_HEADER),
+    Field("counts", _COUNTS, "scan", "raw counts x, y, z, so that everything can be computed again; null in records, "
+          "else -1, where a taxel gave no reading", make=attrgetter("counts"), json=_readings, out=_RECORD_NPZ,
+          byte=PLACE_IN_HEADER),
+    Field("pattern", _PATTERN, "pattern", "surface deformation, in `pattern_unit`", decimals=7,
+          out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),
+    Field("deviation", _DEVIATION, "deviation", "standard deviation of each pixel of the pattern, where the model "
+          "gives it", decimals=7, out=Out.NPZ | Out.MAP, byte=PLACE_IN_HEADER),
+    Field("traction", _TRACTION, "traction", "force on the pad per area along x, y and z, in kPa, z into the pad, over "
+          "the same face as the pattern, where the model gives it", decimals=4, out=Out.NPZ | Out.MAP,
+          byte=PLACE_IN_HEADER),
+    Field("baseline_counts", _SCAN, "baseline", "what was subtracted, drift and all; NaN also where a taxel was not "
+          "zeroed", make=attrgetter("counts"), out=Out.NPZ),
+)
+# fmt: on
+"""Every field of a result, in the order of the outputs but for shared memory, whose order is that of the bytes."""
+
+MAPS: Final = tuple(field for field in FIELDS if Out.MAP in field.out)
+
+
+def maps_of(result: Result) -> dict[str, NDArray[np.float32]]:
+    """Return the maps that go beside a record, those that there are, by name."""
+    maps = ((field.name, getattr(result, field.attribute)) for field in MAPS)
+    return {name: values for name, values in maps if values is not None}
