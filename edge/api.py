@@ -57,10 +57,10 @@ from firmware_bridge.errors import (
     SensorFileError,
     SourceError,
 )
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.parse import DEMO_LOOP
-from firmware_bridge.scans.can_id_maps import ID_MAPS
+from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap, layout_c
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
@@ -78,6 +78,8 @@ __all__ = [
     "DEMO_LOOP",
     "DEMO_MODEL",
     "ID_MAPS",
+    "USPA44",
+    "USPA46",
     "Baseline",
     "BaselineRefusedError",
     "BridgeError",
@@ -92,6 +94,7 @@ __all__ = [
     "MessageError",
     "Model",
     "ModelError",
+    "ModelMap",
     "NoDeviceError",
     "Pad",
     "RecordingError",
@@ -100,6 +103,7 @@ __all__ = [
     "Scan",
     "SensorFile",
     "SensorFileError",
+    "SensorGeometry",
     "Sink",
     "SinkClosedError",
     "SinkError",
@@ -116,6 +120,7 @@ __all__ = [
     "demo_recording",
     "devices",
     "examine",
+    "layout_c",
     "load_baselines",
     "load_model",
     "load_sensor_file",
@@ -133,7 +138,7 @@ __all__ = [
 def open_source(
     *texts: str,
     sensor: str | Path | None = None,
-    id_map: str | None = None,
+    id_map: str | ModelMap | None = None,
     rate_hz: float | None = None,
     give_up_s: float = math.inf,
     force: bool = False,
@@ -145,7 +150,8 @@ def open_source(
             "left=slcan:...". Without any, the adapter of the sensor file, or the one that is plugged in.
         sensor: file that `edge-sr doctor` wrote. How its sensors sit, their baselines, their counts per newton and
             their pads hold for every runtime of this source; it goes before what a recording tells.
-        id_map: which CAN id is which taxel, one of ID_MAPS.
+        id_map: which CAN id is which taxel, one of ID_MAPS, and with it which pad; or a map of your own, as `layout_c`
+            makes one of a geometry.
         rate_hz: plays a recording at this rate; of a device, what its patterns' deadlines are by, in [Hz].
         give_up_s: how long a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
         force: use a sensor file of an emulated sensor on a device, which is refused else when the source is opened.
@@ -271,7 +277,9 @@ def open_runtime(
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
         source=kind,
-        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)),
+        # What dead taxels are estimated by was fitted on presses of this pad alone.
+        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if known.geometry == USPA44 else None,
+        geometry=known.geometry,
         baselines=references(baselines, known),
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
@@ -334,6 +342,7 @@ def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.
         contract,
         patient=source.kind == "replay",
         mountings=source.sensor_file.mountings,
+        geometry=source.sensor_file.geometry,
         unix_offset_ns=source.unix_offset_ns,
         source=source.kind,
         origin=source.origin,

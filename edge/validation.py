@@ -6,7 +6,8 @@ from numbers import Integral, Real
 from typing import Any
 
 from edge.errors import UsageError
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.geometry import AXES, SensorGeometry
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -50,8 +51,8 @@ def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
             raise UsageError(f"{got}, expected {geometry.scan_shape}: zero again")
 
 
-def check_pads(pads: Any) -> None:
-    """A pad of all sensors, or pads by the names of theirs, or None.
+def check_pads(pads: Any, geometry: SensorGeometry) -> None:
+    """A pad of all sensors, or pads by the names of theirs, or None; their gains of one grid.
 
     Raises:
         UsageError: it is none of these.
@@ -60,5 +61,28 @@ def check_pads(pads: Any) -> None:
         for name, pad in pads.items():
             if not isinstance(pad, Pad):
                 raise UsageError(f"pad of sensor {name} is a {type(pad).__name__}, expected a Pad")
-    elif pads is not None and not isinstance(pads, Pad):
+            _check_gains(f"pad of sensor {name}", pad, geometry)
+    elif isinstance(pads, Pad):
+        _check_gains("pad", pads, geometry)
+    elif pads is not None:
         raise UsageError(f"pad is a {type(pads).__name__}, expected a Pad, or each by its sensor's name")
+
+
+def _check_gains(name: str, pad: Pad, geometry: SensorGeometry) -> None:
+    expected = len(AXES) * geometry.taxel_count
+    if pad.gains is not None and len(pad.gains) != expected:
+        raise UsageError(
+            f"{name} has {len(pad.gains)} gains, expected {expected}, three for each taxel of a {geometry.name}"
+        )
+
+
+def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry) -> None:
+    """Mountings by the names of their sensors, of one grid.
+
+    Raises:
+        UsageError: one is of another number of taxels.
+    """
+    for name, mounting in mountings.items():
+        if mounting.taxel_count != geometry.taxel_count:
+            got = f"mounting of sensor {name} is of {mounting.taxel_count} taxels"
+            raise UsageError(f"{got}, expected {geometry.taxel_count}: run edge-sr doctor with the sensor's --id-map")

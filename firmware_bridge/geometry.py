@@ -30,6 +30,11 @@ class SensorGeometry:
         """Shape of a scan: (axes, rows, cols)."""
         return (len(AXES), self.rows, self.cols)
 
+    @property
+    def corners(self) -> tuple[int, int, int, int]:
+        """Taxels on the corners: top left, top right, bottom right, bottom left."""
+        return (0, self.cols - 1, self.taxel_count - 1, self.taxel_count - self.cols)
+
     def taxel_centres_mm(self) -> NDArray[np.float64]:
         """Centres of the taxels, (taxel_count, 2), x then y in [mm] from the sensor's centre."""
         x_mm = (np.arange(self.cols) - (self.cols - 1) / 2) * self.pitch_mm
@@ -47,3 +52,15 @@ class SensorGeometry:
 
 
 USPA44: Final = SensorGeometry("uSPa44", rows=4, cols=4, pitch_mm=4.7, width_mm=20.0, height_mm=20.0)
+USPA46: Final = SensorGeometry("uSPa46", rows=4, cols=6, pitch_mm=7.25, width_mm=43.5, height_mm=29.0)
+"""Its outline is taken to end half a pitch beyond the outer taxels."""
+PADS: Final = (USPA44, USPA46)
+"""Pads that are known by name."""
+MOST_TAXELS: Final = 64
+"""Bits of the masks in records and files."""
+
+
+def pad_of(rows: int, cols: int) -> SensorGeometry:
+    """Return the known pad of this grid, or for a recording of another one a geometry without a pitch."""
+    known = next((pad for pad in PADS if (pad.rows, pad.cols) == (rows, cols)), None)
+    return known or SensorGeometry(f"unknown {rows}x{cols}", rows, cols, np.nan, np.nan, np.nan)

@@ -32,6 +32,7 @@ from typing import Final, cast
 import joblib
 
 from edge.terminal.progress_bar import Progress
+from firmware_bridge.geometry import PADS, USPA44
 from train.data.dataset import Sequences, join, load_sequences
 from train.data.generation_config import FORCE_N, Generation, one_thread, random_figures, solve_chunk
 from train.data.workers import start_workers
@@ -172,6 +173,7 @@ def _config(options: argparse.Namespace) -> Generation:
         angle_step_deg=options.angle_step_deg,
         force_n=options.force_n,
         seed=options.seed,
+        pad=options.pad,
     )
 
 
@@ -194,6 +196,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--taps", type=int, default=MAX_TAPS, help=f"in a sequence ({MAX_TAPS})")
     parser.add_argument("--angle-step-deg", type=float, default=ANGLE_STEP_DEG, help="turn between taps (5)")
     parser.add_argument("--force-n", type=float, default=FORCE_N, help="at which presses end (9.2)")
+    parser.add_argument("--pad", choices=[pad.name for pad in PADS], default=USPA44.name, help="sensor model (uSPa44)")
     parser.add_argument("--seed", type=int, default=1, help="of poses and random figures (1)")
     parser.add_argument("--jobs", type=int, default=-1, help="processes, -1 for one on each core (-1)")
     return parser

@@ -56,9 +56,12 @@ def check_id_map(ids: Mapping[int, int], model: ModelMap, half_silent: bool) -> 
     others = {
         name: sensors
         for name, other in ID_MAPS.items()
-        if name != model.name and other.geometry == model.geometry and (sensors := _whole_sensors(ids, other))
+        if name != model.name and (sensors := _whole_sensors(ids, other))
     }
-    if whole and not half_silent:
+    # The ids of a smaller pad may be among those of a larger one: then it is the larger one that speaks.
+    largest = max((ID_MAPS[name].geometry.taxel_count for name in others), default=0)
+    others = {name: sensors for name, sensors in others.items() if ID_MAPS[name].geometry.taxel_count == largest}
+    if whole and not half_silent and largest <= model.geometry.taxel_count:
         return Finding("id map", "ok", f"{model.name}, all ids of sensor {', '.join(whole)} heard", norm)
     if others:
         told = " or ".join(f"{name} (sensor {', '.join(sensors)})" for name, sensors in others.items())

@@ -72,7 +72,8 @@ def examine(watched: Watched, unix_time_s: float) -> Examined:
     samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
     enough = {name: one for name, one in samples.items() if one.enough}
     half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
-    baud = check_baud(watched.facts, watched.counters, watched.duration_s, len(enough), watched.rate_hz)
+    taxels = watched.model.geometry.taxel_count
+    baud = check_baud(watched.facts, watched.counters, watched.duration_s, len(enough), watched.rate_hz, taxels)
     id_map = check_id_map(watched.ids, watched.model, bool(half_silent))
     line_full = baud is not None and baud.verdict == "wrong"
     of_link = [check_link(watched.counters, watched.duration_s), baud]

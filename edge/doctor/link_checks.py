@@ -95,7 +95,12 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
 
 
 def check_baud(
-    facts: LineFacts, counters: Mapping[str, int], duration_s: float, sensors: int, rate_hz: float | None
+    facts: LineFacts,
+    counters: Mapping[str, int],
+    duration_s: float,
+    sensors: int,
+    rate_hz: float | None,
+    taxel_count: int = USPA44.taxel_count,
 ) -> Finding | None:
     """Does the serial line carry what the sensors send? None for what is no serial line.
 
@@ -105,12 +110,13 @@ def check_baud(
         duration_s: for which it was watched, in [s].
         sensors: on the bus.
         rate_hz: of each, where a user expects one, in [Hz].
+        taxel_count: of each.
     """
     frames, received = counters.get("frames", 0), counters.get("received_bytes", 0)
     if facts.baud is None or not frames or not sensors or duration_s <= 0:
         return None
     line_bytes = STAMPED_LINE_BYTES if received / frames > (LINE_BYTES + STAMPED_LINE_BYTES) / 2 else LINE_BYTES
-    carries_hz = capacity_hz(facts.baud, line_bytes, sensors)
+    carries_hz = capacity_hz(facts.baud, line_bytes, sensors, taxel_count)
     used = received * BITS_PER_BYTE / duration_s / facts.baud
     pads = f"{sensors} sensors" if sensors > 1 else "a sensor"
     measured = f"{facts.baud} baud carry {carries_hz:.0f} scans a second of {pads}, {100 * used:.0f} % are used"
@@ -125,9 +131,9 @@ def check_baud(
     return Finding("baud rate", "ok", measured, norm)
 
 
-def capacity_hz(baud: int, line_bytes: int, sensors: int = 1) -> float:
+def capacity_hz(baud: int, line_bytes: int, sensors: int = 1, taxel_count: int = USPA44.taxel_count) -> float:
     """Scans a second of each sensor that a serial line carries, in [Hz]."""
-    return baud / BITS_PER_BYTE / (line_bytes * USPA44.taxel_count * sensors)
+    return baud / BITS_PER_BYTE / (line_bytes * taxel_count * sensors)
 
 
 def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Finding:

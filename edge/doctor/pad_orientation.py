@@ -12,10 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.geometry import USPA44, SensorGeometry
 
+AS_MAPPED: Final = "as the id map says"
+"""Name of the way in which nothing is to be corrected."""
 CORNERS: Final = ("top left", "top right", "bottom right", "bottom left")
-CORNER_PLACES: Final = (0, 3, 15, 12)
 TO_THE_MIDDLE: Final = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 """Signs of x and y of a push from each corner to the middle."""
 FEWEST_CORNERS: Final = 3
@@ -25,16 +26,14 @@ three contradicts, 0 for the other axis."""
 _OFF_THE_MIDDLE: Final = 0.4
 """In pitches: a press nearer to a midline than this is on no corner."""
 
-_GRID: Final = np.arange(USPA44.taxel_count).reshape(USPA44.rows, USPA44.cols)
-
 
 @dataclass(frozen=True)
 class Press:
     """What one corner gave.
 
     Attributes:
-        place: of the corner that was asked for, one of CORNER_PLACES.
-        taxel: the corner of the taxels that answered, one of CORNER_PLACES.
+        place: of the corner that was asked for, one of the geometry's corners.
+        taxel: the corner of the taxels that answered, one of the same.
         z_counts: summed z.
         push_counts: by how much the summed x and y changed when pushed to the middle; None where no push was felt.
     """
@@ -53,17 +52,22 @@ class Axes:
     signs: tuple[int, int]
 
 
-def orders() -> dict[str, tuple[int, ...]]:
-    """The eight ways in which a pad can lie, by name; each gives the taxel of every place."""
+def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
+    """The ways in which a pad can lie, by name; each gives the taxel of every place.
+
+    There are eight, and four where the pad is not square: a quarter turn would make another grid of it.
+    """
+    grid = np.arange(geometry.taxel_count).reshape(geometry.rows, geometry.cols)
+    quarter_turns = range(4) if geometry.rows == geometry.cols else (0, 2)
     turned = {
-        f"turned by {90 * quarters} degrees clockwise" if quarters else "as the id map says": np.rot90(_GRID, -quarters)
-        for quarters in range(4)
+        f"turned by {90 * quarters} degrees clockwise" if quarters else AS_MAPPED: np.rot90(grid, -quarters)
+        for quarters in quarter_turns
     }
     mirrored = {
-        name.replace("as the id map says", "mirrored left to right").replace(
-            "turned", "mirrored, then turned"
-        ): np.rot90(np.fliplr(_GRID), -quarters)
-        for quarters, name in enumerate(turned)
+        name.replace(AS_MAPPED, "mirrored left to right").replace("turned", "mirrored, then turned"): np.rot90(
+            np.fliplr(grid), -quarters
+        )
+        for quarters, name in zip(quarter_turns, turned, strict=True)
     }
     return {name: tuple(grid.ravel().tolist()) for name, grid in (turned | mirrored).items()}
 
@@ -74,28 +78,31 @@ def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
     weights = np.clip(sizes - 0.2 * sizes.max(), 0, None)
     if not weights.sum() > 0:
         return None
-    rows, cols = np.indices(weights.shape)
-    down, right = (float((weights * at).sum() / weights.sum()) - (len(_GRID) - 1) / 2 for at in (rows, cols))
+    down, right = (
+        float((weights * at).sum() / weights.sum()) - (size - 1) / 2
+        for at, size in zip(np.indices(weights.shape), weights.shape, strict=True)
+    )
     if min(abs(down), abs(right)) < _OFF_THE_MIDDLE:
         return None
-    return int(_GRID[0 if down < 0 else -1, 0 if right < 0 else -1])
+    rows, cols = weights.shape
+    return (0 if down < 0 else (rows - 1) * cols) + (0 if right < 0 else cols - 1)
 
 
-def find_order(presses: Sequence[Press]) -> str | None:
-    """Name of the way the pad lies, of `orders`; None where it is none of the eight."""
-    for name, order in orders().items():
+def find_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str | None:
+    """Name of the way the pad lies, of `orders`; None where it is none of them."""
+    for name, order in orders(geometry).items():
         if all(order[press.place] == press.taxel for press in presses):
             return name
     return None
 
 
-def find_axes(presses: Sequence[Press]) -> Axes | None:
+def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> Axes | None:
     """Which way x and y point; None where too few pushes were felt, or where they contradict each other."""
     pushes = [press for press in presses if press.push_counts is not None]
     if len(pushes) < FEWEST_CORNERS:
         return None
     felt = np.array([press.push_counts for press in pushes])
-    expected = np.array([TO_THE_MIDDLE[CORNER_PLACES.index(press.place)] for press in pushes])
+    expected = np.array([TO_THE_MIDDLE[geometry.corners.index(press.place)] for press in pushes])
     # A strong push at one corner must not outvote the others: a vote each.
     votes = np.sign(felt).T @ expected / len(pushes)  # rows: the wire's x and y; columns: the pad's
     for swap in (False, True):
@@ -111,13 +118,13 @@ def z_sign(presses: Sequence[Press]) -> int | None:
     return signs.pop() if len(signs) == 1 else None
 
 
-def why_no_order(presses: Sequence[Press]) -> str:
-    """What in these presses fits none of the eight ways."""
+def why_no_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str:
+    """What in these presses fits none of the ways."""
     answered: Mapping[int, list[int]] = {
-        taxel: [press.place for press in presses if press.taxel == taxel] for taxel in CORNER_PLACES
+        taxel: [press.place for press in presses if press.taxel == taxel] for taxel in geometry.corners
     }
     twice = [places for places in answered.values() if len(places) > 1]
     if twice:
-        names = " and ".join(CORNERS[CORNER_PLACES.index(place)] for place in twice[0])
+        names = " and ".join(CORNERS[geometry.corners.index(place)] for place in twice[0])
         return f"{names} answered at the same corner"
     return "opposite corners do not answer at opposite corners"

@@ -1,11 +1,13 @@
 """What the guided press tells, as findings, and the mounting that sets it right."""
 
+from dataclasses import replace
 from typing import Final
 
 from edge.doctor.findings import Finding, Verdict
-from edge.doctor.pad_orientation import FEWEST_CORNERS, find_axes, find_order, orders, why_no_order, z_sign
+from edge.doctor.pad_orientation import AS_MAPPED, FEWEST_CORNERS, find_axes, find_order, orders, why_no_order, z_sign
 from edge.doctor.press_guide import Answer
-from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
+from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.scans.mounting import Mounting
 
 USUAL_COUNTS_PER_NEWTON: Final = (900.0, 1700.0)
 """Data sheets and a fit give 1150 to 1370."""
@@ -13,13 +15,16 @@ _AGAIN: Final = "press again: run the doctor once more"
 _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 
 
-def judge_press(answer: Answer, kept: bool, weighed: bool) -> tuple[list[Finding], Mounting | None]:
+def judge_press(
+    answer: Answer, kept: bool, weighed: bool, geometry: SensorGeometry = USPA44
+) -> tuple[list[Finding], Mounting | None]:
     """Findings, and the mounting that was found; None while order or axes are not known.
 
     Args:
         answer: of the guided press.
         kept: what is found goes into a sensor file, so that nothing is left to be done.
         weighed: a weight was asked for.
+        geometry: of the sensor.
     """
     presses = answer.presses
     findings: list[Finding] = []
@@ -28,16 +33,17 @@ def judge_press(answer: Answer, kept: bool, weighed: bool) -> tuple[list[Finding
         measured = f"{len(presses)} of 4 corners felt"
         findings = [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")]
     else:
-        turn = find_order(presses)
-        axes, z = find_axes(presses), z_sign(presses)
-        findings.append(_order_finding(turn, "" if turn else why_no_order(presses), kept))
+        turn = find_order(presses, geometry)
+        axes, z = find_axes(presses, geometry), z_sign(presses)
+        findings.append(_order_finding(turn, "" if turn else why_no_order(presses, geometry), kept))
         if axes is None or z is None:
             findings.append(_unclear_axes(sum(press.push_counts is not None for press in presses), z))
         else:
-            found = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z))
+            count = geometry.taxel_count
+            found = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z), taxel_count=count)
             findings.append(_axes_finding(found, kept))
             if turn is not None:
-                mounting = Mounting(orders()[turn], found.swap_xy, found.signs)
+                mounting = replace(found, order=orders(geometry)[turn])
     if weighed:
         findings.append(_force_finding(answer.counts_per_newton, kept))
     return findings, mounting
@@ -48,7 +54,7 @@ def _order_finding(turn: str | None, why: str, kept: bool) -> Finding:
     if turn is None:
         remedy = "the id map has the taxels in another order than any turn of this pad: try another --id-map"
         return Finding("taxel order", "wrong", why, norm, remedy)
-    if orders()[turn] == AS_MAPPED:
+    if turn == AS_MAPPED:
         return Finding("taxel order", "ok", turn, norm)
     return Finding("taxel order", _settled(kept), turn, norm, _use(kept))
 

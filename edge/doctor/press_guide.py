@@ -10,9 +10,9 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, Press, corner_taxel
+from edge.doctor.pad_orientation import CORNERS, Press, corner_taxel
 from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.geometry import USPA44, SensorGeometry
 
 HOLD_SCANS: Final = 20
 FREE_SCANS: Final = 20
@@ -65,11 +65,12 @@ class GuidedPress:
         done: nothing more is asked.
     """
 
-    def __init__(self, weight_g: float | None = None) -> None:
+    def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
         """Prepare to ask; a weight is asked for where its mass is given in [g]."""
+        self._corners = geometry.corners
         self.answer = Answer()
         self.done = False
-        self._held: NDArray[np.float32] = np.zeros(USPA44.scan_shape, dtype=np.float32)
+        self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
         self._dialogue = self._all(weight_g)
         self.first: Final = next(self._dialogue) or ""
 
@@ -90,7 +91,7 @@ class GuidedPress:
             return None
 
     def _all(self, weight_g: float | None) -> Dialogue[None]:
-        for place, name in zip(CORNER_PLACES, CORNERS, strict=True):
+        for place, name in zip(self._corners, CORNERS, strict=True):
             press = yield from _corner(place, name)
             if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
                 break

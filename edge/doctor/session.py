@@ -89,7 +89,8 @@ class Visit:
     def _press_one(self, name: str, examined: Examined, several: bool) -> Mounting | None:
         baseline = examined.baselines[name]
         mounting = self._watch.known.mountings.get(name)
-        guide = GuidedPress(self._options.weight_g)
+        geometry = self._watch.known.geometry
+        guide = GuidedPress(self._options.weight_g, geometry)
         whose = f"Sensor {name}: " if several else ""
         self._say(f"{whose}Hold the pad before you as patterns are to be drawn.")
         self._say(whose + guide.first)
@@ -108,7 +109,7 @@ class Visit:
                 if ask is not None:
                     self._say(whose + ask)
         weighed = self._options.weight_g is not None
-        findings, found = judge_press(guide.answer, self._options.out is not None, weighed)
+        findings, found = judge_press(guide.answer, self._options.out is not None, weighed, geometry)
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
         if guide.answer.counts_per_newton is not None:
             self.newtons[name] = guide.answer.counts_per_newton

@@ -69,12 +69,12 @@ def keep(
     Raises:
         SensorFileError: the file cannot be written, or holds what was not found this time.
     """
-    entries = dict(known.sensors)
+    entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
     for name in sorted({*baselines, *found, *counts_per_newton}):
-        entry = entries.get(name, SensorEntry(assumed=_AS_WIRED))
+        entry = entries.get(name, SensorEntry(as_wired, assumed=_AS_WIRED))
         parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
         renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
-        turned = found.get(name, Mounting())
+        turned = found.get(name, as_wired)
         baseline = baselines.get(name, entry.baseline)
         if baseline is not None and turned.moves_taxels:
             counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
@@ -128,7 +128,7 @@ def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
 
     return [
         *["order and axes"] * lost("mounting", "mounting" not in entry.assumed, "mounting" not in written.assumed),
-        *["gains"] * (entry.mounting.gains != Mounting().gains == written.mounting.gains),
+        *["gains"] * (entry.mounting.evens_gains and not written.mounting.evens_gains),
         *["counts per newton"] * lost("force", entry.counts_per_newton is not None, bool(written.counts_per_newton)),
         *["what is known of the pad"] * (entry.pad is not None and written.pad is None),
         *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),

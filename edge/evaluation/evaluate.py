@@ -25,6 +25,7 @@ def judge(
     frozen: FrozenSet,
     contact_level: float,
     half_width_mm: NDArray[np.floating] | None = None,
+    pitch_mm: float = USPA44.pitch_mm,
 ) -> dict[str, NDArray[np.float64]]:
     """Every metric of every frame, (n,) each.
 
@@ -34,6 +35,7 @@ def judge(
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
         half_width_mm: (n, H, W), of the intervals that are to hold 90 % of pixels, in [mm]; "coverage_90" tells how
             many they hold, and is left out without them.
+        pitch_mm: of the taxels, in [mm].
     """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
     errors = {
@@ -42,9 +44,7 @@ def judge(
         "ssim_global": ssim_global(patterns, truth, full_scale),
         "rmse_percent": rmse_percent(patterns, truth, full_scale),
         "contact_iou": contact_iou(patterns, frozen.touching(), contact_level),
-        "boundary_mm": boundary_distance_mm(
-            patterns, frozen.touching(), contact_level, USPA44.pixel_pitch_mm(frozen.scale)
-        ),
+        "boundary_mm": boundary_distance_mm(patterns, frozen.touching(), contact_level, pitch_mm / frozen.scale),
     }
     if half_width_mm is not None:
         errors["coverage_90"] = interval_coverage(patterns, truth, half_width_mm)
@@ -57,7 +57,7 @@ def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> di
     One run a frame gives the patterns and, where the model has them, the deviations.
     """
     patterns, half_width_mm = infer_with_intervals(model, frozen, given)
-    return judge(patterns, frozen, model.contract.contact_level, half_width_mm)
+    return judge(patterns, frozen, model.contract.contact_level, half_width_mm, model.contract.pitch_mm)
 
 
 def infer_with_intervals(

@@ -177,7 +177,11 @@ class Contract:
         ):
             expected = getattr(self, key)
             if got != expected:
-                raise ModelError(f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}")
+                raise ModelError(
+                    f"contract key '{key}' is {expected!r}, but the sensor's is {got!r}: the model is for a "
+                    f"{self.sensor} of {self.rows} x {self.cols} taxels, the sensor is a {geometry.name} of "
+                    f"{geometry.rows} x {geometry.cols}; give a --model trained for it, or the sensor's own --id-map"
+                )
 
     def check_stands_in(self, other: "Contract") -> None:
         """Refuse to be chosen instead of a model whose patterns mean something else.

@@ -4,6 +4,7 @@ Readings are taken as drawn from one of several kinds of contact, each a zero-me
 edge, a face over the whole pad. The living taxels weigh the kinds, and each says what the dead ones would read.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -18,8 +19,9 @@ from firmware_bridge.recording.npz_reader import read_npz
 RIDGE: Final = 2e-3
 """Of a kind's mean variance, added to every channel: gains and noise of a sensor of its own."""
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
-"""Of deviations with so many taxels dead, that 90 % intervals hold 90 % of pixels: on validation presses, the larger of
-STSR's and MTSR-4's. On contacts unlike those of training it may be too little."""
+"""Of deviations with so many of sixteen taxels dead, that 90 % intervals hold 90 % of pixels: on validation presses,
+the larger of STSR's and MTSR-4's. On contacts unlike those of training it may be too little."""
+_OF_TAXELS: Final = 16
 MOST_BYTES: Final = 1 << 24
 MOST_KINDS: Final = 64
 _AXES: Final = 3
@@ -123,6 +125,11 @@ def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 def ridge_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     """What RIDGE comes to for each of (kinds, n, n)."""
     return RIDGE * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
+
+
+def widening(dead_share: float) -> float:
+    """Return the factor on deviations where this share of the taxels is dead; at most half of them are."""
+    return WIDENING[min(math.ceil(dead_share * _OF_TAXELS), len(WIDENING) - 1)]
 
 
 def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:

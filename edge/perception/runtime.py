@@ -12,13 +12,13 @@ from edge.errors import WindowError
 from edge.inference.contract import Contract
 from edge.inference.expected_error import expect
 from edge.perception.contact_patch import touched, touched_patch
-from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator
+from edge.perception.dead_taxel_fill import TaxelEstimator, widening
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
 from edge.perception.wrench import wrench_of
 from edge.perception.zero_on_demand import REFUSED
-from edge.validation import check_baselines, check_pads, check_positive
+from edge.validation import check_baselines, check_mountings, check_pads, check_positive
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.mounting import Mounting
@@ -65,7 +65,7 @@ class Runtime:
     Args:
         model: the loaded model.
         source: what kind of source the scans come from; every result says it.
-        estimator: of dead taxels; without it there is no pattern while one is dead.
+        estimator: of dead taxels, on the same grid; without it there is no pattern while one is dead.
         geometry: of the sensors; refused if the model was not trained for it.
         baselines: stored baselines by sensor name; a sensor without one is zeroed from its first
             scans, during which its pad must be still and free.
@@ -117,7 +117,8 @@ class Runtime:
                 check_positive(f"counts_per_newton of sensor {name}", counts)
         elif counts_per_newton is not None:
             check_positive("counts_per_newton", counts_per_newton)
-        check_pads(pad)
+        check_pads(pad, geometry)
+        check_mountings(mountings or {}, geometry)
         self._model = model
         self._event: str | None = None
         self._source: SourceKind = source
@@ -300,7 +301,7 @@ class Runtime:
     ) -> Result:
         contract = self._model.contract
         if deviation is not None and result.dead:
-            deviation *= np.float32(WIDENING[len(result.dead)])
+            deviation *= np.float32(widening(len(result.dead) / self._geometry.taxel_count))
         touching = touched(pattern, contract.contact_level)
         area_mm2, centroid_mm = touched_patch(pattern, touching, self._geometry.pixel_pitch_mm(contract.scale))
         interval_mm = expected = None

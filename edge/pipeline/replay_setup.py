@@ -7,11 +7,13 @@ from pathlib import Path
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import settled, with_recorded
 from edge.terminal.progress_bar import Progress
+from firmware_bridge.geometry import PADS, SensorGeometry
 from firmware_bridge.links.parse import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.wrapper import ChangedLink
 from firmware_bridge.recording.formats import npz_baselines
 from firmware_bridge.recording.tracks import Recording
+from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry
@@ -32,7 +34,9 @@ def open_recording(
     replay = ReplayLink(paths, rate_hz, paced=paced)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     link = _FollowedLink(replay, sum(len(track.counts) for track in tracks)) if bar else replay
-    file = settled(sensor, None)
+    # A sensor file says which pad it is; without one the recording's grid does.
+    pad = tracks[0].geometry
+    file = settled(sensor, None if sensor is not None else _named(pad))
     known = with_recorded(file, link)
     recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
@@ -42,7 +46,7 @@ def open_recording(
         sensors |= {track.sensor for track in tracks}
     entries = {
         name: SensorEntry(
-            mountings.get(name, Mounting()),
+            mountings.get(name, Mounting(taxel_count=file.geometry.taxel_count)),
             known.counts_per_newton.get(name),
             baselines.get(name),
             known.pads.get(name),
@@ -51,6 +55,11 @@ def open_recording(
     }
     known = replace(known, sensors=entries)
     return Source(place_recordings(link, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)
+
+
+def _named(pad: SensorGeometry) -> str | ModelMap:
+    """What stands for the id map of a recording's sensors, whose ids are of no use any more."""
+    return pad.name if pad in PADS else ModelMap(pad.name, pad, {})
 
 
 class _FollowedLink(ChangedLink):

@@ -15,17 +15,21 @@ from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, lo
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
 
-def settled(sensor: str | Path | None, id_map: str | None) -> SensorFile:
+def settled(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
     """What is known of the sensors.
 
     Args:
         sensor: what edge-sr doctor wrote, if there is one.
-        id_map: name of an id map, if one was asked for.
+        id_map: name of an id map, or a map of a program's own, if one was asked for.
 
     Raises:
         SensorFileError: the sensor file cannot be used.
         UsageError: no such id map; or the file is of another, and so would be its order and its baseline.
     """
+    if isinstance(id_map, ModelMap):
+        if sensor is not None:
+            raise UsageError(f"id map {id_map.name} of the program's own, and {sensor}: leave one of them out")
+        return SensorFile(id_map.name, own_map=id_map)
     if id_map not in (None, *ID_MAPS):
         raise UsageError(f"id map is {id_map!r}, expected one of: {', '.join(ID_MAPS)}")
     known = SensorFile(id_map or USPA44_MAP.name) if sensor is None else load_sensor_file(sensor)

@@ -29,11 +29,11 @@ from edge.sinks.ros2.cdr_messages import (
 )
 from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.forced_end import finishing
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.recording.cdr import MessageType
-from firmware_bridge.recording.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
-from firmware_bridge.recording.tracks import MOUNTING_METADATA, SOURCE_METADATA
+from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
+from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -55,6 +55,7 @@ class McapSink(Sink):
         *,
         patient: bool = True,
         mountings: Mapping[str, Mounting] | None = None,
+        geometry: SensorGeometry = USPA44,
         unix_offset_ns: int | None = None,
         origin: SourceKind | None = None,
         clock_s: Callable[[], float] = time.monotonic,
@@ -66,6 +67,7 @@ class McapSink(Sink):
             contract: of the model that the run begins with.
             patient: wait for a slow disk, rather than leave records out.
             mountings: of the sensors, by name: without them, axes would point elsewhere when it is played again.
+            geometry: of the sensors.
             unix_offset_ns: what is added to the time of a scan for [ns] since 1970; by default as the clocks are now.
             origin: what kind of source the scans come from, where results are of a recording; else as they say.
             clock_s: monotonic, in [s].
@@ -78,6 +80,7 @@ class McapSink(Sink):
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._baselines: dict[str, Baseline | None] = {}
+        self._scan, self._baseline = scan_type(geometry.taxel_count), baseline_type(geometry.taxel_count)
         self._origin = origin
         self._source_told = False
         self._patient = patient
@@ -87,9 +90,13 @@ class McapSink(Sink):
             self._file = McapFile(path, _PROFILE, f"tactile-edge-sr {_version()}", clock_s)
             try:
                 self._file.add_metadata("contract", {key: json.dumps(one) for key, one in asdict(contract).items()})
-                self._file.add_metadata("geometry", {key: json.dumps(one) for key, one in asdict(USPA44).items()})
+                self._file.add_metadata(
+                    GEOMETRY_METADATA, {key: json.dumps(one) for key, one in asdict(geometry).items()}
+                )
                 for name, mounting in (mountings or {}).items():
-                    text = json.dumps(asdict(mounting))
+                    said = asdict(mounting)
+                    del said["taxel_count"]  # which the geometry tells
+                    text = json.dumps(said)
                     self._file.add_metadata(MOUNTING_METADATA, {"sensor": name, "mounting": text})
             except OSError:
                 self._file.abandon()
@@ -128,9 +135,9 @@ class McapSink(Sink):
                 self._source_told = True
             if result.baseline is not None and self._baselines.get(sensor) is not result.baseline:
                 data = encode_baseline(result.baseline, result.baseline_age_s, unix_ns)
-                self._add(sensor, "baseline", BASELINE, unix_ns, data)
+                self._add(sensor, "baseline", self._baseline, unix_ns, data)
                 self._baselines[sensor] = result.baseline
-            self._add(sensor, "scan", SCAN, unix_ns, encode_scan(scan, unix_ns, said["fresh"], said["renewed"]))
+            self._add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, unix_ns, said["fresh"], said["renewed"]))
             self._add(sensor, "result", RESULT, unix_ns, result_message(result, said, unix_ns))
             for name, values in maps_of(result).items():
                 self._add(sensor, name, IMAGE, unix_ns, image(values, frame_of(result), unix_ns))

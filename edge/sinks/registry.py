@@ -10,6 +10,7 @@ from edge.inference.contract import Contract
 from edge.pipeline.sink import Sink
 from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
+from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.mounting import Mounting
 
@@ -58,6 +59,7 @@ def open_sink(
     *,
     patient: bool = True,
     mountings: Mapping[str, Mounting] | None = None,
+    geometry: SensorGeometry = USPA44,
     unix_offset_ns: int | None = None,
     source: str | None = None,
     origin: SourceKind | None = None,
@@ -70,6 +72,7 @@ def open_sink(
         contract: says which maps will come, and their shapes.
         patient: wait for slow readers, rather than leave records out.
         mountings: of the sensors, by name.
+        geometry: of the sensors.
         unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
         source: kind of what is read, told with events.
         origin: what kind of source the scans come from, where they are of a recording that tells.
@@ -108,6 +111,7 @@ def open_sink(
             contract,
             patient=patient,
             mountings=mountings,
+            geometry=geometry,
             unix_offset_ns=unix_offset_ns,
             origin=origin,
         )

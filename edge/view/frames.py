@@ -9,7 +9,6 @@ from edge.perception.event import Event
 from edge.sinks.binary_message import pack
 from edge.sinks.json_record import encodable, event_record, record
 from edge.view.run_snapshot import Heard, Newest, Point, Told
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import SourceKind
 
 VERSION: Final = 1
@@ -110,7 +109,7 @@ def hello(run: Run, recording: Path | None) -> bytes:
         "taps": contract.taps,
         "pattern_unit": contract.output_unit,
         "full_scale": contract.output_full_scale,
-        "pixel_pitch_mm": USPA44.pixel_pitch_mm(contract.scale),
+        "pixel_pitch_mm": contract.pitch_mm / contract.scale,
         "taxel_pitch_mm": contract.pitch_mm,
         "rows": contract.rows,
         "cols": contract.cols,

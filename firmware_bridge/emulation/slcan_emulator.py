@@ -18,7 +18,6 @@ from firmware_bridge.emulation.faults.lines import Piece
 from firmware_bridge.emulation.pty_port import COUNTED_LATE_NS, PseudoPort
 from firmware_bridge.emulation.xela_controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 _STOP_POLL_S: Final = 0.05
 _DRAIN_POLL_S: Final = 0.01
@@ -94,7 +93,7 @@ class Emulator:
         )
         self._latency_s = latency_s
         self._on_scan = on_scan
-        self._last_frames = {USPA44_MAP.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
+        self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
         self._faults = faults
         self._resets = 0
         self._elsewhere = False

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, CanFrame, encode_frame
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import ABSENT
 
 FRAME_S: Final = 0.000_13
@@ -23,18 +22,21 @@ FRAME_S: Final = 0.000_13
 CR: Final = b"\r"
 BEL: Final = b"\a"
 _LONGEST_COMMAND: Final = 32
+_SHAPES: Final = tuple(dict.fromkeys(model.geometry.scan_shape for model in ID_MAPS.values()))
 _RIGHT_BITRATE: Final = 8
 _WRONG_BITRATE: Final = 6
 
 
-def scan_frames(counts: NDArray[np.int32], controller: int, noise: random.Random) -> list[CanFrame]:
-    """One scan (3, 4, 4) as a controller sends it: a frame per taxel, by SDA, then by taxel on it.
+def scan_frames(
+    counts: NDArray[np.int32], controller: int, noise: random.Random, model: ModelMap = USPA44_MAP
+) -> list[CanFrame]:
+    """One scan (3, rows, cols) as a controller sends it: a frame per taxel, by SDA, then by taxel on it.
 
     Absent taxels send nothing. The bytes that carry no reading are filled from `noise`, never zero.
     """
     frames: list[CanFrame] = []
     by_taxel = counts.reshape(3, -1).T.tolist()
-    for can_id, taxel in USPA44_MAP.wire_order(str(controller)):
+    for can_id, taxel in model.wire_order(str(controller)):
         x, y, z = by_taxel[taxel]
         if x != ABSENT:
             words = b"".join(value.to_bytes(2, "big") for value in (x, y, z))
@@ -43,11 +45,12 @@ def scan_frames(counts: NDArray[np.int32], controller: int, noise: random.Random
 
 
 class Controller(NamedTuple):
-    """One sensor on the bus: what it plays, under which id 0..15, and how many scans a second."""
+    """One sensor on the bus: what it plays, under which id 0..15, how many scans a second, of which pad."""
 
     track: Track
     can_id: int
     rate_hz: float
+    model: ModelMap = USPA44_MAP
 
 
 def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate_hz: float | None) -> list[Controller]:
@@ -68,16 +71,17 @@ def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate
         raise ValueError(f"controllers are {list(can_ids)}, expected {len(tracks)} different ones of 0..15")
     controllers: list[Controller] = []
     for (recording, track), can_id in zip(tracks, can_ids, strict=True):
-        if track.counts.shape[1:] != USPA44.scan_shape:
-            got = track.counts.shape[1:]
-            raise RecordingError(f"{recording.path}: scans of shape {got}, expected {USPA44.scan_shape}")
+        model = ID_MAPS.get(track.geometry.name)
+        if model is None:
+            got, known = track.counts.shape[1:], ", ".join(map(str, _SHAPES))
+            raise RecordingError(f"{recording.path}: scans of shape {got}, expected one of {known}")
         known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
         own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
         if own_rate_hz is None:
             raise RecordingError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
         if not 0 < own_rate_hz < math.inf:
             raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
-        controllers.append(Controller(track, can_id, own_rate_hz))
+        controllers.append(Controller(track, can_id, own_rate_hz, model))
     return controllers
 
 
@@ -107,7 +111,7 @@ def _lane(
         for counts in controller.track.counts:
             # The grid stays where it is however much single scans jitter; a scan waits for the one before.
             time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
-            for frame in scan_frames(counts, controller.can_id, noise):
+            for frame in scan_frames(counts, controller.can_id, noise, controller.model):
                 yield time_s, frame
                 time_s += frame_s
             number, free_s = number + 1, time_s

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.errors import SourceError
+from firmware_bridge.geometry import SensorGeometry
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.merged import NamedLink, SeveralLinks
 from firmware_bridge.links.reconnecting import LastingLink
@@ -108,7 +109,7 @@ def open_source(
     if scheme == "slcan":
         return _slcan(text, rest, model)
     if scheme == "xela-server" and rest:
-        return _placed(_xela_server(rest), mountings, tells_newtons=True)
+        return _placed(_xela_server(rest, model.geometry), mountings, tells_newtons=True)
     if text == "gs_usb" or (scheme == "gs_usb" and rest):
         from firmware_bridge.links.gs_usb_link import GsUsbLink
 
@@ -162,10 +163,10 @@ def _slcan_link(port: str, baud: int | None, model: ModelMap) -> "SlcanSerialLin
     return SlcanSerialLink(port, DEFAULT_BAUD if baud is None else baud, model=model, triggers=trigger_frames(model))
 
 
-def _xela_server(url: str) -> Link:
+def _xela_server(url: str, geometry: SensorGeometry) -> Link:
     from firmware_bridge.links.xela_server import XelaServerLink
 
-    return XelaServerLink(url)
+    return XelaServerLink(url, geometry=geometry)
 
 
 def _is_of(sensor: str, source: str) -> bool:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import LAST_TIME_NS, Recording, Track
@@ -68,7 +67,7 @@ class ReplayLink(Link):
         self.patient = not paced
         self.origin = one_origin(recording.origin for recording in self.recordings)
         self.mountings = {
-            track.sensor: recording.mountings.get(track.sensor, Mounting())
+            track.sensor: recording.mountings.get(track.sensor, Mounting(taxel_count=track.geometry.taxel_count))
             for recording in self.recordings
             if recording.mountings
             for track in recording.tracks
@@ -84,7 +83,7 @@ class ReplayLink(Link):
         sensors = [track.sensor for track in self._tracks]
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
-        self._series = [ScanSeries(track.sensor, USPA44) for track in self._tracks]
+        self._series = [ScanSeries(track.sensor, track.geometry) for track in self._tracks]
         dues = (_lane(lane, due_times_ns) for lane, (_, due_times_ns) in enumerate(lanes))
         self._timeline = heapq.merge(*dues, key=lambda due: due.due_ns)
         self._next: _Due | None = next(self._timeline, None)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
@@ -39,7 +39,15 @@ MOST_NPZ_BYTES: Final = 1 << 31
 RATES_HZ: Final = (1e-3, 1e5)
 """Beyond them periods in ns overflow, or are none."""
 
-CSV_HEADER: Final = tuple(f"txl{taxel}_{axis}" for taxel in range(1, USPA44.taxel_count + 1) for axis in AXES)
+
+def csv_header(taxel_count: int) -> tuple[str, ...]:
+    """Return the columns of so many taxels."""
+    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
+
+
+CSV_HEADER: Final = csv_header(USPA44.taxel_count)
+_CSV_PADS: Final = {len(AXES) * pad.taxel_count: pad for pad in PADS}
+"""A CSV names no pad: the number of its columns does."""
 _META_NAME: Final = "meta_data.csv"
 _META_RATE: Final = "frequency_hz"
 _A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
@@ -71,13 +79,13 @@ def _load_csv(path: Path) -> Recording:
     header = next(rows, None)
     if header is None:
         _refuse(path, 1, "an empty file", "a header and rows of counts")
-    _check_header(path, header)
+    pad = _pad_of_header(path, header)
     values = array("i")  # a list of rows would take ten times the file
     for line, row in enumerate(rows, 2):
-        values.extend(_count_row(path, line, row))
+        values.extend(_count_row(path, line, row, len(header)))
     if not values:
         _refuse(path, 2, "the end of the file", "a row of counts")
-    taxels = np.frombuffer(values, dtype=np.int32).reshape(-1, USPA44.rows, USPA44.cols, len(AXES))
+    taxels = np.frombuffer(values, dtype=np.int32).reshape(-1, pad.rows, pad.cols, len(AXES))
     counts = np.ascontiguousarray(taxels.transpose(0, 3, 1, 2))
     return Recording(path, (Track(path.stem, counts, time_ns=None),), _meta_rate_hz(path.with_name(_META_NAME)))
 
@@ -112,24 +120,30 @@ def _csv_row(path: Path, number: int, line: bytes) -> list[str]:
         raise RecordingError(f"{path}, line {number}: not CSV: {error}") from error
 
 
-def _check_header(path: Path, header: list[str]) -> None:
+def _pad_of_header(path: Path, header: list[str]) -> SensorGeometry:
     names = tuple(name.strip() for name in header)
-    if names == CSV_HEADER:
-        return
-    if sorted(names) == sorted(CSV_HEADER):
+    pad = _CSV_PADS.get(len(names), USPA44)
+    expected = csv_header(pad.taxel_count)
+    if sorted(names) != sorted(expected):
+        text = f"{len(expected)}: {_header_text(expected)}"
+        _refuse(path, 1, f"{len(names)} columns: {', '.join(names[:4])[:60]}, ...", text)
+    if names != expected:
         _refuse(
-            path, 1, f"columns {', '.join(names[:4])}, ...", f"x, y, z of each taxel side by side: {_header_text()}"
+            path,
+            1,
+            f"columns {', '.join(names[:4])}, ...",
+            f"x, y, z of each taxel side by side: {_header_text(expected)}",
         )
-    _refuse(path, 1, f"{len(names)} columns: {', '.join(names[:4])[:60]}, ...", f"{len(CSV_HEADER)}: {_header_text()}")
+    return pad
 
 
-def _header_text() -> str:
-    return f"{', '.join(CSV_HEADER[:4])}, ..., {CSV_HEADER[-1]}"
+def _header_text(header: tuple[str, ...]) -> str:
+    return f"{', '.join(header[:4])}, ..., {header[-1]}"
 
 
-def _count_row(path: Path, line: int, row: list[str]) -> list[int]:
-    if len(row) != len(CSV_HEADER):
-        _refuse(path, line, f"{len(row)} columns", f"{len(CSV_HEADER)}")
+def _count_row(path: Path, line: int, row: list[str], columns: int) -> list[int]:
+    if len(row) != columns:
+        _refuse(path, line, f"{len(row)} columns", f"{columns}")
     return [_count(path, line, cell.strip()) for cell in row]
 
 
@@ -215,7 +229,8 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
         return {}
     ids, counts, ages_s = (arrays[name] for name in _NPZ_BASELINE)
     scans = len(arrays["sensor"])
-    for name, kind, shape in zip(_NPZ_BASELINE, "Uff", ((scans,), (scans, *USPA44.scan_shape), (scans,)), strict=True):
+    scan_shape = recording.tracks[0].counts.shape[1:]
+    for name, kind, shape in zip(_NPZ_BASELINE, "Uff", ((scans,), (scans, *scan_shape), (scans,)), strict=True):
         if arrays[name].dtype.kind != kind or arrays[name].shape != shape:
             _refuse_array(path, name, f"{arrays[name].dtype} of shape {arrays[name].shape}", f"shape {shape}")
     baselines: dict[str, Baseline] = {}
@@ -263,8 +278,11 @@ def _npz_times(path: Path, sensor: str, times: NDArray[np.integer]) -> NDArray[n
 
 
 def _check_npz_counts(path: Path, counts: NDArray[Any]) -> NDArray[np.int32]:
-    if counts.dtype.kind not in "iu" or counts.shape[1:] != USPA44.scan_shape or counts.size == 0:
-        expected = f"whole numbers of shape (scans, {str(USPA44.scan_shape)[1:]}, at least one scan"
+    shape = counts.shape
+    grid = len(shape) == 4 and shape[1] == len(AXES) and 0 < shape[2] * shape[3] <= MOST_TAXELS
+    if counts.dtype.kind not in "iu" or not grid or counts.size == 0:
+        most = f"{MOST_TAXELS} taxels at most"
+        expected = f"whole numbers of shape (scans, {len(AXES)}, rows, cols), {most}, at least one scan"
         _refuse_array(path, "counts", f"{counts.dtype} of shape {counts.shape}", expected)
     if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
         got = f"counts {counts.min()}..{counts.max()}"

@@ -9,7 +9,7 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,10 +24,11 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from firmware_bridge.errors import CdrError, RecordingError
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.geometry import MOST_TAXELS, USPA44, SensorGeometry
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
-from firmware_bridge.recording.scan_messages import BASELINE, SCAN, decode_baseline, decode_scan
+from firmware_bridge.recording.scan_messages import SCAN_NAME, baseline_type, decode_baseline, decode_scan, scan_type
 from firmware_bridge.recording.tracks import (
+    GEOMETRY_METADATA,
     MOST_SENSORS,
     MOUNTING_METADATA,
     SOURCE_METADATA,
@@ -112,6 +113,7 @@ class _Reading:
         self._baselines: dict[str, Baseline] = {}
         self._latest: dict[str, Baseline] = {}
         self._mountings: dict[str, Mounting] = {}
+        self._geometry = USPA44  # of files that name none
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._notes: list[str] = []
@@ -138,7 +140,8 @@ class _Reading:
             raise _DamageError(f"a record that cannot be read ({_short(error)})") from error
 
     def _take_schema(self, schema: Schema) -> None:
-        known = {kind.name: kind for kind in (SCAN, BASELINE)}.get(schema.name)
+        taxels = self._geometry.taxel_count
+        known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels))}.get(schema.name)
         if known is not None and (schema.encoding, schema.data) != ("ros2msg", known.definition.encode()):
             raise RecordingError(f"{self._path}: its {known.name} is of another release of edge-sr than this one")
         self._schemas[schema.id] = known
@@ -146,6 +149,8 @@ class _Reading:
     def _take_metadata(self, metadata: Metadata) -> None:
         if metadata.name == SOURCE_METADATA:
             self._origin = origin_of({metadata.metadata.get("kind", ""), self._origin or ""} - {""})
+        if metadata.name == GEOMETRY_METADATA:
+            self._take_geometry(metadata.metadata)
         if metadata.name != MOUNTING_METADATA:
             return
         sensor = metadata.metadata.get("sensor", "")
@@ -154,12 +159,26 @@ class _Reading:
             order, signs, gains = (tuple(said[key]) for key in ("order", "signs", "gains"))
             if not all(type(value) is int for value in (*order, *signs)) or type(said["swap_xy"]) is not bool:
                 raise ValueError("not whole numbers")
-            mounting = Mounting(order, said["swap_xy"], signs, tuple(map(float, gains)))
+            mounting = Mounting(order, said["swap_xy"], signs, tuple(map(float, gains)), self._geometry.taxel_count)
         except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
             raise RecordingError(f"{self._path}: no mounting of sensor {sensor[:20]!r}: {_short(error)}") from error
         if not is_sensor_name(sensor) or len(self._mountings) >= MOST_SENSORS:
             raise RecordingError(f"{self._path}: a mounting of sensor {sensor[:20]!r}, expected those of its sensors")
         self._mountings[sensor] = mounting
+
+    def _take_geometry(self, said: Mapping[str, str]) -> None:
+        try:
+            geometry = SensorGeometry(**{key: json.loads(text) for key, text in said.items()})
+            sizes = (geometry.rows, geometry.cols)
+            if not all(type(size) is int and size > 0 for size in sizes) or not is_sensor_name(geometry.name):
+                raise ValueError("no grid of taxels")
+            if self._schemas and geometry.taxel_count != self._geometry.taxel_count:
+                raise ValueError("it stands after the first message's definition")
+            if geometry.taxel_count > MOST_TAXELS:
+                raise ValueError(f"{geometry.taxel_count} taxels, expected at most {MOST_TAXELS}")
+        except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+            raise RecordingError(f"{self._path}: no geometry of its sensors: {_short(error)}") from error
+        self._geometry = geometry
 
     def _take_message(self, data: memoryview) -> None:
         try:
@@ -170,15 +189,15 @@ class _Reading:
         if topic is None or topic.kind is None:
             return
         try:
-            if topic.kind is SCAN:
+            if topic.kind.name == SCAN_NAME:
                 self._take_scan(data[_MESSAGE.size :], log_ns)
             else:
-                self._take_baseline(decode_baseline(data[_MESSAGE.size :]))
+                self._take_baseline(decode_baseline(data[_MESSAGE.size :], self._geometry))
         except CdrError as error:
             raise RecordingError(f"{self._path}, topic {topic.name!r}: {error}") from error
 
     def _take_scan(self, data: memoryview, log_ns: int) -> None:
-        scan = decode_scan(data)
+        scan = decode_scan(data, self._geometry)
         lane = self._lanes.get(scan.sensor)
         if lane is None:
             if len(self._lanes) == MOST_SENSORS:
@@ -230,7 +249,7 @@ class _Reading:
     def recording(self) -> Recording:
         if not self._lanes:
             raise RecordingError(f"{self._path}: no scans that edge-sr recorded{self._instead()}")
-        tracks = tuple(_track(sensor, lane) for sensor, lane in self._lanes.items())
+        tracks = tuple(_track(sensor, lane, self._geometry) for sensor, lane in self._lanes.items())
         mountings = {name: one for name, one in self._mountings.items() if name in self._lanes}
         baselines = {name: one for name, one in self._baselines.items() if name in self._lanes}
         return Recording(
@@ -311,18 +330,19 @@ def _unpacked(chunk: Chunk) -> bytes:
     return data
 
 
-def _track(sensor: str, lane: _Lane) -> Track:
+def _track(sensor: str, lane: _Lane, geometry: SensorGeometry) -> Track:
     scans = len(lane.times_ns)
     masks = np.frombuffer(lane.renewed, "<u8").astype("<u8").view(np.uint8).reshape(scans, 8)
-    renewed = np.unpackbits(masks, axis=1, count=USPA44.taxel_count, bitorder="little").astype(bool)
+    renewed = np.unpackbits(masks, axis=1, count=geometry.taxel_count, bitorder="little").astype(bool)
     return Track(
         sensor,
-        np.frombuffer(lane.counts, np.int32).reshape(scans, *USPA44.scan_shape),
+        np.frombuffer(lane.counts, np.int32).reshape(scans, *geometry.scan_shape),
         np.frombuffer(lane.times_ns, np.int64),
         np.frombuffer(lane.numbers, np.int64),
         np.frombuffer(lane.device_times_ns, np.int64),
-        renewed.reshape(scans, USPA44.rows, USPA44.cols),
+        renewed.reshape(scans, geometry.rows, geometry.cols),
         tuple(map(lane.vendor.get, range(scans))) if lane.vendor else None,
+        geometry,
     )
 
 

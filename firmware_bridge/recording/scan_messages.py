@@ -1,12 +1,13 @@
 """A scan and a baseline as messages: all that is needed to play a recording again, bit for bit. No I/O."""
 
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import CdrError
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
@@ -14,11 +15,9 @@ from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
 
-_ALL: Final = (1 << USPA44.taxel_count) - 1
-
-SCAN: Final = MessageType(
-    "tactile_edge_sr/msg/Scan",
-    """\
+SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"
+BASELINE_NAME: Final = "tactile_edge_sr/msg/Baseline"
+_SCAN_TEXT: Final = """\
 # One reading of all taxels of one sensor, raw.
 std_msgs/Header header          # wall clock time of time_ns; frame_id is the sensor
 string sensor
@@ -27,16 +26,12 @@ int64 time_ns                   # monotonic, when its newest reading arrived
 int64 device_time_ns            # the same by the device's own time stamps; -1 without
 uint64 fresh                    # bit i: taxel i, row-major from the top left, gave a reading
 uint64 renewed                  # bit i: fresh, and another reading than before
-int32[48] counts                # [axis x, y, z][row][column]; -1 where not fresh
+int32[{counts}] counts                # [axis x, y, z][row][column]; -1 where not fresh
 float32[] vendor_newtons        # the same, by the vendor's software; empty where it tells none
 float32[] vendor_temperature_k  # [row][column], empty where it tells none
 float32[] vendor_ups_hz         # [row][column], empty where it tells none
-""",
-    STD_HEADER,
-)
-BASELINE: Final = MessageType(
-    "tactile_edge_sr/msg/Baseline",
-    """\
+"""
+_BASELINE_TEXT: Final = """\
 # What is subtracted from a sensor's scans from the next one on, drift and all.
 std_msgs/Header header
 string sensor
@@ -45,14 +40,28 @@ string origin                   # start-up, demand, or file
 float64 created_unix_s          # when it was taken, since 1970
 int32 scans                     # that it is the median of
 float64 age_s                   # NaN where a clock was wrong
-float32[48] counts              # [axis x, y, z][row][column]; NaN where a taxel was not zeroed
-""",
-    STD_HEADER,
-)
+float32[{counts}] counts              # [axis x, y, z][row][column]; NaN where a taxel was not zeroed
+"""
+
+
+@lru_cache
+def scan_type(taxel_count: int) -> MessageType:
+    """Return the message of a scan of so many taxels."""
+    return MessageType(SCAN_NAME, _SCAN_TEXT.format(counts=len(AXES) * taxel_count), STD_HEADER)
+
+
+@lru_cache
+def baseline_type(taxel_count: int) -> MessageType:
+    """Return the message of a baseline of so many taxels."""
+    return MessageType(BASELINE_NAME, _BASELINE_TEXT.format(counts=len(AXES) * taxel_count), STD_HEADER)
+
+
+SCAN: Final = scan_type(USPA44.taxel_count)
+BASELINE: Final = baseline_type(USPA44.taxel_count)
 
 
 class RecordedScan(NamedTuple):
-    """What a message says of a scan, checked; numbers as `SCAN` has them."""
+    """What a message says of a scan, checked; numbers as `scan_type` has them."""
 
     sensor: str
     number: int
@@ -67,7 +76,7 @@ class RecordedScan(NamedTuple):
 def encode_scan(scan: Scan, unix_ns: int, fresh: int, renewed: int) -> bytes:
     """A scan that came at `unix_ns` [ns] since 1970; `fresh` and `renewed` are its masks as numbers."""
     vendor = VendorReading() if scan.vendor is None else scan.vendor
-    return SCAN.encode(
+    return scan_type(scan.fresh.size).encode(
         {
             "header": {"stamp": stamp(unix_ns), "frame_id": scan.sensor},
             "sensor": scan.sensor,
@@ -84,28 +93,29 @@ def encode_scan(scan: Scan, unix_ns: int, fresh: int, renewed: int) -> bytes:
     )
 
 
-def decode_scan(data: bytes | memoryview) -> RecordedScan:
+def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> RecordedScan:
     """The scan in a message.
 
     Raises:
         CdrError: it is none, or says what no scan says.
     """
-    said = SCAN.decode(data)
+    said = scan_type(geometry.taxel_count).decode(data)
     sensor, number, fresh, renewed = said["sensor"], said["number"], said["fresh"], said["renewed"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
     _check(0 <= number <= LAST_TIME_NS, "number", number, f"0..{LAST_TIME_NS}")
     for name, least in (("time_ns", 0), ("device_time_ns", -1)):
         _check(least <= said[name] <= LAST_TIME_NS, name, said[name], f"{least}..{LAST_TIME_NS}")
-    _check(fresh <= _ALL and renewed & ~fresh == 0, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
-    counts = said["counts"].reshape(USPA44.scan_shape)
+    right = fresh < 1 << geometry.taxel_count and renewed & ~fresh == 0
+    _check(right, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
+    counts = said["counts"].reshape(geometry.scan_shape)
     low, high = int(counts.min()), int(counts.max())
     _check(low >= ABSENT and high <= HIGHEST_COUNT, "counts", (low, high), f"{ABSENT}..{HIGHEST_COUNT}")
     absent = counts == ABSENT
-    told = mask(fresh)
+    told = mask(fresh, geometry)
     _check(bool((absent == ~told).all()), "counts", "readings", "one on each axis of a fresh taxel, none of others")
     _check_vendor(said)
     vendor = {
-        "newtons": _vendor(said, "vendor_newtons", USPA44.scan_shape),
+        "newtons": _vendor(said, "vendor_newtons", geometry.scan_shape),
         "temperature_k": _vendor(said, "vendor_temperature_k", told.shape),
         "ups_hz": _vendor(said, "vendor_ups_hz", told.shape),
     }
@@ -119,7 +129,7 @@ def decode_scan(data: bytes | memoryview) -> RecordedScan:
 
 def encode_baseline(baseline: Baseline, age_s: float | None, unix_ns: int) -> bytes:
     """A baseline that comes into use at `unix_ns` [ns] since 1970."""
-    return BASELINE.encode(
+    return baseline_type(baseline.counts[0].size).encode(
         {
             "header": {"stamp": stamp(unix_ns), "frame_id": baseline.sensor},
             "sensor": baseline.sensor,
@@ -134,13 +144,13 @@ def encode_baseline(baseline: Baseline, age_s: float | None, unix_ns: int) -> by
     )
 
 
-def decode_baseline(data: bytes | memoryview) -> Baseline:
+def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> Baseline:
     """The baseline in a message, as of a file.
 
     Raises:
         CdrError: it is none, or says what no baseline says.
     """
-    said = BASELINE.decode(data)
+    said = baseline_type(geometry.taxel_count).decode(data)
     sensor, created_unix_s, scans = said["sensor"], said["created_unix_s"], said["scans"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
     _check(is_sensor_name(said["id"]), "id", said["id"], "a short text")
@@ -151,17 +161,17 @@ def decode_baseline(data: bytes | memoryview) -> Baseline:
     else:
         _check(0 < created_unix_s <= LAST_UNIX_S, "created_unix_s", created_unix_s, "seconds since 1970, or none")
     _check(scans >= 1, "scans", scans, "a whole number from 1")
-    counts = np.array(said["counts"].reshape(USPA44.scan_shape))
+    counts = np.array(said["counts"].reshape(geometry.scan_shape))
     inside = np.isnan(counts) | ((counts >= 0) & (counts <= HIGHEST_COUNT + 1))
     _check(bool(inside.all()), "counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
     counts.setflags(write=False)
     return Baseline(sensor, counts, created_unix_s, scans, "file", said["id"])
 
 
-def mask(bits: int) -> NDArray[np.bool_]:
+def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:
     """A number as a (rows, cols) mask: bit i is taxel i, row-major from the top left."""
     taxels = np.unpackbits(np.frombuffer(bits.to_bytes(8, "little"), np.uint8), bitorder="little")
-    return taxels[: USPA44.taxel_count].astype(bool).reshape(USPA44.rows, USPA44.cols)
+    return taxels[: geometry.taxel_count].astype(bool).reshape(geometry.rows, geometry.cols)
 
 
 def _check_vendor(said: dict[str, Any]) -> None:

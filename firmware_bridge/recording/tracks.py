@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.geometry import SensorGeometry, pad_of
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.schedule import NS_PER_S
 
@@ -15,8 +16,10 @@ if TYPE_CHECKING:
     from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
+GEOMETRY_METADATA: Final = "geometry"
+"""Of an MCAP file: the pad of all its sensors."""
 MOUNTING_METADATA: Final = "mounting"
-"""Of an MCAP file: one a sensor."""
+"""The same: one a sensor."""
 SOURCE_METADATA: Final = "source"
 """The same: what kind of source it was."""
 HIGHEST_COUNT: Final = 0xFFFF
@@ -38,6 +41,7 @@ class Track:
         device_time_ns: (n,) int64, on the same clock as `time_ns`; -1 where the device gave none.
         renewed: (n, rows, cols) bool, which readings were new.
         vendor: (n,) of what the vendor's software said.
+        pad: as the file names it; None if it does not.
     """
 
     sensor: str
@@ -47,6 +51,12 @@ class Track:
     device_time_ns: NDArray[np.int64] | None = None
     renewed: NDArray[np.bool_] | None = None
     vendor: tuple[VendorReading | None, ...] | None = None
+    pad: SensorGeometry | None = None
+
+    @property
+    def geometry(self) -> SensorGeometry:
+        """The pad, by its grid where the file does not name it."""
+        return self.pad or pad_of(*self.counts.shape[2:])
 
     @property
     def mean_rate_hz(self) -> float | None:

@@ -1,4 +1,4 @@
-"""CAN frames to taxel readings of XELA uSkin 4x4 sensors. No I/O.
+"""CAN frames to taxel readings of XELA uSkin sensors. No I/O.
 
 One taxel per frame, eight bytes: byte 0 unused, X, Y, Z as unsigned big-endian 16 bit, byte 7
 unused. The unused bytes are not zero. Which id is which taxel depends on the controller's age:
@@ -21,9 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.can.slcan import PACKED_BYTES, CanFrame
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
 
 PAYLOAD_BYTES: Final = 8
+CONTROLLERS: Final = range(16)
+SDAS: Final = 8
+"""Data lines that an id of layout C can name, and on each TAXELS_OF_SDA taxels."""
+TAXELS_OF_SDA: Final = 16
 BOARDS: Final = range(1, 8)
 _unpack_xyz = struct.Struct(">HHH").unpack_from
 _unpack_packed = struct.Struct(">HxHHHx").unpack_from
@@ -72,6 +76,10 @@ class ModelMap:
     geometry: SensorGeometry
     taxels: Mapping[int, tuple[str, int]]
     triggered: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.geometry.taxel_count <= MOST_TAXELS:
+            raise ValueError(f"{self.name} has {self.geometry.taxel_count} taxels, expected 1 to {MOST_TAXELS}")
 
     def wire_order(self, sensor: str) -> list[tuple[int, int]]:
         """(CAN id, taxel) of one sensor in ascending id, which is the order of SDA, then taxel."""
@@ -123,14 +131,22 @@ def trigger_frame(board: int) -> CanFrame:
     return CanFrame(0x200 | board, bytes((0x07, 0x00)))
 
 
-def _layout_c_uspa44() -> dict[int, tuple[str, int]]:
-    # An SDA is a row; its taxels are numbered from right to left.
-    return {
-        sda << 8 | taxel << 4 | controller: (str(controller), sda * 4 + (3 - taxel))
-        for controller in range(16)
-        for sda in range(4)
-        for taxel in range(4)
+def layout_c(geometry: SensorGeometry) -> ModelMap:
+    """Return the id map of a current controller whose SDAs are the rows, their taxels numbered from right to left.
+
+    Raises:
+        ValueError: ids cannot name so many rows or columns.
+    """
+    rows, cols = geometry.rows, geometry.cols
+    if rows > SDAS or cols > TAXELS_OF_SDA:
+        raise ValueError(f"{rows} x {cols} taxels, expected at most {SDAS} x {TAXELS_OF_SDA}")
+    taxels = {
+        sda << 8 | taxel << 4 | controller: (str(controller), sda * cols + (cols - 1 - taxel))
+        for controller in CONTROLLERS
+        for sda in range(rows)
+        for taxel in range(cols)
     }
+    return ModelMap(geometry.name, geometry, MappingProxyType(taxels))
 
 
 def _layout_c_xr1944() -> dict[int, tuple[str, int]]:
@@ -138,24 +154,34 @@ def _layout_c_xr1944() -> dict[int, tuple[str, int]]:
     # uSPa44, the same board; nothing we know says so.
     return {
         sda << 8 | taxel << 4 | controller: (str(controller), (sda * 2 + taxel // 4) * 4 + (3 - taxel % 4))
-        for controller in range(16)
+        for controller in CONTROLLERS
         for sda in range(2)
         for taxel in range(8)
     }
 
 
 def _layout_a() -> dict[int, tuple[str, int]]:
-    return {0x700 | board << 4 | taxel: (str(board), taxel) for board in BOARDS for taxel in range(16)}
+    taxels = range(USPA44.taxel_count)
+    return {0x700 | board << 4 | taxel: (str(board), taxel) for board in BOARDS for taxel in taxels}
 
 
 def _layout_b() -> dict[int, tuple[str, int]]:
-    return {board << 8 | n: (f"{board}{'ab'[n // 16]}", n % 16) for board in BOARDS for n in range(32)}
+    taxels = USPA44.taxel_count
+    return {board << 8 | n: (f"{board}{'ab'[n // taxels]}", n % taxels) for board in BOARDS for n in range(2 * taxels)}
 
 
-USPA44_MAP: Final = ModelMap("uSPa44", USPA44, MappingProxyType(_layout_c_uspa44()))
+USPA44_MAP: Final = layout_c(USPA44)
+USPA46_MAP: Final = layout_c(USPA46)
+"""Its ids are the manual's; that its columns run from right to left too is inferred from uSPa44."""
 XR1944_MAP: Final = ModelMap("XR1944", USPA44, MappingProxyType(_layout_c_xr1944()))
 LAYOUT_A_MAP: Final = ModelMap("layout A", USPA44, MappingProxyType(_layout_a()), triggered=True)
 LAYOUT_B_MAP: Final = ModelMap("layout B", USPA44, MappingProxyType(_layout_b()), triggered=True)
 
-ID_MAPS: Final = {"uSPa44": USPA44_MAP, "XR1944": XR1944_MAP, "A": LAYOUT_A_MAP, "B": LAYOUT_B_MAP}
+ID_MAPS: Final = {
+    "uSPa44": USPA44_MAP,
+    "uSPa46": USPA46_MAP,
+    "XR1944": XR1944_MAP,
+    "A": LAYOUT_A_MAP,
+    "B": LAYOUT_B_MAP,
+}
 """The maps by the name a user gives."""

@@ -18,40 +18,52 @@ from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.scan import Scan, VendorReading
 
 AS_MAPPED: Final = tuple(range(USPA44.taxel_count))
-_EVEN_GAINS: Final = (1.0,) * (len(AXES) * USPA44.taxel_count)
+"""The default order, of the default pad."""
 
 
 @dataclass(frozen=True)
 class Mounting:
     """How one sensor sits; by default as its id map says.
 
+    An order or gains that are left out, or empty, are those of the id map for so many taxels.
+
     Attributes:
         order: of each place on the pad, row-major from the top left, the taxel of the id map that lies there.
         swap_xy: the wire's x is the pad's y, and the other way round.
         signs: 1 or -1 of x (to the right), y (down) and z (into the pad), after the swap.
         gains: by which x, y and z of every place are multiplied, axis by axis, after the swap; 3 * taxels numbers.
+        taxel_count: of the sensor.
 
     Raises:
         ValueError: one of these cannot be.
     """
 
-    order: tuple[int, ...] = AS_MAPPED
+    order: tuple[int, ...] = ()
     swap_xy: bool = False
     signs: tuple[int, int, int] = (1, 1, 1)
-    gains: tuple[float, ...] = _EVEN_GAINS
+    gains: tuple[float, ...] = ()
+    taxel_count: int = USPA44.taxel_count
 
     def __post_init__(self) -> None:
-        if sorted(self.order) != list(AS_MAPPED):
-            raise ValueError(f"order is {list(self.order)}, expected each of 0..{AS_MAPPED[-1]} once")
+        count = self.taxel_count
+        object.__setattr__(self, "order", self.order or tuple(range(count)))
+        object.__setattr__(self, "gains", self.gains or (1.0,) * (len(AXES) * count))
+        if sorted(self.order) != list(range(count)):
+            raise ValueError(f"order is {list(self.order)}, expected each of 0..{count - 1} once")
         if len(self.signs) != len(AXES) or not set(self.signs) <= {1, -1}:
             raise ValueError(f"signs are {list(self.signs)}, expected three of 1 and -1")
-        if len(self.gains) != len(_EVEN_GAINS) or not all(0 < gain < np.inf for gain in self.gains):
-            raise ValueError(f"gains are {list(self.gains)}, expected {len(_EVEN_GAINS)} positive numbers")
+        if len(self.gains) != len(AXES) * count or not all(0 < gain < np.inf for gain in self.gains):
+            raise ValueError(f"gains are {list(self.gains)}, expected {len(AXES) * count} positive numbers")
 
     @property
     def moves_taxels(self) -> bool:
         """Some taxel lies elsewhere than its id map says."""
-        return self.order != AS_MAPPED
+        return self.order != tuple(range(self.taxel_count))
+
+    @property
+    def evens_gains(self) -> bool:
+        """Some reading is multiplied by another number than 1."""
+        return any(gain != 1 for gain in self.gains)
 
     @property
     def reverses_axes(self) -> bool:
@@ -61,12 +73,12 @@ class Mounting:
     @property
     def turns_axes(self) -> bool:
         """Counts become deformation in another way than by the baseline alone."""
-        return self.reverses_axes or self.gains != _EVEN_GAINS
+        return self.reverses_axes or self.evens_gains
 
     def correct(self, deformation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Deformation (3, rows, cols), in place but along the wire's axes, as the pad's axes have it, in counts."""
         turned = deformation[[1, 0, 2]] if self.swap_xy else deformation.copy()
-        turned *= self._factors
+        turned *= self._factors.reshape(turned.shape)
         return turned
 
     def place(self, scan: Scan) -> Scan:
@@ -95,6 +107,7 @@ class Mounting:
             self.swap_xy != found.swap_xy,
             (signs[0], signs[1], signs[2]),
             tuple(gains.ravel().tolist()),
+            self.taxel_count,
         )
 
     def _place_vendor(self, vendor: VendorReading) -> VendorReading:
@@ -112,8 +125,8 @@ class Mounting:
 
     @cached_property
     def _factors(self) -> NDArray[np.float32]:
-        gains = np.asarray(self.gains, dtype=np.float32).reshape(USPA44.scan_shape)
-        return gains * np.asarray(self.signs, dtype=np.float32)[:, None, None]
+        gains = np.asarray(self.gains, dtype=np.float32).reshape(len(AXES), -1)
+        return gains * np.asarray(self.signs, dtype=np.float32)[:, None]
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting]) -> ModelMap:

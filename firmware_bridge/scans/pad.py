@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.geometry import AXES, MOST_TAXELS, USPA44
 from firmware_bridge.scans.mounting import Mounting
 
 PAD_RANGES: Final = MappingProxyType(
@@ -27,6 +27,7 @@ PAD_RANGES: Final = MappingProxyType(
 """The constants of a pad, in this order, and what each may be: wider than any pad, so that only slips are refused."""
 GAIN_RANGE: Final = (0.01, 100.0)
 GAINS: Final = len(AXES) * USPA44.taxel_count
+"""Numbers of the default pad's gains."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,12 @@ class Pad:
             if not low <= ends[0] <= ends[1] <= high:
                 raise ValueError(f"{name} lies in {list(ends)}, expected two of {low:g} to {high:g}, the lower first")
         low, high = GAIN_RANGE
-        if self.gains is not None and (len(self.gains) != GAINS or not all(low <= gain <= high for gain in self.gains)):
-            raise ValueError(f"gains are {list(self.gains)}, expected {GAINS} numbers from {low:g} to {high:g}")
+        if self.gains is not None and (
+            len(self.gains) not in range(len(AXES), len(AXES) * MOST_TAXELS + 1, len(AXES))
+            or not all(low <= gain <= high for gain in self.gains)
+        ):
+            expected = f"{len(AXES)} numbers a taxel, {GAINS} of a {USPA44.name}, from {low:g} to {high:g}"
+            raise ValueError(f"gains are {list(self.gains)}, expected {expected}")
 
     @property
     def constants(self) -> dict[str, float]:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.geometry import AXES, SensorGeometry
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import GAIN_RANGE, GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.pad import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.sensor_file.toml_reader import (
     REMEDY,
@@ -44,7 +44,6 @@ LONGEST_LINE_BYTES: Final = 2048
 """Twice a line of all gains. Python's reader takes time that grows with the square of a key's dots: 60 kB took 27 s."""
 PARTS: Final = ("mounting", "force", "baseline")
 """Of an entry: what can be assumed, or be of an emulated sensor."""
-_GRID: Final = (USPA44.rows, USPA44.cols)
 
 
 @dataclass(frozen=True)
@@ -73,14 +72,16 @@ class SensorFile:
     """What one file tells.
 
     Attributes:
-        model: name of the id map, one of ID_MAPS.
+        model: name of the id map, one of ID_MAPS unless `own_map` is given.
         adapter: serial number of the USB adapter, where it is known.
         sensors: by sensor name.
+        own_map: an id map that is none of ID_MAPS, of a program's own pad; no file holds it.
     """
 
     model: str = USPA44_MAP.name
     adapter: str | None = None
     sensors: Mapping[str, SensorEntry] = field(default_factory=dict)
+    own_map: ModelMap | None = None
 
     @property
     def mountings(self) -> dict[str, Mounting]:
@@ -95,7 +96,12 @@ class SensorFile:
     @property
     def model_map(self) -> ModelMap:
         """The id map."""
-        return ID_MAPS[self.model]
+        return ID_MAPS[self.model] if self.own_map is None else self.own_map
+
+    @property
+    def geometry(self) -> SensorGeometry:
+        """The pad of each sensor."""
+        return self.model_map.geometry
 
     @property
     def baselines(self) -> dict[str, Baseline]:
@@ -140,32 +146,35 @@ def load_sensor_file(path: str | Path) -> SensorFile:
         if not is_sensor_name(name):
             top.refuse("sensors", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
     top.end()
-    return SensorFile(model, adapter, {name: _entry(path, name, table) for name, table in sensors.items()})
+    return SensorFile(
+        model, adapter, {name: _entry(path, name, table, ID_MAPS[model].geometry) for name, table in sensors.items()}
+    )
 
 
-def _entry(path: Path, name: str, values: Mapping[str, Any]) -> SensorEntry:
+def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> SensorEntry:
     table = Table(path, f"sensors.{name}.", values)
-    order = table.take("order", _order, required=False)
+    order = table.take("order", partial(_order, geometry), required=False)
     swap_xy = table.take("swap_xy", truth, required=False)
     signs = table.take("signs", _signs, required=False)
-    gains = table.take("gains", _gains, required=False)
+    gains = table.take("gains", partial(_gains, geometry), required=False)
     counts_per_newton = table.take("counts_per_newton", positive, required=False)
     pad = table.take("pad", a_table, required=False)
     baseline = table.take("baseline", a_table, required=False)
     marks = {key: table.take(key, _parts, required=False) or frozenset() for key in ("assumed", "emulated")}
     table.end()
     known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
-    mounting = Mounting(**{key: value for key, value in known.items() if value is not None})
+    known = {key: value for key, value in known.items() if value is not None}
+    mounting = Mounting(**known, taxel_count=geometry.taxel_count)
     return SensorEntry(
         mounting,
         counts_per_newton,
-        None if baseline is None else _baseline(path, name, baseline),
-        None if pad is None else _pad(path, name, pad),
+        None if baseline is None else _baseline(path, name, baseline, geometry),
+        None if pad is None else _pad(path, name, pad, geometry),
         **marks,
     )
 
 
-def _pad(path: Path, name: str, values: Mapping[str, Any]) -> Pad:
+def _pad(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Pad:
     table = Table(path, f"sensors.{name}.pad.", values)
     constants: dict[str, float] = {}
     intervals: dict[str, tuple[float, float]] = {}
@@ -176,17 +185,17 @@ def _pad(path: Path, name: str, values: Mapping[str, Any]) -> Pad:
             constants[constant] = value
         if interval is not None:
             intervals[constant] = interval
-    gains = table.take("gains", _pad_gains, required=False)
+    gains = table.take("gains", partial(_pad_gains, geometry), required=False)
     table.end()
     return Pad(**constants, intervals=intervals, gains=gains)
 
 
-def _baseline(path: Path, name: str, values: Mapping[str, Any]) -> Baseline:
+def _baseline(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Baseline:
     table = Table(path, f"sensors.{name}.baseline.", values)
     expected_id = table.take("id", text_value, required=False)
     created_unix_s = table.take("created_unix_s", positive)
     scans = table.take("scans", whole)
-    axes = [table.take(axis, _rest_counts) for axis in AXES]
+    axes = [table.take(axis, partial(_rest_counts, geometry)) for axis in AXES]
     table.end()
     baseline = Baseline.of(name, np.stack(axes), created_unix_s, scans, "file")
     if expected_id not in (None, baseline.id):
@@ -196,10 +205,10 @@ def _baseline(path: Path, name: str, values: Mapping[str, Any]) -> Baseline:
     return baseline
 
 
-def _order(value: Any) -> tuple[int, ...]:
-    expected = f"{_GRID[0]} rows of {_GRID[1]}, each of 0..{USPA44.taxel_count - 1} once"
-    cells = flat_cells(value, _GRID, expected)
-    if not all(type(cell) is int for cell in cells) or sorted(cells) != list(range(USPA44.taxel_count)):
+def _order(geometry: SensorGeometry, value: Any) -> tuple[int, ...]:
+    expected = f"{geometry.rows} rows of {geometry.cols}, each of 0..{geometry.taxel_count - 1} once"
+    cells = flat_cells(value, geometry.scan_shape[1:], expected)
+    if not all(type(cell) is int for cell in cells) or sorted(cells) != list(range(geometry.taxel_count)):
         raise ValueError(expected)
     return tuple(cells)
 
@@ -218,14 +227,14 @@ def _signs(value: Any) -> tuple[int, ...]:
     return tuple(signs)
 
 
-def _gains(value: Any) -> tuple[float, ...]:
-    expected = f"positive numbers, 3, or {len(AXES)} x {_GRID[0]} x {_GRID[1]}"
+def _gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
+    expected = f"positive numbers, 3, or {len(AXES)} x {geometry.rows} x {geometry.cols}"
     per_taxel = isinstance(value, list) and any(isinstance(one, list) for one in value)
-    cells = flat_cells(value, USPA44.scan_shape if per_taxel else (len(AXES),), expected)
+    cells = flat_cells(value, geometry.scan_shape if per_taxel else (len(AXES),), expected)
     if not all(is_number(cell) and cell > 0 for cell in cells):
         raise ValueError(expected)
     gains = [float(cell) for cell in cells]
-    return tuple(gains if per_taxel else [gain for gain in gains for _ in range(USPA44.taxel_count)])
+    return tuple(gains if per_taxel else [gain for gain in gains for _ in range(geometry.taxel_count)])
 
 
 def _interval(low: float, high: float, value: Any) -> tuple[float, float]:
@@ -236,18 +245,20 @@ def _interval(low: float, high: float, value: Any) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
-def _pad_gains(value: Any) -> tuple[float, ...]:
+def _pad_gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
     low, high = GAIN_RANGE
-    expected = f"{GAINS} numbers from {low:g} to {high:g}: x of all places, then y, then z"
-    gains = flat_cells(value, (GAINS,), expected)
+    count = len(AXES) * geometry.taxel_count
+    expected = f"{count} numbers from {low:g} to {high:g}: x of all places, then y, then z"
+    gains = flat_cells(value, (count,), expected)
     if not all(is_number(gain) and low <= gain <= high for gain in gains):
         raise ValueError(expected)
     return tuple(map(float, gains))
 
 
-def _rest_counts(value: Any) -> NDArray[np.float64]:
-    expected = f"{_GRID[0]} rows of {_GRID[1]} numbers 0..{COUNTS_ON_CIRCLE - 1}"
-    cells = flat_cells(value, _GRID, expected)
+def _rest_counts(geometry: SensorGeometry, value: Any) -> NDArray[np.float64]:
+    grid = geometry.scan_shape[1:]
+    expected = f"{grid[0]} rows of {grid[1]} numbers 0..{COUNTS_ON_CIRCLE - 1}"
+    cells = flat_cells(value, grid, expected)
     if not all(is_number(cell) and 0 <= cell < COUNTS_ON_CIRCLE for cell in cells):
         raise ValueError(expected)
-    return np.array(cells, dtype=np.float64).reshape(_GRID)
+    return np.array(cells, dtype=np.float64).reshape(grid)

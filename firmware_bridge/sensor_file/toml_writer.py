@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.geometry import AXES
 from firmware_bridge.in_place import write_in_place
+from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import (
@@ -29,7 +30,8 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
     """Write a sensor file in place; one that is there stays as NAME.bak.
 
     Raises:
-        SensorFileError: the file cannot be written, or would hold no sensor, or a baseline with a silent taxel.
+        SensorFileError: the file cannot be written, or would hold no sensor, a baseline with a silent taxel, or a pad
+            of a program's own.
     """
     path = Path(path)
     if not sensor_file.sensors:
@@ -39,6 +41,11 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
             raise SensorFileError(
                 f"{path}: a taxel of sensor {name} was silent while zeroing: zero again when it is not"
             )
+    if sensor_file.own_map is not None:
+        raise SensorFileError(
+            f"{path}: not written, for no file can name the id map {sensor_file.model!r} of a program's own: expected "
+            f"one of {', '.join(ID_MAPS)}"
+        )
     text = _text(sensor_file)
     try:
         write_in_place(path, lambda draft: draft.write_text(text, encoding="utf-8"), load_sensor_file)
@@ -55,13 +62,14 @@ def _text(sensor_file: SensorFile) -> str:
         f"model = {_quoted(sensor_file.model)}  # which CAN id is which taxel, as --id-map",
         *adapter,
     ]
+    cols = sensor_file.geometry.cols
     for name, entry in sensor_file.sensors.items():
-        lines += ["", f"[sensors.{_quoted(name)}]", *_mounting_lines(entry.mounting)]
+        lines += ["", f"[sensors.{_quoted(name)}]", *_mounting_lines(entry.mounting, cols)]
         if entry.counts_per_newton is not None:
             lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
         lines += _mark_lines(entry)
         if entry.pad is not None:
-            lines += ["", f"[sensors.{_quoted(name)}.pad]", *_pad_lines(entry.pad)]
+            lines += ["", f"[sensors.{_quoted(name)}.pad]", *_pad_lines(entry.pad, cols)]
         if entry.baseline is not None:
             lines += ["", f"[sensors.{_quoted(name)}.baseline]", *_baseline_lines(entry.baseline)]
     return "\n".join([*lines, ""])
@@ -79,17 +87,21 @@ def _mark_lines(entry: SensorEntry) -> list[str]:
     ]
 
 
-def _mounting_lines(mounting: Mounting) -> list[str]:
+def _mounting_lines(mounting: Mounting, cols: int) -> list[str]:
     gains = np.asarray(mounting.gains).reshape(len(AXES), -1)
     even = (gains == gains[:, :1]).all()
     gain_lines = (
         [f"gains = {gains[:, 0].tolist()}  # of x, y and z"]
         if even
-        else ["gains = [", *(line for plane in gains for line in [*_grid_lines("    ", plane.tolist()), "    ],"]), "]"]
+        else [
+            "gains = [",
+            *(line for plane in gains for line in [*_grid_lines("    ", plane.tolist(), cols), "    ],"]),
+            "]",
+        ]
     )
     return [
         "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
-        *_grid_lines("order = ", list(mounting.order)),
+        *_grid_lines("order = ", list(mounting.order), cols),
         "]",
         f"swap_xy = {str(mounting.swap_xy).lower()}",
         f"signs = {list(mounting.signs)}  # of x (to the right), y (down) and z (into the pad), after the swap",
@@ -97,7 +109,7 @@ def _mounting_lines(mounting: Mounting) -> list[str]:
     ]
 
 
-def _pad_lines(pad: Pad) -> list[str]:
+def _pad_lines(pad: Pad, cols: int) -> list[str]:
     lines = ["# The pad itself, for networks that ask for it."]
     known = pad.constants
     for name in PAD_RANGES:
@@ -106,7 +118,7 @@ def _pad_lines(pad: Pad) -> list[str]:
         if name in pad.intervals:
             lines.append(f"{name}_interval = {list(map(float, pad.intervals[name]))}")
     if pad.gains is not None:
-        rows = (pad.gains[at : at + USPA44.cols] for at in range(0, len(pad.gains), USPA44.cols))
+        rows = (pad.gains[at : at + cols] for at in range(0, len(pad.gains), cols))
         lines += [
             "# How strongly each place reads: x row by row, then y, then z.",
             "gains = [",
@@ -120,7 +132,7 @@ def _baseline_lines(baseline: Baseline) -> list[str]:
     axes = [
         line
         for axis, plane in zip(AXES, baseline.counts, strict=True)
-        for line in [*_grid_lines(f"{axis} = ", plane.ravel().tolist()), "]"]
+        for line in [*_grid_lines(f"{axis} = ", plane.ravel().tolist(), plane.shape[1]), "]"]
     ]
     return [
         "# What the free pad reads, in counts, place by place.",
@@ -131,12 +143,12 @@ def _baseline_lines(baseline: Baseline) -> list[str]:
     ]
 
 
-def _grid_lines(start: str, values: Sequence[int | float]) -> list[str]:
+def _grid_lines(start: str, values: Sequence[int | float], cols: int) -> list[str]:
     """A grid row by row, without its last bracket."""
     texts = [repr(value) for value in values]
     width = max(map(len, texts))
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    rows = (texts[at : at + USPA44.cols] for at in range(0, len(texts), USPA44.cols))
+    rows = (texts[at : at + cols] for at in range(0, len(texts), cols))
     return [f"{start}[", *(f"{indent}[{', '.join(text.rjust(width) for text in row)}]," for row in rows)]
 
 

@@ -363,8 +363,8 @@ def test_more_options_out_of_range():
 
 def test_recordings_that_no_such_sensor_made(tmp_path):
     other = make_recording(1)
-    wide = Track("4", np.zeros((1, 3, 4, 6), dtype=np.int32), None)
-    with pytest.raises(RecordingError, match=r"\(3, 4, 6\)"):
+    wide = Track("4", np.zeros((1, 3, 5, 6), dtype=np.int32), None)
+    with pytest.raises(RecordingError, match=r"\(3, 5, 6\)"):
         Emulator([type(other)(other.path, (wide,), 100.0)])
     with pytest.raises(RecordingError, match="--rate-hz"):
         Emulator([type(other)(other.path, other.tracks, None)])

@@ -272,7 +272,7 @@ class TestIdMap:
     @pytest.mark.parametrize("spoken", ID_MAPS)
     @pytest.mark.parametrize("asked", ID_MAPS)
     def test_the_map_to_try_is_that_of_the_ids_heard(self, asked, spoken):
-        sensor = {"uSPa44": "4", "XR1944": "4", "A": "1", "B": "1a"}[spoken]
+        sensor = {"uSPa44": "4", "uSPa46": "4", "XR1944": "4", "A": "1", "B": "1a"}[spoken]
         ids = [can_id for can_id, _ in ID_MAPS[spoken].wire_order(sensor)]
         heard, closed, counters = heard_of(ID_MAPS[asked], ids)
         found = {
@@ -287,6 +287,8 @@ class TestIdMap:
         if {asked, spoken} == {"uSPa44", "XR1944"}:
             assert found["silent taxels"].verdict == "not known" and "torn scans" in found
             assert found["torn scans"].verdict == "ok"
+        elif {asked, spoken} <= {"uSPa44", "uSPa46", "XR1944"}:  # one shares half of its ids, or more, with the other
+            assert "torn scans" in found
         else:
             assert found["scans"].verdict == "wrong"
 

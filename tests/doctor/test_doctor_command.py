@@ -21,9 +21,10 @@ from edge.doctor import command, watch
 from edge.doctor import session as visit
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.options import doctor_parser
-from edge.doctor.pad_orientation import CORNER_PLACES, CORNERS, orders
+from edge.doctor.pad_orientation import CORNERS, orders
 from firmware_bridge.emulation import pty_port as pseudo_port
 from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
@@ -51,7 +52,7 @@ class Person:
         self._rng = np.random.default_rng(7)
 
     def hear(self, text: str) -> None:
-        for place, corner in zip(CORNER_PLACES, CORNERS, strict=True):
+        for place, corner in zip(USPA44.corners, CORNERS, strict=True):
             if f"the {corner} corner" in text:
                 self._place = place
                 self._felt = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(place)])

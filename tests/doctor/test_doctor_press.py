@@ -9,10 +9,11 @@ from bridge_samples import read_until_lost
 from doctor_samples import finger, healthy_counts, visit
 
 from edge.doctor.examine import check_baseline
-from edge.doctor.pad_orientation import CORNER_PLACES, Press, corner_taxel, find_axes, find_order, orders, z_sign
+from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders, z_sign
 from edge.doctor.press_findings import judge_press
 from edge.doctor.press_guide import PATIENCE_S, Answer, GuidedPress
 from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
@@ -97,7 +98,7 @@ def test_a_pad_that_is_held_over_eight_real_sensors_on_one_pseudo_terminal():
 
 
 def press(place, taxel=None, z=4000.0, push=(500.0, 500.0)):
-    x, y = dict(zip(CORNER_PLACES, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True))[place]
+    x, y = dict(zip(USPA44.corners, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True))[place]
     return Press(place, place if taxel is None else taxel, z, None if push is None else (push[0] * x, push[1] * y))
 
 
@@ -109,7 +110,7 @@ class TestAnswers:
 
     def test_three_corners_settle_the_turn_and_the_axes(self):
         for left_out in range(4):
-            presses = [press(place) for place in CORNER_PLACES]
+            presses = [press(place) for place in USPA44.corners]
             del presses[left_out]
             assert find_order(presses) == "as the id map says"
             axes = find_axes(presses)
@@ -118,7 +119,7 @@ class TestAnswers:
     @pytest.mark.parametrize("wrong", range(4))
     def test_one_contradicting_push_is_not_outvoted(self, wrong):
         pushes = [(-500, 500) if n == wrong else (900, 900) for n in range(4)]
-        presses = [press(place, push=push) for place, push in zip(CORNER_PLACES, pushes, strict=True)]
+        presses = [press(place, push=push) for place, push in zip(USPA44.corners, pushes, strict=True)]
         assert find_axes(presses) is None
         findings, mounting = judge_press(Answer(presses), False, False)
         assert mounting is None
@@ -126,18 +127,18 @@ class TestAnswers:
         assert "contradict" in findings[1].measured
 
     def test_pushes_that_were_not_felt_are_told(self):
-        presses = [press(place, push=None if n > 1 else (500, 500)) for n, place in enumerate(CORNER_PLACES)]
+        presses = [press(place, push=None if n > 1 else (500, 500)) for n, place in enumerate(USPA44.corners)]
         findings, mounting = judge_press(Answer(presses), False, False)
         assert findings[1].verdict == "not known" and "2 of 4 pushes" in findings[1].measured and mounting is None
 
     def test_z_that_does_both_is_wrong(self):
-        presses = [press(place, z=-4000.0 if place == 15 else 4000.0) for place in CORNER_PLACES]
+        presses = [press(place, z=-4000.0 if place == 15 else 4000.0) for place in USPA44.corners]
         assert z_sign(presses) is None
         findings, mounting = judge_press(Answer(presses), False, False)
         assert findings[1].verdict == "wrong" and "falls under others" in findings[1].measured and mounting is None
 
     def test_what_a_sensor_file_keeps_is_no_longer_wrong(self):
-        turned = [press(place, CORNER_PLACES[(n + 1) % 4]) for n, place in enumerate(CORNER_PLACES)]
+        turned = [press(place, USPA44.corners[(n + 1) % 4]) for n, place in enumerate(USPA44.corners)]
         for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file says so")):
             findings, mounting = judge_press(Answer(turned), kept, False)
             assert mounting is not None and mounting.moves_taxels
@@ -145,8 +146,8 @@ class TestAnswers:
             assert findings[0].measured == "turned by 270 degrees clockwise"
 
     def test_corners_by_the_load(self):
-        assert [corner_taxel(finger(place)) for place in CORNER_PLACES] == list(CORNER_PLACES)
-        assert [corner_taxel(-finger(place)) for place in CORNER_PLACES] == list(CORNER_PLACES)
+        assert [corner_taxel(finger(place)) for place in USPA44.corners] == list(USPA44.corners)
+        assert [corner_taxel(-finger(place)) for place in USPA44.corners] == list(USPA44.corners)
         assert corner_taxel(np.zeros((4, 4))) is None
         middle = np.zeros((4, 4))
         middle[0, 1:3] = 900

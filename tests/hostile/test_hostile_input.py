@@ -160,7 +160,10 @@ class TestArchives:
             ({"sensor": np.array(["4", "4\n5"])}, "printable"),
             ({"sensor": np.array(["4", "x" * 65])}, "printable"),
             ({"rate_hz": np.array(1e-300)}, "a positive number"),
-            ({"counts": np.zeros((2, 3, 2, 2), np.int32)}, r"\(scans, 3, 4, 4\)"),
+            ({"counts": np.zeros((2, 2, 4, 4), np.int32)}, r"\(scans, 3, rows, cols\)"),
+            ({"counts": np.zeros((2, 3, 16), np.int32)}, r"\(scans, 3, rows, cols\)"),
+            ({"counts": np.zeros((2, 3, 0, 4), np.int32)}, r"\(scans, 3, rows, cols\)"),
+            ({"counts": np.zeros((2, 3, 5, 13), np.int32)}, "64 taxels at most"),
         ],
     )
     def test_values_that_nothing_can_be_done_with(self, tmp_path, changes, complaint):

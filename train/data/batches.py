@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from train.data.batch import Batch
-from train.data.dataset import Sequences, quarter_turns, windows
+from train.data.dataset import Sequences, quarter_turns, turns_of, windows
 from train.physics.sensor_noise import Nuisances
 from train.surfaces.named_surfaces import is_random_figure
 
@@ -76,7 +76,7 @@ class WindowBatches:
         )
         given = rng.choice(np.arange(1, taps + 1), size=len(index), p=self._given)
         readings *= (np.arange(taps) < given[:, None])[..., None, None, None]
-        readings, patterns = quarter_turns(readings, patterns, int(rng.integers(4)))
+        readings, patterns = quarter_turns(readings, patterns, turns_of(readings, int(rng.integers(4))))
         return np.ascontiguousarray(readings), np.ascontiguousarray(patterns)
 
     def index(self, number: int) -> NDArray[np.int64]:

@@ -273,6 +273,11 @@ def quarter_turns(
     return turned, maps
 
 
+def turns_of(windows: NDArray[np.float32], quarters: int) -> int:
+    """Return the quarter turns that keep the grid of (..., rows, cols): any of a square, of others the half turns."""
+    return quarters if windows.shape[-1] == windows.shape[-2] else 2 * (quarters % 2)
+
+
 def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
     """Values (b, m, ...) at shares (b, m) of presses whose frames (b, FRAMES, ...) are known, and 0 at their start."""
     away = np.abs(share[..., None] * FRAMES - np.arange(1, FRAMES + 1))

@@ -14,6 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from edge.terminal.progress_bar import tracked
+from firmware_bridge.geometry import PADS, USPA44
 from train.data.dataset import Sequences, join
 from train.errors import DatasetError, TrainError
 from train.physics.elastic_layer import Layer
@@ -41,6 +42,7 @@ SEED: Final = 20240228
 FORCE_N: Final = 9.2
 """Presses go this far, so that set forces up to 8 N with 15 % of spread lie on them."""
 _FIGURES_PER_SEED: Final = 1_000_000
+_PADS: Final = {pad.name: pad for pad in PADS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +61,7 @@ class Generation:
         pose_error_deg: the same of its angle.
         seed: of the poses.
         chunk: sequences solved in one go.
+        pad: name of the sensor model.
     """
 
     surfaces: tuple[str, ...] = SURFACES
@@ -72,6 +75,7 @@ class Generation:
     pose_error_deg: float = Nuisances().pose_error_deg
     seed: int = 1
     chunk: int = 48
+    pad: str = USPA44.name
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "surfaces", tuple(self.surfaces))  # a list, if it comes from JSON
@@ -81,6 +85,8 @@ class Generation:
             raise DatasetError(f"force_n is {self.force_n}, expected more than 0 N")
         if not 0 <= self.angle_step_deg <= 180:
             raise DatasetError(f"angle_step_deg is {self.angle_step_deg}, expected 0 to 180")
+        if self.pad not in _PADS:
+            raise DatasetError(f"pad is {self.pad!r}, expected one of {', '.join(_PADS)}")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
         for name, value, most in (
@@ -113,6 +119,8 @@ class Generation:
             "samples of a cell": SAMPLES,
         }
         facts = asdict(self) | {"surfaces": list(self.surfaces), "world": world}
+        if self.pad == USPA44.name:
+            del facts["pad"]  # what was made before there was a choice keeps its name
         meshes = {name: mesh_sha256(name) for name in self.surfaces if name.startswith("mesh:")}
         return facts | ({"meshes": meshes} if meshes else {})
 
@@ -174,7 +182,7 @@ def solve_chunk(config: Generation, chunk: int) -> Sequences:
     names = [name for name in targets.surfaces for _ in range(config.taps)]
     newest = np.arange(len(poses)) % config.taps == 0
     try:
-        solved = _sensor().tap(names, poses, config.force_n, newest)
+        solved = _sensor(config.pad).tap(names, poses, config.force_n, newest)
     except TrainError:
         raise
     except ValueError as error:  # the pad meets nothing at all: a user's mesh is smaller than the poses' reach
@@ -201,5 +209,5 @@ def solve_all(config: Generation) -> Sequences:
 
 
 @lru_cache(maxsize=1)
-def _sensor() -> SimulatedSensor:
-    return SimulatedSensor()
+def _sensor(pad: str) -> SimulatedSensor:
+    return SimulatedSensor(_PADS[pad])

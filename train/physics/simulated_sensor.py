@@ -4,7 +4,7 @@ On a flat surface pressure is linear in the indentation: one solution serves all
 contact grows: each frame is solved, after the depth has been found at which the tap reaches its force.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
@@ -15,7 +15,7 @@ from firmware_bridge.geometry import USPA44, SensorGeometry
 from train.physics.contact import REACH, ContactSolver
 from train.physics.curved_patterns import heights_pattern
 from train.physics.elastic_layer import Layer
-from train.physics.taxel_response import Skin
+from train.physics.taxel_response import Skin, on_pad
 from train.physics.tpsf import tpsf_pattern
 from train.surfaces.depth_image import NOTHING_MM, Footprints, Pose, Relief, footprints
 from train.surfaces.named_surfaces import is_flat, surface_mesh
@@ -62,21 +62,27 @@ class SimulatedSensor:
     """One sensor model that taps surfaces.
 
     Args:
-        geometry: the taxels, as many rows as columns.
+        geometry: the taxels.
         layer: the pad.
+
+    The contact is solved on a square grid as wide as the pad's longer side; where the pad ends before, nothing touches.
     """
 
     def __init__(self, geometry: SensorGeometry = USPA44, layer: Layer | None = None) -> None:
         layer = Layer() if layer is None else layer
-        if geometry.rows != geometry.cols or geometry.width_mm != geometry.height_mm:
-            raise ValueError(f"{geometry} is not square; the contact is solved on a square grid")
         self.geometry = geometry
         self.cell_mm = geometry.pixel_pitch_mm(_CELLS_PER_PITCH)
         # The pad is wider than the pattern; as many whole cells as fit on it, with the pattern in the middle.
-        pattern_cells = geometry.rows * _CELLS_PER_PITCH
-        self.size = pattern_cells + 2 * int((geometry.width_mm / self.cell_mm - pattern_cells) // 2)
+        side = max(geometry.rows, geometry.cols)
+        side_mm, pattern_cells = max(geometry.width_mm, geometry.height_mm), side * _CELLS_PER_PITCH
+        self.size = pattern_cells + 2 * int((side_mm / self.cell_mm - pattern_cells) // 2)
         self._pixel_mm = geometry.pixel_pitch_mm(FINE_SCALE)
-        self._pixels = geometry.rows * FINE_SCALE
+        self._pixels = side * FINE_SCALE
+        height, width = geometry.pattern_shape(FINE_SCALE)
+        top, left = (self._pixels - height) // 2, (self._pixels - width) // 2
+        self._pattern = (..., slice(top, top + height), slice(left, left + width))
+        self._on_cells = on_pad(geometry, self.size, self.cell_mm)
+        self._on_pixels = on_pad(geometry, self._pixels, self._pixel_mm)
         self._to_pixels = _between(self.size, self.cell_mm, self._pixels, self._pixel_mm)
         self._solver = ContactSolver(layer, self.size, self.cell_mm)
         self._skin = Skin(geometry, layer, self.size, self.cell_mm)
@@ -113,9 +119,9 @@ class SimulatedSensor:
         if not (np.isfinite(wanted_n) & (wanted_n > 0)).all():
             raise ValueError(f"set forces of {wanted_n.min()} to {wanted_n.max()} N, expected positive ones")
         known = [_surface(name) for name in surfaces]
-        seen = footprints([relief for relief, _ in known], poses, self.size, self.cell_mm)
+        seen = self._within(footprints([relief for relief, _ in known], poses, self.size, self.cell_mm))
         flat = np.array([level for _, level in known], dtype=bool) & self._is_level(seen)
-        cover = seen.cover_on(self.size, self.cell_mm, np.flatnonzero(flat), _LEVEL_MM)
+        cover = seen.cover_on(self.size, self.cell_mm, np.flatnonzero(flat), _LEVEL_MM) * self._on_cells
         level = cover.any(axis=(1, 2))  # else what the pad meets is a point that is finer than the samples of a cell
         flat[flat], cover = level, cover[level]
         pattern_of = np.flatnonzero(np.broadcast_to(with_pattern, count))
@@ -124,14 +130,34 @@ class SimulatedSensor:
             counts=np.empty((count, FRAMES, *self.geometry.scan_shape), dtype=np.float32),
             force_n=np.empty((count, FRAMES), dtype=np.float32),
             indentation_mm=np.empty((count, FRAMES), dtype=np.float32),
-            patterns=np.empty((len(pattern_of), maps, self._pixels, self._pixels), dtype=np.float32),
-            touching=np.empty((len(pattern_of), maps, self._pixels, self._pixels), dtype=np.bool_),
+            patterns=np.empty((len(pattern_of), maps, *self.geometry.pattern_shape(FINE_SCALE)), dtype=np.float32),
+            touching=np.empty((len(pattern_of), maps, *self.geometry.pattern_shape(FINE_SCALE)), dtype=np.bool_),
         )
         if flat.any():
             self._tap_flat(taps, np.flatnonzero(flat), cover, seen, wanted_n, pattern_of)
         if not flat.all():
             self._tap_curved(taps, np.flatnonzero(~flat), seen, wanted_n, pattern_of)
         return taps
+
+    def _within(self, seen: Footprints) -> Footprints:
+        """What lies under the pad of what lies under the square; depth counts from its own highest point.
+
+        Raises:
+            ValueError: nothing does at a pose.
+        """
+        if self._on_cells.all():
+            return seen
+        depth_mm = np.where(self._on_cells, seen.depth_mm, np.float32(NOTHING_MM))
+        low_mm = depth_mm.min(axis=(1, 2))
+        if (low_mm >= NOTHING_MM).any():
+            raise ValueError("nothing of a surface lies under the pad at a pose; expected poses over it")
+        lowered = np.where(depth_mm < NOTHING_MM, depth_mm - low_mm[:, None, None], depth_mm)
+        return replace(seen, top_mm=seen.top_mm - low_mm, depth_mm=lowered)
+
+    def _fine_mm(self, seen: Footprints, poses: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Depth on the pixels of the truth, those beyond the pad included."""
+        depth_mm = seen.depth_on(self._pixels, self._pixel_mm, poses)
+        return np.where(self._on_pixels, depth_mm, np.float32(NOTHING_MM))
 
     @staticmethod
     def _is_level(seen: Footprints) -> NDArray[np.bool_]:
@@ -157,12 +183,12 @@ class SimulatedSensor:
         taps.counts[which] = self._skin.flat_frames(unit.pressure_mpa, indentation_mm)
         rows = np.flatnonzero(np.isin(pattern_of, which))
         poses = pattern_of[rows]
-        touching = seen.depth_on(self._pixels, self._pixel_mm, poses) <= _LEVEL_MM
+        touching = self._fine_mm(seen, poses) <= _LEVEL_MM
         pattern = tpsf_pattern(touching, taps.indentation_mm[poses, -1], self._pixel_mm)
         # A mixed batch has a map for each frame; alone, the last one stands for all.
         shares = _SHARES[-taps.patterns.shape[1] :].astype(np.float32)
-        taps.patterns[rows] = pattern[:, None] * shares[:, None, None]
-        taps.touching[rows] = touching[:, None]
+        taps.patterns[rows] = pattern[self._pattern][:, None] * shares[:, None, None]
+        taps.touching[rows] = touching[self._pattern][:, None]
 
     def _tap_curved(
         self,
@@ -183,13 +209,13 @@ class SimulatedSensor:
         taps.force_n[which] = frames_mpa.sum(axis=(2, 3)) * self.cell_mm**2
         taps.counts[which] = self._skin.frames(frames_mpa)
         rows = np.flatnonzero(np.isin(pattern_of, which))
-        fine_mm = seen.depth_on(self._pixels, self._pixel_mm, pattern_of[rows])
+        fine_mm = self._fine_mm(seen, pattern_of[rows])
         for row, fine, tap in zip(rows, fine_mm, np.searchsorted(which, pattern_of[rows]), strict=True):
             frames_mm = indentation_mm[tap].astype(np.float32)
             deep = np.tile(fine, (FRAMES, 1, 1))
             touching = self._touching(frames_mpa[tap], depth_mm[tap], deep, frames_mm[:, None, None])
-            taps.touching[row] = touching
-            taps.patterns[row] = heights_pattern(deep, touching, frames_mm, self._pixel_mm)
+            taps.touching[row] = touching[self._pattern]
+            taps.patterns[row] = heights_pattern(deep, touching, frames_mm, self._pixel_mm)[self._pattern]
 
     def _press_to(
         self, depth_mm: NDArray[np.float32], wanted_n: NDArray[np.float64]

@@ -26,6 +26,14 @@ this factor the simulated one is .57."""
 _CALIBRATION_N: Final = 1.0
 
 
+def on_pad(geometry: SensorGeometry, size: int, cell_mm: float) -> NDArray[np.bool_]:
+    """Return which cells of a square grid centred on the pad lie on it, (size, size)."""
+    along_mm = np.abs(np.arange(size) - (size - 1) / 2) * cell_mm
+    square = geometry.width_mm == geometry.height_mm
+    across, down = (along_mm < (np.inf if square else side / 2) for side in (geometry.width_mm, geometry.height_mm))
+    return down[:, None] & across
+
+
 class Skin:
     """Readings of a sensor whose pad is pressed.
 
@@ -81,7 +89,8 @@ class Skin:
         response[:, :2] *= in_plane_share
         self._response = response.astype(np.float32)
         # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.
-        even_mpa = np.full((size, size), _CALIBRATION_N / (size * cell_mm) ** 2)
+        loaded = on_pad(geometry, size, cell_mm)
+        even_mpa = loaded * (_CALIBRATION_N / ((size * cell_mm) ** 2 * loaded.mean()))
         z_sum_mt = self._magnets.change_mt(self.movement(even_mpa))[:, 2].sum()
         self.counts_per_mt = float(_CALIBRATION_N * counts_per_newton / z_sum_mt)
 

@@ -1,0 +1,244 @@
+"""A pad of 4 x 6 taxels, from bytes to pattern, and into what is written of it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import make_contract, write_model
+
+from edge import api
+from edge.doctor.can_id_monitor import check_id_map
+from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders
+from edge.errors import ModelError, UsageError
+from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, widening
+from edge.perception.runtime import Runtime
+from edge.perception.tap_tracker import TapTracker
+from edge.pipeline.result_stream import Stream
+from edge.view.frames import hello
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.errors import RecordingError, SensorFileError
+from firmware_bridge.geometry import USPA44, USPA46, SensorGeometry
+from firmware_bridge.recording.formats import csv_header, load_recording
+from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, USPA46_MAP, layout_c
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad import Pad
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline
+
+REST = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None] + 37 * np.arange(24).reshape(4, 6)
+BASELINE = Baseline.of("4", REST, 1.7e9, 100, "file")
+CONTRACT = make_contract(taps=1, sensor="uSPa46", rows=4, cols=6, pitch_mm=7.25, interval_factor=1.6, traction_scale=2)
+PRESSED = 17
+REST_SCANS, SCANS = 20, 60
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Scans at rest, then a press on one taxel of the third row."""
+    rng = np.random.default_rng(0)
+    counts = REST + rng.integers(-2, 3, (SCANS, *REST.shape)).astype(np.int32)
+    for taxel, size in ((PRESSED, 4000), (PRESSED - 1, 400), (PRESSED - 6, 400)):  # a taxel alone would be a fault
+        counts[REST_SCANS:, 2].reshape(-1, 24)[:, taxel] += size
+    path = tmp_path_factory.mktemp("pad") / "pad.npz"
+    return Recording(path, (Track("4", counts, None),), 100.0)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return write_model(tmp_path_factory.mktemp("model") / "pad46.onnx", CONTRACT)
+
+
+@pytest.fixture(scope="module")
+def folder(recording, model, tmp_path_factory):
+    """What a run over a pseudo-terminal wrote, and its results."""
+    folder, loaded = tmp_path_factory.mktemp("out"), api.load_model(model)
+    with (
+        Emulator([recording]) as emulator,
+        api.open_source(f"slcan:{emulator.port}", id_map="uSPa46", give_up_s=0) as source,
+    ):
+        runtime = api.open_runtime(loaded, source, baselines={"4": BASELINE})
+        sinks = [api.open_sink(f"{form}:{folder}/out.{form}", CONTRACT, source) for form in ("jsonl", "npz", "mcap")]
+        results = []
+        try:
+            for result in Stream(source, runtime):
+                results.append(result)
+                for sink in sinks:
+                    sink.write(result, {})
+        except api.LinkLostError:
+            pass
+        for sink in sinks:
+            sink.close()
+    return folder, results
+
+
+def test_bytes_become_patterns_of_the_pads_own_shape(folder):
+    _, results = folder
+    assert len(results) == SCANS
+    assert all(result.scan.counts.shape == (3, 4, 6) and result.scan.complete for result in results)
+    states = [result.state for result in results]
+    # On a machine that is busy a newer scan may wait already.
+    assert set(states[:REST_SCANS]) == {"idle"} and set(states[REST_SCANS:]) <= {"contact", "dropped"}
+    pressed = [result for result in results if result.pattern is not None]
+    assert pressed
+    for result in pressed:
+        assert result.pattern.shape == result.deviation.shape == (40, 60) and result.traction.shape == (3, 8, 12)
+        row, col = np.unravel_index(result.pattern.argmax(), result.pattern.shape)
+        assert 6 * (row // 10) + col // 10 == PRESSED
+        assert result.area_mm2 == pytest.approx(7.25**2, rel=0.01)
+        assert result.centroid_mm == pytest.approx((2.5 * 7.25, 0.5 * 7.25), abs=0.3)
+
+
+def test_what_is_written_has_the_shape_of_the_pad(folder):
+    out, results = folder
+    records = [json.loads(line) for line in (out / "out.jsonl").read_text().splitlines()]
+    assert np.array(records[0]["counts"]).shape == (3, 4, 6) and records[0]["fresh"] == (1 << 24) - 1
+    with np.load(out / "out.npz") as arrays:
+        assert arrays["counts"].shape == (SCANS, 3, 4, 6) and arrays["pattern"].shape == (SCANS, 40, 60)
+    for form in ("npz", "mcap"):
+        (track,) = load_recording(out / f"out.{form}").tracks
+        assert track.geometry == USPA46
+        assert np.array_equal(track.counts, np.array([result.scan.counts for result in results]))
+
+
+@pytest.mark.parametrize("form", ["npz", "mcap"])
+def test_a_recording_is_played_as_the_pad_it_is_of(folder, model, form):
+    out, results = folder
+    with api.open_recording(out / f"out.{form}") as source:
+        again = list(Stream(source, api.open_runtime(model, source)))
+    assert len(again) == SCANS
+    np.testing.assert_allclose(again[-1].pattern, results[-1].pattern, atol=0.01)  # of 4: it may be of the scan before
+    with api.open_recording(out / f"out.{form}") as source, pytest.raises(ModelError) as refused:
+        api.open_runtime("stsr-small-int8", source)
+    line = str(refused.value)
+    assert "\n" not in line and "a uSPa44 of 4 x 4 taxels, the sensor is a uSPa46 of 4 x 6" in line
+
+
+def test_shared_memory_and_page_follow(model, folder):
+    from edge.sinks.shm import SharedMemorySink
+    from edge.sinks.shm_layout import Layout
+
+    layout = Layout(4, 6, 40, 60, (3, 8, 12))
+    assert layout.maps["counts"][1] == (3, 4, 6) and layout.maps["pattern"][1] == (40, 60)
+    name = f"pad46-test-{id(layout)}"
+    sink = SharedMemorySink(name, CONTRACT)
+    try:
+        sink.write(folder[1][-1], {})
+    finally:
+        sink.close()
+
+
+def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
+    """Six by six, which no release knows: a geometry, its id map, a model."""
+    pad = SensorGeometry("mine", rows=6, cols=6, pitch_mm=3.0, width_mm=18.0, height_mm=18.0)
+    contract = make_contract(taps=1, scale=4, sensor="mine", rows=6, cols=6, pitch_mm=3.0)
+    rest = np.broadcast_to(np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None], (3, 6, 6))
+    baseline = Baseline.of("4", rest, 1.7e9, 100, "file")
+    source = api.open_source("slcan:/dev/none", id_map=layout_c(pad))
+    assert source.sensor_file.geometry == pad
+    model = api.load_model(write_model(tmp_path / "mine.onnx", contract))
+    runtime = Runtime(model, source="device", geometry=source.sensor_file.geometry, baselines={"4": baseline})
+    counts = rest.copy()
+    counts[2, 5, 0] += 5000
+    scans = replace_scan(counts)
+    pattern = [runtime.push(scan) for scan in scans][-1].pattern
+    assert pattern is not None and pattern.shape == (24, 24) and pattern[20:, :4].min() > 0 == pattern[:20].max()
+    with pytest.raises(SensorFileError, match="id map 'mine'"):
+        save_sensor_file(tmp_path / "s.toml", replace(source.sensor_file, sensors={"4": SensorEntry()}))
+    with pytest.raises(ValueError, match="at most 8 x 16"):
+        layout_c(replace(pad, rows=9))
+    with pytest.raises(ValueError, match="1 to 64"):
+        layout_c(replace(pad, rows=8, cols=9))
+
+
+def replace_scan(counts):
+    from firmware_bridge.scans.scan import ScanSeries
+
+    series = ScanSeries("4", SensorGeometry("mine", *counts.shape[1:], 1, 1, 1))
+    return [series.close(counts + number, number * 10_000_000) for number in range(3)]
+
+
+def test_a_sensor_file_has_the_grid_of_its_model(tmp_path):
+    turned = Mounting(tuple(reversed(range(24))), gains=tuple(np.linspace(0.9, 1.1, 72).tolist()), taxel_count=24)
+    pad = Pad(thickness_mm=5.0, gains=(1.5,) * 72)
+    written = SensorFile("uSPa46", None, {"4": SensorEntry(turned, 1180.0, BASELINE, pad)})
+    save_sensor_file(tmp_path / "s.toml", written)
+    text = (tmp_path / "s.toml").read_text()
+    assert "    [23, 22, 21, 20, 19, 18],\n" in text
+    read = load_sensor_file(tmp_path / "s.toml")
+    assert read.geometry == USPA46 and read.mountings == written.mountings and read.pads == written.pads
+    assert read.baselines["4"].id == BASELINE.id
+    (tmp_path / "s.toml").write_text(text.replace('"uSPa46"', '"uSPa44"'))
+    with pytest.raises(SensorFileError, match="expected 4 rows of 4"):
+        load_sensor_file(tmp_path / "s.toml")
+
+
+def test_what_is_of_another_grid_is_refused_by_the_runtime(model):
+    loaded = api.load_model(model)
+    settings = {"source": "device", "geometry": USPA46}
+    with pytest.raises(UsageError, match="mounting of sensor 4 is of 16 taxels, expected 24"):
+        Runtime(loaded, mountings={"4": Mounting()}, **settings)
+    with pytest.raises(UsageError, match="48 gains, expected 72"):
+        Runtime(loaded, pad=Pad(gains=(1.0,) * 48), **settings)
+    with pytest.raises(ModelError, match="give a --model trained for it"):
+        Runtime(loaded, source="device", geometry=USPA44)
+
+
+def test_a_recording_may_name_another_pad_than_its_scans_have(tmp_path):
+    rows = [",".join(csv_header(24)), ",".join(["1000"] * 72), ",".join(["1000"] * 72), ""]
+    (tmp_path / "4.csv").write_text("\n".join(rows))
+    (track,) = load_recording(tmp_path / "4.csv").tracks
+    assert track.geometry == USPA46
+    (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(20)), ""]))
+    with pytest.raises(RecordingError, match="60 columns"):
+        load_recording(tmp_path / "4.csv")
+
+
+def test_a_pad_that_is_not_square_can_lie_in_four_ways():
+    assert len(orders()) == 8 and len(orders(USPA46)) == 4
+    assert USPA46.corners == (0, 5, 23, 18)
+    assert all(sorted(order) == list(range(24)) for order in orders(USPA46).values())
+    for corner in USPA46.corners:
+        z = np.zeros(24)
+        z[corner] = 4000
+        assert corner_taxel(z.reshape(4, 6)) == corner
+    pushes = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    presses = [Press(place, place, 1.0, push) for place, push in zip(USPA46.corners, pushes, strict=True)]
+    assert find_order(presses, USPA46) == "as the id map says"
+    axes = find_axes(presses, USPA46)
+    assert axes is not None and (axes.swap_xy, axes.signs) == (False, (1, 1))
+
+
+def test_the_larger_pad_is_what_speaks_where_the_smaller_ones_ids_are_among_its_own():
+    ids = dict.fromkeys((can_id for can_id, _ in USPA46_MAP.wire_order("4")), 10)
+    finding = check_id_map(ids, USPA44_MAP, half_silent=False)
+    assert finding is not None and finding.verdict == "wrong" and finding.remedy == "--id-map uSPa46"
+    finding = check_id_map(ids, USPA46_MAP, half_silent=False)
+    assert finding is not None and finding.verdict == "ok"
+
+
+def test_dead_taxels_are_filled_in_on_any_grid_and_doubted_by_their_share():
+    estimator = TaxelEstimator(np.eye(72)[None] + 0.5, (4, 6))
+    dead = np.zeros((4, 6), dtype=bool)
+    dead[1, 2] = True
+    filled = estimator.filler(dead)(np.full((3, 4, 6), 100, dtype=np.float32))
+    assert np.isfinite(filled.counts).all() and 50 < filled.counts[2, 1, 2] < 110
+    assert [widening(count / 16) for count in range(9)] == list(WIDENING)
+    assert widening(12 / 24) == WIDENING[8] and widening(1 / 24) == WIDENING[1]
+
+
+def test_taps_are_tracked_on_any_grid():
+    tracker = TapTracker(2, grid_shape=(4, 6))
+    assert tracker.push(np.full((3, 4, 6), 200, dtype=np.float32), 0).window.shape == (2, 3, 4, 6)
+
+
+def test_the_page_is_told_the_grid():
+    from types import SimpleNamespace
+
+    run = SimpleNamespace(contract=CONTRACT, id="1", name="a", kind="device", model="m")
+    frame = hello(run, None)
+    told = json.loads(frame[frame.index(b"{") :])
+    assert (told["rows"], told["cols"], told["height"], told["width"]) == (4, 6, 40, 60)
+    assert told["pixel_pitch_mm"] == 0.725
