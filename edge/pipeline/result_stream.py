@@ -109,10 +109,15 @@ class Stream:
             if self._commands is not None:
                 obey(self._commands, self._runtime)
                 self.statistics.commands_refused = self._commands.refused
-            for notice, scans in _between_notices(taken):
-                if notice is not None:
-                    self._heed(notice)
+            scans: list[Scan] = []
+            for heard in taken:
+                if isinstance(heard, Scan):
+                    scans.append(heard)
+                    continue
                 yield from self._results(scans)
+                self._heed(heard)
+                scans = []
+            yield from self._results(scans)
             for event in self._silence.look():
                 self._tell(event)
             if not taken:
@@ -136,6 +141,8 @@ class Stream:
             yield taken
 
     def _results(self, scans: Sequence[Scan]) -> Iterator[Result]:
+        if not scans:
+            return
         newest = {scan.sensor: scan for scan in scans}
         results = self._runtime.push_together([(scan, newest[scan.sensor] is scan) for scan in scans])
         done_ns = self._clock_ns()
@@ -169,19 +176,3 @@ class Stream:
     def _tell(self, event: Event) -> None:
         self.statistics.tell(event)
         self._on_event(event)
-
-
-def _between_notices(
-    taken: Sequence[Scan | Notice],
-) -> Iterator[tuple[Notice | None, list[Scan]]]:
-    """Cut what was taken at its notices: each, and the scans behind it."""
-    notice, scans = None, []
-    for heard in taken:
-        if isinstance(heard, Scan):
-            scans.append(heard)
-            continue
-        if notice is not None or scans:
-            yield notice, scans
-        notice, scans = heard, []
-    if notice is not None or scans:
-        yield notice, scans

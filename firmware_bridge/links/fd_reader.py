@@ -136,7 +136,8 @@ class BurstReader:
         Raises:
             OSError: the port is gone.
         """
-        if _waiting_bytes(self.descriptor) < FULL_BYTES:
+        waiting = fcntl.ioctl(self.descriptor, termios.FIONREAD, bytes(4)) if fcntl and termios else bytes(4)
+        if int.from_bytes(waiting, sys.byteorder) < FULL_BYTES:
             self.empty_s = self._clock_s()
 
     def _take(self, data: bytes, wanted_bytes: int) -> bytes:
@@ -155,9 +156,3 @@ class BurstReader:
                 raise
             data += piece
         return data
-
-
-def _waiting_bytes(descriptor: int) -> int:
-    if fcntl is None or termios is None:
-        return 0
-    return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)

@@ -93,7 +93,7 @@ class SlcanSerialLink(Link):
         self._plugged = PluggedAdapter(port)
         self._asks_stamps = baudrate >= SLOWEST_STAMPED_BAUD
         self._scans = SlcanScans(model)
-        self._questions = StatusQuestions(self._scans.status)
+        self._questions = StatusQuestions(self._scans.decoder.status)
         self._stamps_on = False
         self._silent_openings = 0
         self._frames_at_opening = 0
@@ -154,10 +154,10 @@ class SlcanSerialLink(Link):
         self._received_bytes += len(data)
         now_ns = time.monotonic_ns()
         scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
-        if self._questions.due(len(scans), self._scans.refusals, now_ns):
+        if self._questions.due(len(scans), self._scans.decoder.refusals, now_ns):
             _ask(self._serial, STATUS_FLAGS)
         silence = self._questions.answered_in_silence
-        self.trouble = self._scans.status.trouble(self._scans.frames, flags_of_a_silence=silence)
+        self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
         if self._stamps_on and self._stamps_are_none():
             self._asks_stamps = self._stamps_on = False
             self._stamps_to_set = STAMPS_OFF
@@ -199,10 +199,10 @@ class SlcanSerialLink(Link):
         return port
 
     def _start(self, port: serial.Serial) -> None:
-        frames = self._scans.frames
+        frames = self._scans.decoder.frames
         self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
         self._frames_at_opening = frames
-        self._late_stamps_from = self._scans.late_stamps, frames
+        self._late_stamps_from = self._scans.decoder.late_stamps, frames
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
         # One write each: some adapters obey only the first command in a USB packet.
         for command in (CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M):
@@ -216,10 +216,10 @@ class SlcanSerialLink(Link):
 
     def _stamps_are_none(self) -> bool:
         late_before, frames_before = self._late_stamps_from
-        if self._scans.late_stamps - late_before >= MOST_LATE_STAMPS:
+        if self._scans.decoder.late_stamps - late_before >= MOST_LATE_STAMPS:
             return True
-        if self._scans.frames - frames_before >= LATE_STAMPS_FRAMES:
-            self._late_stamps_from = self._scans.late_stamps, self._scans.frames
+        if self._scans.decoder.frames - frames_before >= LATE_STAMPS_FRAMES:
+            self._late_stamps_from = self._scans.decoder.late_stamps, self._scans.decoder.frames
         return False
 
     def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:

@@ -228,7 +228,7 @@ def test_a_port_that_is_away_holds_up_no_other_and_comes_back_to_the_common_thre
                 assert not numbers(taken[:back], "left/4"), "scans from behind the outage came before word of it"
                 readers = {t.name for t in threading.enumerate() if t.name.startswith(("link-", "scan-"))}
                 assert readers == {"scan-reader_0"}
-            assert source.counters()["outages"] == outages + 1
+                assert source.counters()["outages"] == outages + 1
     assert [name for name in names if name.startswith("link-reader")]
     assert not {thread for thread in set(threading.enumerate()) - before if thread.name.startswith(("link-", "scan-"))}
 
