@@ -43,7 +43,7 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.pipeline.source_setup import link_to, references, refuse_emulated, settled, with_recorded
+from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
@@ -169,8 +169,8 @@ def open_source(
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
     known = settled(sensor, id_map)
-    link = link_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
-    return Source(link, sensor_file=with_recorded(known, link), rate_hz=rate_hz, force=force)
+    links = links_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
+    return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
 
 
 def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":

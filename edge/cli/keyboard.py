@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
-from edge.pipeline.commands import RESET, ZERO, Command
+from edge.pipeline.commands import RESET, ZERO, Command, Commands
 from edge.terminal.forced_end import before_force
 
 KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
@@ -22,38 +22,38 @@ READ_BYTES: Final = 64
 ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
-class KeyCommands:
-    """Keys of a terminal, which is never waited for; other keys than KEYS are passed over.
+class Keys:
+    """Producer of commands from keys of a terminal, which is never waited for; other keys than KEYS are passed over."""
 
-    Attributes:
-        refused: always 0.
-    """
-
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, commands: Commands, descriptor: int) -> None:
         """Start with the terminal as it is.
 
         Args:
+            commands: asked for by keys.
             descriptor: of a terminal.
         """
-        self.refused = 0
+        self._commands = commands
         self._descriptor = descriptor
         self._before: list[Any] | None = None
         self._gone = False
 
-    def poll(self) -> list[Command]:
-        """What was asked for since the last call."""
+    def read(self) -> None:
+        """Put what was asked for since the last call."""
         if self._gone or not self._foreground():
-            return []
+            return
         if self._before is None:
             self.take()  # in the foreground again
         if not select.select([self._descriptor], [], [], 0)[0]:
-            return []
+            return
         try:
             keys = os.read(self._descriptor, READ_BYTES)
         except OSError:  # the terminal was closed, which ends keys but not the run
             keys = b""
         self._gone = not keys
-        return [command for key in keys if (command := KEYS.get(bytes([key]))) is not None]
+        for key in keys:
+            command = KEYS.get(bytes([key]))
+            if command is not None:
+                self._commands.put(command)
 
     def take(self) -> None:
         """Have keys come one by one, unseen; Ctrl-C and Ctrl-Z go on to be signals."""
@@ -92,22 +92,23 @@ class KeyCommands:
 
 
 @contextmanager
-def terminal_keys() -> Iterator[KeyCommands | None]:
-    """Keys of the terminal that stdin is; None where it is none."""
+def terminal_keys(commands: Commands) -> Iterator[None]:
+    """Have keys of the terminal that stdin is taken for commands; nothing where it is none."""
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
-        yield None
+        yield
         return
-    keys = KeyCommands(sys.stdin.fileno())
+    keys = Keys(commands, sys.stdin.fileno())
+    commands.ask(keys.read)
     with _given_back_on_signals(keys), before_force(partial(keys.give_back, for_good=True)):
         keys.take()
         try:
-            yield keys
+            yield
         finally:
             keys.give_back()
 
 
 @contextmanager
-def _given_back_on_signals(keys: KeyCommands) -> Iterator[None]:
+def _given_back_on_signals(keys: Keys) -> Iterator[None]:
     """Have the terminal given back before a signal that ends or stops the program does what it did before."""
     before: dict[int, Any] = {}
 

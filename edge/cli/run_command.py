@@ -18,6 +18,7 @@ from edge.api import (
     DEFAULT_MODEL,
     DEMO_LOOP,
     DEMO_MODEL,
+    Commands,
     Contract,
     DeviceError,
     Fan,
@@ -83,7 +84,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
         score = None
         statistics = Statistics() if statistics is None else statistics
         with (
-            _open_view(options, model.contract) as view,
+            _open_view(options, model.contract, commands) as view,
             _summary(statistics, source),
             source,
             contextlib.ExitStack() as closing,
@@ -93,7 +94,6 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             opener = partial(open_sink, contract=model.contract, source=source, stop=stop)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say)
-                commands = view.commands(commands)
                 print(f"live page: {view.url}", file=sys.stderr, flush=True)
             if demo:
                 score = _open_score(model.contract, partial(_go_on, scores, view) if loops else lambda score: None)
@@ -146,7 +146,9 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             _print_score(score, scores)
 
 
-def _open_view(options: argparse.Namespace, contract: Contract) -> "contextlib.AbstractContextManager[LiveView | None]":
+def _open_view(
+    options: argparse.Namespace, contract: Contract, commands: Commands
+) -> "contextlib.AbstractContextManager[LiveView | None]":
     if options.view is None:
         for name in ("view_host", "view_token", "view_record_dir"):
             if getattr(options, name) is not None:
@@ -159,7 +161,7 @@ def _open_view(options: argparse.Namespace, contract: Contract) -> "contextlib.A
     if options.view_record_dir is not None and not os.access(f"{directory}/", os.W_OK | os.X_OK):
         expected = "expected a folder that may be written into"
         raise UsageError(f"--view-record-dir {directory}: {expected}; make it, or leave it out for the current folder")
-    return LiveView(options.view_host or LOOPBACK, options.view, options.view_token, directory, contract)
+    return LiveView(options.view_host or LOOPBACK, options.view, options.view_token, directory, contract, commands)
 
 
 def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]") -> "DemoScore":

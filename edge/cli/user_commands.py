@@ -2,59 +2,40 @@
 
 import contextlib
 import signal
+import threading
 from collections.abc import Iterator
 
 from edge.cli.keyboard import terminal_keys
-from edge.pipeline.commands import ZERO, AllCommands, Command, Commands, stdin_commands
+from edge.pipeline.commands import ZERO, Commands, read_stdin
 
 
 @contextlib.contextmanager
 def user_commands() -> Iterator[Commands]:
     """Commands from lines on stdin, or from keys where it is a terminal, and from SIGUSR1."""
-    with contextlib.ExitStack() as closing:
-        places: list[Commands] = [closing.enter_context(zero_on_signal())]
-        lines = stdin_commands()
-        if lines is not None:
-            places.append(lines)
-        keys = closing.enter_context(terminal_keys())
-        if keys is not None:
-            places.append(keys)
-        yield AllCommands(places)
-
-
-class SignalCommands:
-    """Commands that signals stand for.
-
-    Attributes:
-        refused: always 0.
-    """
-
-    def __init__(self) -> None:
-        self.refused = 0
-        self._asked = False
-
-    def ask(self, number: int, frame: object) -> None:
-        """The handler: zero all sensors again."""
-        self._asked = True
-
-    def poll(self) -> list[Command]:
-        """What was asked for since the last call; asked twice meanwhile is asked once."""
-        if not self._asked:
-            return []
-        self._asked = False
-        return [ZERO]
+    commands = Commands()
+    with zero_on_signal(commands):
+        read_stdin(commands)
+        with terminal_keys(commands):
+            yield commands
 
 
 @contextlib.contextmanager
-def zero_on_signal() -> Iterator[SignalCommands]:
+def zero_on_signal(commands: Commands) -> Iterator[None]:
     """SIGUSR1, where there is one, asks for zeroing again; as any request it is refused in contact."""
-    commands = SignalCommands()
     number = getattr(signal, "SIGUSR1", None)
     if number is None:
-        yield commands
+        yield
         return
-    before = signal.signal(number, commands.ask)
+    asked = threading.Event()
+
+    def put() -> None:
+        if asked.is_set():  # twice meanwhile is once
+            asked.clear()
+            commands.put(ZERO)
+
+    commands.ask(put)
+    before = signal.signal(number, lambda *_: asked.set())
     try:
-        yield commands
+        yield
     finally:
         signal.signal(number, before)

@@ -9,7 +9,7 @@ from edge.doctor.can_id_monitor import HeardIds
 from edge.doctor.examine import Watched
 from edge.doctor.link_checks import line_facts
 from edge.errors import UsageError
-from edge.pipeline.source_setup import link_to, with_recorded
+from edge.pipeline.source_setup import links_to, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
@@ -43,7 +43,7 @@ class Watch:
         """Prepare to watch.
 
         Args:
-            texts: the source, as in edge.pipeline.source_setup.link_to; one at most.
+            texts: the source, as in edge.pipeline.source_setup.links_to; one at most.
             known: of the sensors.
             references: what the free pads read before, by sensor.
             rate_hz: to be expected of each sensor, in [Hz].
@@ -51,7 +51,7 @@ class Watch:
             clock_s: the clock of the scans, monotonic, in [s].
 
         Raises:
-            BridgeError: as in edge.pipeline.source_setup.link_to.
+            BridgeError: as in edge.pipeline.source_setup.links_to.
             UsageError: several sources; a rate or references that cannot be.
         """
         if len(texts) > 1:
@@ -61,8 +61,8 @@ class Watch:
         check_baselines(references, known.model_map.geometry)
         self._heard = HeardIds(known.model_map.taxels)
         self._model = self._heard.listening(known.model_map)
-        self.link = link_to(texts, known, model=self._model, rate_hz=rate_hz, give_up_s=None)
-        self.known = with_recorded(known, self.link)
+        (self.link,) = links_to(texts, known, model=self._model, rate_hz=rate_hz, give_up_s=None)
+        self.known = with_recorded(known, [self.link])
         self.scans: dict[str, list[Scan]] = {}
         self.duration_s = 0.0
         self._references = references

@@ -5,10 +5,11 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from edge.pipeline.scan_reader import Arrival, Source
+from edge.pipeline.scan_reader import Source
 from edge.terminal.progress_bar import Progress
 from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
 READ_TIMEOUT_S: Final = 0.1
@@ -53,24 +54,23 @@ def take_baselines(
             taken = source.take(READ_TIMEOUT_S)
             if taken is None:
                 raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor were heard")
-            if any(isinstance(heard, Arrival) for heard in taken):
+            if any(isinstance(heard, Scan) for heard in taken):
                 heard_s = clock_s()
             elif clock_s() - heard_s > SILENCE_S:
                 silence = f"no scan from {source.name} for {SILENCE_S:.0f} s"
                 raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor says what is wrong")
             for heard in taken:
-                if not isinstance(heard, Arrival):
+                if not isinstance(heard, Scan):
                     if heard.kind in ("lost", "silent"):
                         estimators.clear()  # nobody knows whether the sensor behind the gap reads as before
                     continue
-                scan = heard.scan
-                name = scan.sensor
+                name = heard.sensor
                 skipped[name] = skipped.get(name, -1) + 1
                 if skipped[name] < skip or name in baselines:
                     continue
                 estimator = estimators.setdefault(name, BaselineEstimator(scans))
                 try:
-                    baseline = estimator.push(scan)
+                    baseline = estimator.push(heard)
                 except BaselineRefusedError as refusal:
                     raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
                 if baseline is not None:

@@ -1,20 +1,22 @@
-"""What a user may ask of a run, and JSON lines on stdin that ask it, such as {"cmd": "reset"}.
-
-Read between scans, without a thread.
-"""
+"""Commands to a run: one queue, filled by keys, signals, viewers and JSON lines on stdin, such as {"cmd": "reset"}."""
 
 import json
 import os
 import select
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Any, Final, Literal, Protocol
 
 from firmware_bridge.scans.scan import is_sensor_name
 
 READ_BYTES: Final = 4096
 LONGEST_LINE_BYTES: Final = 4096
+WAITING: Final = 64
+"""Commands that may wait for the loop to come round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,21 +40,56 @@ RESET: Final = Command("reset")
 ZERO: Final = Command("zero")
 
 
-class Commands(Protocol):
-    """Where a user's commands come from."""
+class Commands:
+    """Queue of what users ask for; any thread puts, and the loop takes between two scans.
+
+    Attributes:
+        refused: messages that were no command, or came when too many waited.
+        record: begins or ends a recording; nothing is recorded without.
+    """
+
+    def __init__(self) -> None:
+        """Start empty, without a producer."""
+        self.refused = 0
+        self.record: Callable[[bool], object] = lambda on: None
+        self._lock = threading.Lock()
+        self._waiting: SimpleQueue[Command] = SimpleQueue()
+        self._producers: list[Callable[[], object]] = []
 
     @property
-    def refused(self) -> int:
-        """What came and was no command."""
-        ...
+    def full(self) -> bool:
+        """More should not be put before the loop has come round, ten times a second at least."""
+        return self._waiting.qsize() >= WAITING
 
-    def poll(self) -> Sequence[Command]:
-        """What was asked for since the last call; never waits."""
-        ...
+    def put(self, command: Command) -> None:
+        """Ask for something."""
+        self._waiting.put(command)
+
+    def refuse(self) -> None:
+        """Count a message that was no command."""
+        with self._lock:
+            self.refused += 1
+
+    def ask(self, producer: Callable[[], object]) -> None:
+        """Have a producer without a thread called before commands are taken; it puts what has come, and never waits."""
+        self._producers.append(producer)
+
+    def poll(self) -> list[Command]:
+        """Return what was asked of the runtime since the last call; what was to be recorded is done. Never waits."""
+        for produce in self._producers:
+            produce()
+        commands: list[Command] = []
+        while not self._waiting.empty():
+            command = self._waiting.get_nowait()
+            if command.name == "record":
+                self.record(command.on)
+            else:
+                commands.append(command)
+        return commands
 
 
-class Obedient(Protocol):
-    """What does as it is told: a runtime."""
+class Controlled(Protocol):
+    """A runtime, as far as commands go."""
 
     def reset(self) -> None:
         """Forget earlier taps."""
@@ -63,7 +100,7 @@ class Obedient(Protocol):
         ...
 
 
-def obey(commands: Commands, runtime: Obedient) -> None:
+def obey(commands: Commands, runtime: Controlled) -> None:
     """Have done what was asked for since the last call."""
     for command in commands.poll():
         if command.name == "reset":
@@ -72,23 +109,19 @@ def obey(commands: Commands, runtime: Obedient) -> None:
             runtime.zero(command.sensor, force=command.force)
 
 
-class LineCommands:
-    """Commands from a file descriptor, which is never waited for.
+class CommandLines:
+    """Producer of commands from lines of a file descriptor, which is never waited for."""
 
-    Attributes:
-        refused: lines that were no command.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self.refused = 0
+    def __init__(self, commands: Commands, descriptor: int) -> None:
+        self._commands = commands
         self._descriptor = descriptor
         self._open = True
         self._partial = b""
 
-    def poll(self) -> list[Command]:
-        """The commands that came since the last call."""
+    def read(self) -> None:
+        """Put the commands that came since the last call."""
         if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
-            return []
+            return
         try:
             data = os.read(self._descriptor, READ_BYTES)
         except OSError:  # the other end is gone, which stops commands but not the run
@@ -96,18 +129,21 @@ class LineCommands:
         self._open = bool(data)
         *lines, partial = (self._partial + (data or b"\n")).split(b"\n")
         self._partial = partial[: LONGEST_LINE_BYTES + 1]
-        return [command for line in lines if (command := self._parse(line)) is not None]
+        for line in lines:
+            self._parse(line)
 
-    def _parse(self, line: bytes) -> Command | None:
+    def _parse(self, line: bytes) -> None:
         if not line.strip():
-            return None
+            return
         try:
             parsed = json.loads(line) if len(line) <= LONGEST_LINE_BYTES else None
         except (ValueError, RecursionError):
             parsed = None
         command = runtime_command(parsed) if isinstance(parsed, dict) else None
-        self.refused += command is None
-        return command
+        if command is None:
+            self._commands.refuse()
+        else:
+            self._commands.put(command)
 
 
 def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
@@ -124,30 +160,12 @@ def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
     return Command("zero", sensor, force)
 
 
-class AllCommands:
-    """Commands from several places."""
+def read_stdin(commands: Commands) -> None:
+    """Have lines of stdin taken for commands, unless there is none or it is a terminal, which has keys.
 
-    def __init__(self, places: Sequence[Commands]) -> None:
-        self._places = places
-
-    @property
-    def refused(self) -> int:
-        """What came and was no command."""
-        return sum(place.refused for place in self._places)
-
-    def poll(self) -> list[Command]:
-        """What was asked for since the last call, place by place."""
-        return [command for place in self._places for command in place.poll()]
-
-
-def stdin_commands() -> LineCommands | None:
-    """Commands from stdin; None where there is none, or where it is a terminal.
-
-    A terminal has keys. Elsewhere than on POSIX a pipe cannot be asked whether it has something.
+    Elsewhere than on POSIX a pipe cannot be asked whether it has something.
     """
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
-        return None
-    try:
-        return LineCommands(sys.stdin.fileno())
-    except OSError:  # what stands in its place is no file of the system's
-        return None
+        return
+    with suppress(OSError):  # what stands in its place is no file of the system's
+        commands.ask(CommandLines(commands, sys.stdin.fileno()).read)

@@ -20,24 +20,19 @@ class Deadline:
 
     The period is the running median of the intervals between scans, which neither jitter nor a gap moves, unless a
     rate is given.
+
+    Attributes:
+        period_ns: between scans, in [ns]; None as long as too few have come.
     """
 
     def __init__(self, rate_hz: float | None = None) -> None:
         """Start without a scan; `rate_hz` is the sensor's rate if it is known, in [Hz]."""
-        self._known_period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
+        self.period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
+        self._known = rate_hz is not None
         self._intervals: deque[int] = deque()
         self._sorted: list[int] = []
         self._last_ns: int | None = None
         self._hurried = 0
-
-    @property
-    def period_ns(self) -> int | None:
-        """Between scans, in [ns]; None as long as too few have come."""
-        if self._known_period_ns is not None:
-            return self._known_period_ns
-        if len(self._sorted) < FEWEST_INTERVALS:
-            return None
-        return self._sorted[len(self._sorted) // 2]
 
     def follow(self, scan_time_ns: int) -> None:
         """Take the arrival of the next scan, pattern or not, in [ns]. Time that stands is no interval."""
@@ -51,15 +46,21 @@ class Deadline:
             del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
         self._intervals.append(interval_ns)
         insort(self._sorted, interval_ns)
+        self._measure()
+
+    def _measure(self) -> None:
+        if not self._known:
+            enough = len(self._sorted) >= FEWEST_INTERVALS
+            self.period_ns = self._sorted[len(self._sorted) // 2] if enough else None
 
     def _is_of_a_burst(self, interval_ns: int) -> bool:
         """Whether the scan was held up somewhere and came right behind the one before; not if all of late did."""
-        period_ns = self.period_ns
-        hurried = period_ns is not None and interval_ns * BURST_SHARE < period_ns
+        hurried = self.period_ns is not None and interval_ns * BURST_SHARE < self.period_ns
         self._hurried = self._hurried + 1 if hurried else 0
         if self._hurried > LONGEST_BURST:
             self._intervals.clear()
             self._sorted.clear()
+            self._measure()
         return hurried and self._hurried <= LONGEST_BURST
 
     def check(self, scan_time_ns: int, done_ns: int) -> bool:
@@ -69,5 +70,4 @@ class Deadline:
             scan_time_ns: arrival of its scan's last reading, in [ns].
             done_ns: when the pattern was ready, on the same clock.
         """
-        period_ns = self.period_ns
-        return period_ns is not None and done_ns - scan_time_ns > period_ns
+        return self.period_ns is not None and done_ns - scan_time_ns > self.period_ns

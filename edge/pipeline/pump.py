@@ -49,8 +49,13 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
     """
 
     def counters() -> Mapping[str, int]:
-        statistics.unwritten = sum(sink.unwritten for sink in sinks)
-        return {**stream.counters, "unwritten": statistics.unwritten}
+        unwritten = 0
+        for sink in sinks:
+            unwritten += sink.unwritten
+        statistics.unwritten = unwritten
+        counters = stream.counters
+        counters["unwritten"] = unwritten
+        return counters
 
     def tell(event: Event) -> None:
         known = counters()

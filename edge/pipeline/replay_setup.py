@@ -1,6 +1,7 @@
 """A recording as a source, with what it knows of its sensors."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,6 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.geometry import PADS, SensorGeometry
 from firmware_bridge.links.parse import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.links.wrapper import ChangedLink
 from firmware_bridge.recording.formats import npz_baselines
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.can_id_maps import ModelMap
@@ -31,13 +31,12 @@ def open_recording(
 ) -> Source:
     """The source that plays a recording, as edge.api.open_recording; with a bar of how far it is, if asked for."""
     paths = recording_paths(str(path))
-    replay = ReplayLink(paths, rate_hz, paced=paced)
+    replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
-    link = _FollowedLink(replay, sum(len(track.counts) for track in tracks)) if bar else replay
     # A sensor file says which pad it is; without one the recording's grid does.
     pad = tracks[0].geometry
     file = settled(sensor, None if sensor is not None else _named(pad))
-    known = with_recorded(file, link)
+    known = with_recorded(file, [replay])
     recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
     mountings = known.mountings
@@ -54,7 +53,7 @@ def open_recording(
         for name in sorted(sensors)
     }
     known = replace(known, sensors=entries)
-    return Source(place_recordings(link, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)
+    return Source(place_recordings(replay, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)
 
 
 def _named(pad: SensorGeometry) -> str | ModelMap:
@@ -62,20 +61,23 @@ def _named(pad: SensorGeometry) -> str | ModelMap:
     return pad.name if pad in PADS else ModelMap(pad.name, pad, {})
 
 
-class _FollowedLink(ChangedLink):
-    """A recording, and a bar that tells how much of it was taken."""
+class _FollowedReplay(ReplayLink):
+    """A recording, and a bar that shows how much of it was taken."""
 
-    def __init__(self, link: ReplayLink, scans: int) -> None:
-        super().__init__(link)
+    def __init__(self, paths: Sequence[str], rate_hz: float | None, *, paced: bool) -> None:
+        super().__init__(paths, rate_hz, paced=paced)
+        scans = sum(len(track.counts) for recording in self.recordings for track in recording.tracks)
         self._bar = Progress("replay", scans, "scan")
 
     def __exit__(self, *exc_info: object) -> None:
         self._bar.close()
         super().__exit__(*exc_info)
 
-    def _change(self, scan: Scan) -> Scan:
-        self._bar.advance()
-        return scan
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Scans that fell due since the last call."""
+        scans = super().read(timeout_s)
+        self._bar.advance(len(scans))
+        return scans
 
 
 def _in_its_time(recording: Recording, *, paced: bool) -> dict[str, Baseline]:

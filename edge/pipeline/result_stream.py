@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Self
 
@@ -12,11 +12,13 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
+from edge.pipeline.link_reader import POLL_S
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.scan_reader import POLL_S, Arrival, Source
+from edge.pipeline.scan_reader import Source
 from edge.pipeline.silence import Silence
 from edge.validation import check_positive
 from firmware_bridge.links.base import Notice
+from firmware_bridge.scans.scan import Scan
 
 
 class Stream:
@@ -28,7 +30,6 @@ class Stream:
     was left may go on in another, with the next result.
 
     Attributes:
-        counters: up to the last result: the source's, `dropped`, `overruns`, `late` and `missed`.
         statistics: of the results so far.
     """
 
@@ -66,7 +67,6 @@ class Stream:
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)
-        self.counters: Mapping[str, int] = source.counters()
         self.statistics = Statistics() if statistics is None else statistics
         self._source = source
         self._runtime = runtime
@@ -80,6 +80,17 @@ class Stream:
         self._clock_s = clock_s
         self._clock_ns = clock_ns
         self._running = self._run()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """The source's up to now, which may be ahead of the last result, and the stream's up to that."""
+        statistics = self.statistics
+        counters = self._source.counters()
+        counters["dropped"] = statistics.dropped
+        counters["overruns"] = statistics.overruns
+        counters["late"] = statistics.late
+        counters["missed"] = statistics.missed
+        return counters
 
     def __iter__(self) -> Self:
         return self
@@ -98,16 +109,21 @@ class Stream:
             if self._commands is not None:
                 obey(self._commands, self._runtime)
                 self.statistics.commands_refused = self._commands.refused
-            for notice, arrivals in _between_notices(taken):
-                if notice is not None:
-                    self._heed(notice)
-                yield from self._results(arrivals)
+            scans: list[Scan] = []
+            for heard in taken:
+                if isinstance(heard, Scan):
+                    scans.append(heard)
+                    continue
+                yield from self._results(scans)
+                self._heed(heard)
+                scans = []
+            yield from self._results(scans)
             for event in self._silence.look():
                 self._tell(event)
             if not taken:
                 self._on_wait()
 
-    def _taken(self) -> Iterator[list[Arrival | Notice]]:
+    def _taken(self) -> Iterator[list[Scan | Notice]]:
         """What the source gives, until it ends, `stop` is set, or the time is over: that of scans, where they wait."""
         length_s = math.inf if self._duration_s is None else self._duration_s
         begun_s = self._clock_s()
@@ -118,23 +134,24 @@ class Stream:
             if taken is None:
                 return
             for heard in taken if self._source.patient else ():  # one scan at most
-                if isinstance(heard, Arrival):
-                    first_ns = heard.scan.time_ns if first_ns is None else first_ns
-                    if heard.scan.time_ns - first_ns >= length_s * 1e9:
+                if isinstance(heard, Scan):
+                    first_ns = heard.time_ns if first_ns is None else first_ns
+                    if heard.time_ns - first_ns >= length_s * 1e9:
                         return
             yield taken
 
-    def _results(self, arrivals: Sequence[Arrival]) -> Iterator[Result]:
-        newest = {arrival.scan.sensor: index for index, arrival in enumerate(arrivals)}
-        scans = [(a.scan, newest[a.scan.sensor] == index) for index, a in enumerate(arrivals)]
-        results = self._runtime.push_together(scans)
+    def _results(self, scans: Sequence[Scan]) -> Iterator[Result]:
+        if not scans:
+            return
+        newest = {scan.sensor: scan for scan in scans}
+        results = self._runtime.push_together([(scan, newest[scan.sensor] is scan) for scan in scans])
         done_ns = self._clock_ns()
-        for arrival, result in zip(arrivals, results, strict=True):
-            yield self._follow(arrival, result, done_ns)
+        for result in results:
+            yield self._follow(result, done_ns)
 
-    def _follow(self, arrival: Arrival, result: Result, done_ns: int) -> Result:
+    def _follow(self, result: Result, done_ns: int) -> Result:
         """Count a result that was ready at `done_ns`."""
-        scan, statistics = arrival.scan, self.statistics
+        scan, statistics = result.scan, self.statistics
         deadline = self._deadlines.get(scan.sensor)
         if deadline is None:
             deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
@@ -145,13 +162,6 @@ class Stream:
             result = replace(result, latency_us=(done_ns - scan.time_ns) / 1e3)
         statistics.add(result)
         statistics.missed = self._silence.missed
-        self.counters = {
-            **arrival.counters,
-            "dropped": statistics.dropped,
-            "overruns": statistics.overruns,
-            "late": statistics.late,
-            "missed": statistics.missed,
-        }
         if heard_again is not None:
             self._tell(heard_again)
         return result
@@ -166,19 +176,3 @@ class Stream:
     def _tell(self, event: Event) -> None:
         self.statistics.tell(event)
         self._on_event(event)
-
-
-def _between_notices(
-    taken: Sequence[Arrival | Notice],
-) -> Iterator[tuple[Notice | None, list[Arrival]]]:
-    """Cut what was taken at its notices: each, and the scans behind it."""
-    notice, arrivals = None, []
-    for heard in taken:
-        if isinstance(heard, Arrival):
-            arrivals.append(heard)
-            continue
-        if notice is not None or arrivals:
-            yield notice, arrivals
-        notice, arrivals = heard, []
-    if notice is not None or arrivals:
-        yield notice, arrivals

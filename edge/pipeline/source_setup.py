@@ -1,7 +1,7 @@
 """What a sensor file and what is asked for beside it come to."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,15 +41,15 @@ def settled(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorF
     return known
 
 
-def link_to(
+def links_to(
     texts: Sequence[str],
     known: SensorFile,
     *,
     model: ModelMap | None = None,
     rate_hz: float | None = None,
     give_up_s: float | None = math.inf,
-) -> Link:
-    """The link to what was asked for, not yet entered.
+) -> list[Link]:
+    """The links to what was asked for, not yet entered.
 
     Args:
         texts: as in firmware_bridge.links.parse; without any, the adapter of the sensor file or the one there is.
@@ -74,9 +74,9 @@ def link_to(
     )
 
 
-def with_recorded(known: SensorFile, link: Link) -> SensorFile:
+def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:
     """What is known, and of sensors that it does not name how they sat when they were recorded."""
-    recorded = {name: SensorEntry(mounting) for name, mounting in link.mountings.items()}
+    recorded = {name: SensorEntry(mounting) for link in links for name, mounting in link.mountings.items()}
     return replace(known, sensors=recorded | dict(known.sensors))
 
 

@@ -39,7 +39,9 @@ class StatusSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
         self._latest[result.scan.sensor] = result
-        self._rates.setdefault(result.scan.sensor, Rate()).add(result.scan.time_ns)
+        if result.scan.sensor not in self._rates:
+            self._rates[result.scan.sensor] = Rate()
+        self._rates[result.scan.sensor].add(result.scan.time_ns)
         self._counters = counters
         self._last_scan_s = self._heard_s[result.scan.sensor] = self._clock_s()
         self._refresh()

@@ -11,15 +11,14 @@ from typing import Final, Self
 
 from edge.inference.contract import Contract
 from edge.perception.event import Event
-from edge.pipeline.commands import AllCommands, Commands
+from edge.pipeline.commands import Commands
 from edge.pipeline.sink import Sink
 from edge.view.access import grant
 from edge.view.frames import Run
-from edge.view.recorder import FORM, RecordCommands, Recorder
+from edge.view.recorder import FORM, Recorder
 from edge.view.run_snapshot import Heard
 from edge.view.server import Server
 from edge.view.sink import ViewSink
-from edge.view.viewer_commands import Asked
 from firmware_bridge.links.base import SourceKind
 
 LOOPBACK: Final = "127.0.0.1"
@@ -33,7 +32,15 @@ class LiveView:
         url: the page's address.
     """
 
-    def __init__(self, host: str, port: int, token: str | None, record_dir: Path, contract: Contract) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        token: str | None,
+        record_dir: Path,
+        contract: Contract,
+        commands: Commands,
+    ) -> None:
         """Take the port.
 
         Args:
@@ -42,6 +49,7 @@ class LiveView:
             token: that requests must know; None makes one where others than this machine can reach `host`.
             record_dir: where recordings are made.
             contract: of the run's model.
+            commands: gets those of viewers; those to record are done by this page's recorder.
 
         Raises:
             UsageError: the token cannot be one.
@@ -49,11 +57,11 @@ class LiveView:
         """
         access = grant(host, socket.gethostname(), token)
         self._heard = Heard()
-        self._asked = Asked()
         self._messages: Callable[[Event], object] = lambda event: None
         self._recorder = Recorder(record_dir, self._tell)
+        commands.record = self._recorder.record
         import_module(f"edge.sinks.{FORM}")  # now, rather than between two scans: it may take a fifth of a second
-        self._server = Server(self._heard, self._asked, access, port, lambda: self._recorder.path, self._failed)
+        self._server = Server(self._heard, commands, access, port, lambda: self._recorder.path, self._failed)
         self._view = ViewSink(self._heard, lambda: self._server.watched, self._server.wake)
         self._contract = contract
         self._open = contextlib.ExitStack()
@@ -88,10 +96,6 @@ class LiveView:
         self._messages = messages
         self._recorder.open_sink = open_sink
         self._server.begin(Run(name, kind, model, self._contract, secrets.token_hex(8)))
-
-    def commands(self, others: Commands) -> Commands:
-        """Commands of viewers, and others; those to record are done when they are polled."""
-        return RecordCommands(AllCommands([others, self._asked]), self._recorder)
 
     def _failed(self, why: str) -> None:
         self._messages(Event(time.monotonic_ns(), "trouble", None, why))

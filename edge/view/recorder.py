@@ -1,7 +1,7 @@
 """A recording that is begun and ended while the run goes on."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from threading import get_native_id
@@ -10,7 +10,6 @@ from typing import Final
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.commands import Command, Commands
 from edge.pipeline.sink import Sink
 
 FORM: Final = "mcap"
@@ -147,29 +146,6 @@ class Recorder(Sink):
 
     def _say(self, kind: str, text: str) -> None:
         self._tell(Event(self._clock_ns(), kind, None, text))
-
-
-class RecordCommands:
-    """Commands, of which those to record are done here, and the others handed on to who polls."""
-
-    def __init__(self, commands: Commands, recorder: Recorder) -> None:
-        self._commands = commands
-        self._recorder = recorder
-
-    @property
-    def refused(self) -> int:
-        """What came and was no command."""
-        return self._commands.refused
-
-    def poll(self) -> Sequence[Command]:
-        """What else was asked for since the last call."""
-        others: list[Command] = []
-        for command in self._commands.poll():
-            if command.name == "record":
-                self._recorder.record(command.on)
-            else:
-                others.append(command)
-        return others
 
 
 def _unused(stem: Path) -> Path:

@@ -25,12 +25,13 @@ from websockets.http11 import Request, Response
 from websockets.protocol import State
 
 from edge.errors import SinkError
+from edge.pipeline.commands import Commands
 from edge.view.access import SOCKET, Access
 from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import Frames, Run, hello, refused, state
 from edge.view.run_snapshot import Heard
 from edge.view.static_page import load_page
-from edge.view.viewer_commands import LONGEST_BYTES, Asked
+from edge.view.viewer_commands import LONGEST_BYTES, hear
 from edge.view.viewer_connection import Attended
 from firmware_bridge.links.base import SourceKind
 
@@ -57,7 +58,7 @@ class Server:
     def __init__(
         self,
         heard: Heard,
-        asked: Asked,
+        commands: Commands,
         access: Access,
         port: int,
         recording: Callable[[], Path | None] = lambda: None,
@@ -67,7 +68,7 @@ class Server:
 
         Args:
             heard: what to show.
-            asked: takes what viewers ask for.
+            commands: gets what viewers ask for.
             access: who may look.
             port: 0 for any free one.
             recording: file that is recorded into, or None.
@@ -78,7 +79,7 @@ class Server:
         """
         self.watched = False
         self._heard = heard
-        self._asked = asked
+        self._commands = commands
         self._access = access
         self._recording = recording
         self._failed = failed
@@ -205,7 +206,7 @@ class Server:
                 async for message in connection:
                     if connection.state is not State.OPEN:
                         break  # what was asked before it closed may be much, and takes its time
-                    why = self._asked.hear(message, attended.viewer)
+                    why = hear(message, attended.viewer, self._commands)
                     if why is not None:
                         broadcast([connection], refused(time.monotonic_ns(), why, self._source))
                     await asyncio.sleep(COMMAND_PAUSE_S)

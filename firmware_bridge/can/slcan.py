@@ -88,52 +88,39 @@ class SlcanDecoder:
 
     Attributes:
         status: what the adapter told of itself.
+        frames: so far, of any sort.
+        refusals: BELs so far.
+        late_stamps: lines lost so far because their time stamp was beyond LAST_TIMESTAMP_MS.
+        usual_line_bytes: a usual frame's line as the adapter sends it, with its CR; the shorter one before that is
+            learnt.
     """
 
     def __init__(self) -> None:
         self.status = AdapterStatus()
+        self.usual_line_bytes = _FORMS[False].line_bytes
         self._form: _Form | None = None
         self._newest_stamped = False
         self._same_in_a_row = 0
         self._pending = b""
-        self._frames = 0
+        self.frames = 0
         self._bad_lines = 0
         self._non_ascii_lines = 0
         self._skipped_bytes = 0
-        self._late_stamps = 0
+        self.late_stamps = 0
         self._replies = 0
-        self._refusals = 0
+        self.refusals = 0
 
     @property
     def pending_bytes(self) -> int:
         """Bytes of an unfinished line."""
         return len(self._pending)
 
-    @property
-    def usual_line_bytes(self) -> int:
-        """A usual frame's line as the adapter sends it, with its CR; the shorter one before that is learnt."""
-        return (self._form or _FORMS[False]).line_bytes
-
-    @property
-    def frames(self) -> int:
-        """Frames so far, of any sort."""
-        return self._frames
-
-    @property
-    def refusals(self) -> int:
-        """BELs so far."""
-        return self._refusals
-
-    @property
-    def late_stamps(self) -> int:
-        """Lines lost because their time stamp was beyond LAST_TIMESTAMP_MS."""
-        return self._late_stamps
-
     def begin_anew(self) -> None:
         """Give up an unfinished line: the link broke, and what comes next does not belong to it, nor has its form."""
         self._skipped_bytes += len(self._pending)
         self._pending = b""
         self._form, self._same_in_a_row = None, 0
+        self.usual_line_bytes = _FORMS[False].line_bytes
 
     def feed(self, data: bytes) -> list[CanFrame]:
         """Frames whose last byte lies in `data`; what comes after it waits for the next call."""
@@ -159,7 +146,7 @@ class SlcanDecoder:
             form = self._form
             if form and (usual := form.lines.match(buffer, position)):
                 packed = unhexlify(usual[0].translate(None, b"t\r"))
-                self._frames += len(packed) // form.frame_bytes
+                self.frames += len(packed) // form.frame_bytes
                 self._same_in_a_row = 0
                 pieces.append(PackedFrames(packed, form.frame_bytes))
                 position = usual.end()
@@ -171,7 +158,7 @@ class SlcanDecoder:
                 break
             frame = self._read_line(buffer[position : end.start()], refused=end[0] == b"\a")
             if frame is not None:
-                self._frames += 1
+                self.frames += 1
                 pieces.append(frame)
             position = end.end()
         # Of an unfinished line only the last characters can still become a frame: memory is bounded.
@@ -183,29 +170,29 @@ class SlcanDecoder:
     def counters(self) -> dict[str, int]:
         """Frames, lines of each other sort, and bytes that belong to none of them."""
         return {
-            "frames": self._frames,
+            "frames": self.frames,
             "bad_lines": self._bad_lines,
             "non_ascii_lines": self._non_ascii_lines,
             "skipped_bytes": self._skipped_bytes,
-            "late_stamps": self._late_stamps,
+            "late_stamps": self.late_stamps,
             "replies": self._replies,
-            "refusals": self._refusals,
+            "refusals": self.refusals,
         } | self.status.counters()
 
     def _read_line(self, line: bytes, *, refused: bool) -> CanFrame | None:
-        self._refusals += refused
+        self.refusals += refused
         start = max(line.rfind(letter) for letter in (b"t", b"T", b"r", b"R"))
         # A frame ends at CR alone: a BEL says that what stands before it went wrong.
         if start >= 0 and not refused:
             frame = _parse_frame(line[start:])
             if frame is not None and (frame.timestamp_ms or 0) > LAST_TIMESTAMP_MS:
-                self._late_stamps += 1
+                self.late_stamps += 1
             elif frame is not None and self._takes(frame.timestamp_ms is not None):
                 self._skipped_bytes += start
                 return frame
         if _REPLY.fullmatch(line):
             self._replies += not refused
-        elif not self.status.hear(line, self._frames):
+        elif not self.status.hear(line, self.frames):
             self._skipped_bytes += len(line)
             if line[-LONGEST_LINE:].isascii():
                 self._bad_lines += 1
@@ -219,6 +206,7 @@ class SlcanDecoder:
         self._newest_stamped = stamped
         if self._same_in_a_row >= LINES_TO_LEARN:
             self._form = _FORMS[stamped]
+            self.usual_line_bytes = self._form.line_bytes
         return self._form is None or self._form is _FORMS[stamped]
 
 

@@ -7,6 +7,19 @@ from typing import Literal, NamedTuple, Protocol
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
+
+class Wait(NamedTuple):
+    """When to call `read(0)` next: once the descriptor is readable, and after `longest_s` in any case.
+
+    Attributes:
+        descriptor: of the open link.
+        longest_s: in [s].
+    """
+
+    descriptor: int
+    longest_s: float
+
+
 SourceKind = Literal["device", "replay", "emulated"]
 NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
@@ -70,6 +83,13 @@ class Link(Protocol):
             LinkLostError: the link was there and is gone.
         """
         ...
+
+    def wait_on(self) -> Wait | None:
+        """Return what to wait for before `read(0)`, which then does not wait; None where a read may take long.
+
+        A link that waits for something else than a descriptor, or is about to open, takes a thread of its own.
+        """
+        return None
 
     def notices(self) -> list[Notice]:
         """What there is to tell since the last call, all of it from before the scans that the last `read` gave."""

@@ -38,6 +38,8 @@ class BurstReader:
     """Reads bytes from the descriptor of a serial port that is in raw mode and does not block.
 
     Attributes:
+        descriptor: of the port.
+        held_until_s: the beginning of a scan was fetched, and its end is waited for until then; None else.
         empty_s: when no more than the beginning of a scan lay there the last time that was looked.
     """
 
@@ -53,10 +55,12 @@ class BurstReader:
         Raises:
             OSError: the port is gone. termios.error, which is none, as well.
         """
-        self._descriptor = descriptor
+        self.descriptor = descriptor
         self._clock_s = clock_s
         self._sleep = sleep
         self._newest_s = self.empty_s = clock_s()
+        self._held = b""
+        self.held_until_s: float | None = None
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
@@ -66,33 +70,65 @@ class BurstReader:
             termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> bytes:
-        """What has come, when `wanted_bytes` have, or when no more do; waits at most `timeout_s` for the first.
+        """Return what has come, when `wanted_bytes` have, or when no more do.
+
+        Args:
+            timeout_s: longest wait for the first byte, in [s]. At 0 nothing is waited for: what is only the beginning
+                of a scan is kept, and the rest asked for by another call after `longest_wait_s`.
+            wanted_bytes: until a scan can close; the same until something is returned.
 
         Raises:
             OSError: the port is gone, and everything that came before was given.
         """
         end_s = self._clock_s() + timeout_s
         while True:
-            now_s = self._clock_s()
-            in_step = wanted_bytes >= FULL_BYTES or now_s - self._newest_s > LONGEST_REST_S
-            left_s = max(end_s - now_s, 0.0)
-            if in_step:
-                full = self._poll.poll(1000 * min(left_s, LONGEST_WAIT_S))
-                data = self._take(b"", max(wanted_bytes - FULL_BYTES, 0) if full else wanted_bytes)
-                if full and len(data) == max(wanted_bytes - FULL_BYTES, 0):
-                    self._poll.poll(1000 * LONGEST_REST_S)
-                    data = self._take(data, wanted_bytes)
-            else:
-                data = self._take(b"", wanted_bytes)
-                while len(data) < wanted_bytes and self._clock_s() < now_s + min(left_s, LONGEST_REST_S):
-                    self._sleep(STEP_S)
-                    data = self._take(data, wanted_bytes)
-            if data:
-                self._newest_s = self._clock_s()
-            else:
-                self.empty_s = self._clock_s()
+            left_s = max(end_s - self._clock_s(), 0.0)
+            wait_s = min(left_s, self.longest_wait_s(wanted_bytes))
+            if 0 < wait_s <= STEP_S:  # poll() counts in milliseconds
+                self._sleep(wait_s)
+                wait_s = 0
+            data = self._step(bool(self._poll.poll(1000 * wait_s)), wanted_bytes)
             if data or left_s <= 0:
                 return data
+
+    def longest_wait_s(self, wanted_bytes: int) -> float:
+        """Return how long the next call of `read` may be put off while the descriptor is not readable, in [s]."""
+        if self.held_until_s is None:
+            hurried = wanted_bytes < FULL_BYTES and self._clock_s() - self._newest_s <= LONGEST_REST_S
+            return STEP_S if hurried else LONGEST_WAIT_S
+        left_s = max(self.held_until_s - self._clock_s(), 0.0)
+        return left_s if wanted_bytes >= FULL_BYTES else min(left_s, STEP_S)
+
+    def _step(self, full: bool, wanted_bytes: int) -> bytes:
+        """Return what is there, unless it is the beginning of a scan whose end is on its way.
+
+        Args:
+            full: FULL_BYTES lie there, or the port is gone.
+            wanted_bytes: as in `read`.
+        """
+        now_s = self._clock_s()
+        if self.held_until_s is None:
+            if wanted_bytes >= FULL_BYTES:
+                early = wanted_bytes - FULL_BYTES
+                self._held = self._take(b"", early if full else wanted_bytes)
+                on_its_way = full and len(self._held) == early
+            else:
+                self._held = self._take(b"", wanted_bytes)
+                on_its_way = now_s - self._newest_s <= LONGEST_REST_S and len(self._held) < wanted_bytes
+            if on_its_way:
+                self.held_until_s = now_s + LONGEST_REST_S
+                return b""
+        else:
+            if full or wanted_bytes < FULL_BYTES or now_s >= self.held_until_s:
+                self._held = self._take(self._held, wanted_bytes)
+            if now_s < self.held_until_s and not (full or len(self._held) == wanted_bytes):
+                return b""
+        data, self._held, self.held_until_s = self._held, b"", None
+        if data:
+            self._newest_s = self._clock_s()
+        else:
+            self.empty_s = self._clock_s()
+        return data
 
     def look(self) -> None:
         """Look whether more waits than the beginning of a scan; if not, keep when that was.
@@ -100,7 +136,8 @@ class BurstReader:
         Raises:
             OSError: the port is gone.
         """
-        if _waiting_bytes(self._descriptor) < FULL_BYTES:
+        waiting = fcntl.ioctl(self.descriptor, termios.FIONREAD, bytes(4)) if fcntl and termios else bytes(4)
+        if int.from_bytes(waiting, sys.byteorder) < FULL_BYTES:
             self.empty_s = self._clock_s()
 
     def _take(self, data: bytes, wanted_bytes: int) -> bytes:
@@ -108,7 +145,7 @@ class BurstReader:
         while len(data) < wanted_bytes:
             try:
                 # Asked for VMIN, the kernel hands out 64 bytes a call however many there are.
-                piece = os.read(self._descriptor, wanted_bytes - len(data))
+                piece = os.read(self.descriptor, wanted_bytes - len(data))
                 if not piece:
                     raise OSError(errno.EIO, "hung up")
             except BlockingIOError:
@@ -119,9 +156,3 @@ class BurstReader:
                 raise
             data += piece
         return data
-
-
-def _waiting_bytes(descriptor: int) -> int:
-    if fcntl is None or termios is None:
-        return 0
-    return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from firmware_bridge.errors import SourceError
 from firmware_bridge.geometry import SensorGeometry
 from firmware_bridge.links.base import Link
-from firmware_bridge.links.merged import NamedLink, SeveralLinks
+from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_frames
@@ -49,8 +49,8 @@ def open_sources(
     give_up_s: float | None = math.inf,
     *,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
-) -> Link:
-    """The links that `texts` name as one, not yet entered; what is lost is opened again.
+) -> list[Link]:
+    """The links that `texts` name, not yet entered; what is lost is opened again.
 
     Args:
         texts: each one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4". Of several sources, those without
@@ -62,7 +62,7 @@ def open_sources(
         mountings: how sensors sit, by name, that of their source included.
 
     Raises:
-        SourceError: no such form, one name twice, or sources of several kinds.
+        SourceError: no such form, or one name twice.
         NoDeviceError: as in `open_source`.
         RecordingError: as in `open_source`.
     """
@@ -76,9 +76,8 @@ def open_sources(
             link = LastingLink(link, give_up_s)
         if name in named:
             raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")
-        named[name] = NamedLink(name, link) if name else link
-    links = list(named.values())
-    return links[0] if len(links) == 1 else SeveralLinks(links)
+        named[name] = MountedLink(link, name) if name else link
+    return list(named.values())
 
 
 def open_source(
@@ -178,9 +177,7 @@ def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: boo
     moved = {name: one for name, one in mountings.items() if one.moves_taxels or (tells_newtons and one.reverses_axes)}
     if not moved:
         return link
-    from firmware_bridge.links.placed import PlacedLink
-
-    return PlacedLink(link, moved)
+    return MountedLink(link, places=moved)
 
 
 def _refusal(text: str) -> SourceError:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, NoticeKind, SourceKind
+from firmware_bridge.links.base import Link, Notice, NoticeKind, SourceKind, Wait
 from firmware_bridge.scans.scan import Scan
 
 FIRST_RETRY_S: Final = 0.1
@@ -47,7 +47,8 @@ class LastingLink(Link):
         self._give_up_s = give_up_s
         self._clock_ns = clock_ns
         self._sleep = sleep
-        self._open = False
+        self._entered = self._open = False
+        self._away = False
         self._lost_ns: int | None = None
         self._retry_ns = 0
         self._delay_s = FIRST_RETRY_S
@@ -61,23 +62,27 @@ class LastingLink(Link):
     def __enter__(self) -> "LastingLink":
         self._link.__enter__()
         self.kind = self._link.kind
-        self._open = True
+        self._entered = self._open = True
         self._heard_ns = self._clock_ns()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        if self._open:
-            self._open = False
+        self._open = False
+        if self._entered:
+            self._entered = False
             self._link.__exit__(*exc_info)
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Scans that closed since the last call; none while the link is away.
 
+        A link that is lost or silent is closed and opened by the next call, which may take long and says so before:
+        `wait_on` then gives None.
+
         Raises:
             LinkLostError: it was away for longer than may be.
         """
         if not self._open:
-            self._await_retry(timeout_s)
+            self._come_back(timeout_s)
             return []
         try:
             scans = self._link.read(timeout_s)
@@ -91,6 +96,10 @@ class LastingLink(Link):
         else:
             self._suspect()
         return scans
+
+    def wait_on(self) -> Wait | None:
+        """Return what the link waits for; None while it is to be opened again."""
+        return self._link.wait_on() if self._open else None
 
     def notices(self) -> list[Notice]:
         """What happened to the link since the last call."""
@@ -130,27 +139,23 @@ class LastingLink(Link):
                 f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: see to the sensor's power and its cable"
             )
         self._silent_s += min(self._silent_s, LATE_RETRY_S)
-        self._reopen(now_ns)
+        self._open = False
 
     def _reopen(self, now_ns: int) -> None:
-        if self._open:
-            self._open = False
-            self._link.__exit__(None, None, None)
         try:
             self._link.__enter__()
         except DeviceError as error:
             self._close(f"{error}", now_ns)
         else:
             self._reopenings += 1
-            self._open = True
+            self._entered = self._open = True
             if self._link.kind != self.kind:  # every result would go on to say the other
                 raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start anew")
 
     def _close(self, why: str, now_ns: int | None = None) -> None:
         now_ns = self._clock_ns() if now_ns is None else now_ns
-        if self._open:
-            self._open = False
-            self._link.__exit__(None, None, None)
+        self._open = False
+        self._away = True
         if self._give_up_s == 0:
             raise LinkLostError(why)
         if self._lost_ns is None:
@@ -163,13 +168,21 @@ class LastingLink(Link):
         self._retry_ns = now_ns + int(min(self._delay_s, longest_s) * 1e9)
         self._delay_s = min(2 * self._delay_s, LATE_RETRY_S)
 
-    def _await_retry(self, timeout_s: float) -> None:
+    def _come_back(self, timeout_s: float) -> None:
+        """Close what is still open, and open it again: at once where it is silent, else when it is time to try."""
+        if self._entered:
+            self._entered = False
+            self._link.__exit__(None, None, None)
+        if not self._away:
+            self._reopen(self._clock_ns())
+            return
         wait_s = (self._retry_ns - self._clock_ns()) / 1e9
         if wait_s > 0:
             self._sleep(min(wait_s, timeout_s))
         now_ns = self._clock_ns()
         if now_ns >= self._retry_ns:
             self._heard_ns, self._silent_s = now_ns, SILENT_S  # its silence begins with the opening
+            self._away = False
             self._reopen(now_ns)
 
     def _tell(self, kind: NoticeKind, text: str) -> None:

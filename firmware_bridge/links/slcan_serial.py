@@ -18,7 +18,7 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.base import Link, SourceKind, Wait
 from firmware_bridge.links.fd_reader import BurstReader
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
@@ -96,7 +96,7 @@ class SlcanSerialLink(Link):
         self._plugged = PluggedAdapter(port)
         self._asks_stamps = baudrate >= SLOWEST_STAMPED_BAUD
         self._scans = SlcanScans(model)
-        self._questions = StatusQuestions(self._scans.status)
+        self._questions = StatusQuestions(self._scans.decoder.status)
         self._stamps_on = False
         self._silent_openings = 0
         self._frames_at_opening = 0
@@ -104,11 +104,13 @@ class SlcanSerialLink(Link):
         self._received_bytes = 0
         self._dropped_bytes = 0
         self._unread = Unread()
+        self._stamps_to_set: bytes | None = None
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
 
     def __enter__(self) -> Self:
         self._scans.begin_anew()
+        self._stamps_to_set = None
         self.port = self._plugged.find(serial_ports())
         self._serial = self._open_port()
         try:
@@ -125,6 +127,7 @@ class SlcanSerialLink(Link):
         if port is None:
             return
         with suppress(*_PORT_ERRORS):  # gone already: nobody left to tell
+            _wait_until_sent(port)
             for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
                 port.write(command)
                 _wait_until_sent(port)
@@ -142,8 +145,12 @@ class SlcanSerialLink(Link):
         """
         if self._bursts is None or self._serial is None:
             raise ValueError("the link is not open: use it in a with statement")
+        if self._stamps_to_set is not None:
+            self._open_anew(self._serial, self._stamps_to_set)
         try:
             data = self._bursts.read(timeout_s, self._scans.bytes_until_scan())
+            if self._bursts.held_until_s is not None:
+                return []
             self._unread.found_empty(round(self._bursts.empty_s * 1e9))
             with suppress(OSError):  # of an error behind bytes the next call tells
                 self._bursts.look()
@@ -152,17 +159,25 @@ class SlcanSerialLink(Link):
         self._received_bytes += len(data)
         now_ns = time.monotonic_ns()
         scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
-        if self._questions.due(len(scans), self._scans.refusals, now_ns):
-            _say(self._serial, STATUS_FLAGS)
+        if self._questions.due(len(scans), self._scans.decoder.refusals, now_ns):
+            _ask(self._serial, STATUS_FLAGS)
         silence = self._questions.answered_in_silence
-        self.trouble = self._scans.status.trouble(self._scans.frames, flags_of_a_silence=silence)
+        self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
         if self._stamps_on and self._stamps_are_none():
             self._asks_stamps = self._stamps_on = False
-            self._open_anew(self._serial, STAMPS_OFF)
+            self._stamps_to_set = STAMPS_OFF
         elif scans and self._asks_stamps and not self._stamps_on:  # left out while nothing came
             self._stamps_on = True
-            self._open_anew(self._serial, STAMPS_ON)
+            self._stamps_to_set = STAMPS_ON
+        if timeout_s > 0 and self._stamps_to_set is not None:
+            self._open_anew(self._serial, self._stamps_to_set)
         return scans
+
+    def wait_on(self) -> Wait | None:
+        """Return the port's descriptor; None while the channel is to be opened anew, which waits for a quiet line."""
+        if self._bursts is None or self._stamps_to_set is not None:
+            return None
+        return Wait(self._bursts.descriptor, self._bursts.longest_wait_s(self._scans.bytes_until_scan()))
 
     def counters(self) -> dict[str, int]:
         """Counters of decoder and assembler, bytes received, and bytes that an opening or a closing dropped."""
@@ -190,10 +205,10 @@ class SlcanSerialLink(Link):
         return port
 
     def _start(self, port: serial.Serial) -> None:
-        frames = self._scans.frames
+        frames = self._scans.decoder.frames
         self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
         self._frames_at_opening = frames
-        self._late_stamps_from = self._scans.late_stamps, frames
+        self._late_stamps_from = self._scans.decoder.late_stamps, frames
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
         # One write each: some adapters obey only the first command in a USB packet.
         for command in (CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M):
@@ -207,14 +222,15 @@ class SlcanSerialLink(Link):
 
     def _stamps_are_none(self) -> bool:
         late_before, frames_before = self._late_stamps_from
-        if self._scans.late_stamps - late_before >= MOST_LATE_STAMPS:
+        if self._scans.decoder.late_stamps - late_before >= MOST_LATE_STAMPS:
             return True
-        if self._scans.frames - frames_before >= LATE_STAMPS_FRAMES:
-            self._late_stamps_from = self._scans.late_stamps, self._scans.frames
+        if self._scans.decoder.frames - frames_before >= LATE_STAMPS_FRAMES:
+            self._late_stamps_from = self._scans.decoder.late_stamps, self._scans.decoder.frames
         return False
 
     def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:
         """With time stamps on or off, from a line that has fallen silent: of two forms at once most would be lost."""
+        self._stamps_to_set = None
         for command in (CLOSE, stamps):
             _say(port, command)
         with suppress(*_PORT_ERRORS):  # gone, which reading tells
@@ -237,6 +253,7 @@ class SlcanSerialLink(Link):
 
 def _say(port: serial.Serial, command: bytes) -> None:
     with suppress(*_PORT_ERRORS):  # gone, which reading tells, or full, and then nobody would answer
+        _wait_until_sent(port)
         os.write(port.fileno(), command)
         _wait_until_sent(port)
 
@@ -248,6 +265,13 @@ def _take_waiting(descriptor: int) -> int:
         for _ in range(_MOST_PIECES):
             taken += len(os.read(descriptor, _PIECE_BYTES))
     return taken
+
+
+def _ask(port: serial.Serial, question: bytes) -> None:
+    """Send a question without waiting until it is gone; an adapter that takes nothing would not answer either."""
+    with suppress(*_PORT_ERRORS):
+        if not port.out_waiting:
+            os.write(port.fileno(), question)
 
 
 def _wait_until_sent(port: serial.Serial) -> None:

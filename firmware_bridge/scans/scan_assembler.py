@@ -49,6 +49,7 @@ class ScanAssembler:
     def __init__(self, model: ModelMap) -> None:
         self._model = model
         self._geometry = model.geometry
+        self._taxels = model.geometry.taxel_count
         self._readings = 0
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
@@ -99,11 +100,14 @@ class ScanAssembler:
 
         A sensor that a flipped bit invented, or that fell silent in mid-scan, closes none.
         """
-        sensors = self._sensors.values()
-        open_ones = [sensor for sensor in sensors if sensor.closes_before_long(self._newest_ns)]
+        fewest = self._taxels + 1
+        for sensor in self._sensors.values():
+            if sensor.closes_before_long(self._newest_ns):
+                fewest = min(fewest, sensor.missing)
+        if fewest <= self._taxels:
+            return fewest
         # While the order of the only sensor is still to be learnt, too: its pauses are not to be slept through.
-        open_ones = open_ones or [sensor for sensor in sensors if not sensor.wire.order]
-        return min((sensor.missing for sensor in open_ones), default=self._geometry.taxel_count)
+        return 1 if any(not sensor.wire.order for sensor in self._sensors.values()) else self._taxels
 
     def counters(self) -> dict[str, int]:
         """Sums over all sensors.
@@ -131,6 +135,7 @@ class _Sensor:
         self.confirmed = False
         self.wire = WireCycle(order)
         self._geometry = geometry
+        self._scan_shape = geometry.scan_shape
         self._series = ScanSeries(name, geometry)
         self._last: Reading | None = None
         self._last_cycle: tuple[Cycle, NDArray[np.int32]] | None = None
@@ -178,7 +183,7 @@ class _Sensor:
         self.confirmed = self._begins_known = True
         self.wire.doubts = 0
         self._newest_ns, self._device = time_ns, device
-        counts = counts.reshape(self._geometry.scan_shape)
+        counts = counts.reshape(self._scan_shape)
         if device is None:
             self.wire.count(time_ns)
             return self._count(self._series.close_whole(counts, time_ns), missing=0)

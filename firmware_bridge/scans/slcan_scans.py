@@ -3,7 +3,6 @@
 from typing import Final
 
 from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, CanFrame, SlcanDecoder
-from firmware_bridge.can.slcan_status import AdapterStatus
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import Scan
@@ -14,47 +13,32 @@ _MS_NS: Final = 1_000_000
 
 
 class SlcanScans:
-    """slcan text to scans: the three pure stages in a row."""
+    """slcan text to scans: the three pure stages in a row.
+
+    Attributes:
+        decoder: the first of them, with what it has counted and what the adapter told of itself.
+    """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         self._model = model
+        self._taxels = model.geometry.taxel_count
         self._clock = _millisecond_clock()
         self._stamped: tuple[int, int] | None = None
         self._device = DeviceTime(0, 0)
         self._cycles: dict[bytes, Cycle | None] = {}
-        self._decoder = SlcanDecoder()
+        self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
         self._foreign = 0
-
-    @property
-    def status(self) -> AdapterStatus:
-        """What the adapter told of itself."""
-        return self._decoder.status
-
-    @property
-    def frames(self) -> int:
-        """CAN frames so far, of any sort."""
-        return self._decoder.frames
-
-    @property
-    def refusals(self) -> int:
-        """BELs so far."""
-        return self._decoder.refusals
-
-    @property
-    def late_stamps(self) -> int:
-        """Lines lost because of a time stamp that is none."""
-        return self._decoder.late_stamps
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Scans that close within `data`, which arrived at `time_ns` [ns]."""
         scans: list[Scan] = []
-        for piece in self._decoder.cut(data):
+        for piece in self.decoder.cut(data):
             if isinstance(piece, CanFrame):
                 self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
                 continue
             packed, frame_bytes = piece
-            cycle_bytes = self._model.geometry.taxel_count * frame_bytes
+            cycle_bytes = self._taxels * frame_bytes
             start = 0
             while start < len(packed):
                 end = start + cycle_bytes
@@ -70,17 +54,17 @@ class SlcanScans:
 
     def begin_anew(self) -> None:
         """Give up what is half read, since the link was broken; the adapter's clock may have begun anew, too."""
-        self._decoder.begin_anew()
+        self.decoder.begin_anew()
         self._assembler.begin_anew()
         self._clock, self._stamped = _millisecond_clock(), None
 
     def bytes_until_scan(self) -> int:
         """How many bytes must come at least before a scan can close whole; from 1."""
-        return max(1, self._assembler.fewest_missing() * self._decoder.usual_line_bytes - self._decoder.pending_bytes)
+        return max(1, self._assembler.fewest_missing() * self.decoder.usual_line_bytes - self.decoder.pending_bytes)
 
     def counters(self) -> dict[str, int]:
         """Counters of all stages; foreign: frames that are none of this model's taxels."""
-        return self._decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
+        return self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
 
     def _feed_reading(self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan]) -> None:
         if reading is None:

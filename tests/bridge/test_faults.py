@@ -63,7 +63,7 @@ class Played:
         """The reader counted what the truth says that it must have."""
         counted, told = self.reader.counters(), self.truth.counters()
         counted["bad_lines"] += counted["non_ascii_lines"]
-        counted["skipped_bytes"] += self.reader._decoder.pending_bytes
+        counted["skipped_bytes"] += self.reader.decoder.pending_bytes
         told["skipped_bytes"] += self.truth._pending
         return told == {name: counted[name] for name in told}
 

@@ -1,16 +1,14 @@
-"""Links that come back, and several as one, on a clock of their own."""
+"""Links that come back, on a clock of their own."""
 
 import itertools
-import threading
-from queue import SimpleQueue
 
 import pytest
 from edge_samples import FakeLink, make_scan
 
 from edge.doctor.link_checks import LineFacts, line_facts
-from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
-from firmware_bridge.links.base import Link, Notice
-from firmware_bridge.links.merged import NamedLink, SeveralLinks
+from firmware_bridge.errors import DeviceError, LinkLostError
+from firmware_bridge.links.base import Link, Notice, Wait
+from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.reconnecting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
@@ -218,121 +216,44 @@ def test_trouble_is_told_when_it_comes_and_when_it_goes():
     ]
 
 
-def test_trouble_of_one_of_several_is_trouble_of_all():
-    links = [FakeLink([[make_scan(0)]], endless=True) for _ in range(2)]
-    links[1].trouble = "bus-off"
-    with NamedLink("left", links[1]) as link:
-        link.read(0)
-        assert link.trouble == "bus-off"
-    with SeveralLinks(links) as several:
-        several.read(0.1)
-        assert several.trouble == "bus-off"
-
-
-def read_all(link):
-    """Every scan and notice in its order."""
-    heard = []
-    with link:
-        while not link.ended:
-            scans = link.read(0.05)
-            heard += [*link.notices(), *scans]
-    return heard
-
-
-def test_sensors_of_several_links_bear_their_names():
-    links = [NamedLink(name, FakeLink([[make_scan(n)] for n in range(50)])) for name in ("left", "right")]
-    heard = read_all(SeveralLinks(links))
-    for name in ("left", "right"):
-        assert [scan.number for scan in heard if scan.sensor == f"{name}/4"] == list(range(50))
-    assert SeveralLinks(links).counters() == {"scans": 100}
-
-
 def test_the_doctor_knows_the_port_behind_a_name():
-    link = NamedLink("left", SlcanSerialLink("/dev/ttyUSB7", 115_200))
+    link = MountedLink(SlcanSerialLink("/dev/ttyUSB7", 115_200), "left")
     assert line_facts(link) == LineFacts("/dev/ttyUSB7", 115_200)
 
 
-def test_a_link_that_hangs_holds_up_no_other():
-    gate = threading.Event()
-    slow, fast = FakeLink([gate, [make_scan(0)]]), FakeLink([[make_scan(n)] for n in range(5)])
-    with SeveralLinks([NamedLink("slow", slow), NamedLink("fast", fast)]) as link:
-        heard = []
-        while len(heard) < 5:
-            heard += link.read(5)
-        assert {scan.sensor for scan in heard} == {"fast/4"}
-        gate.set()
-        while not link.ended:
-            heard += link.read(0.1)
-    assert [scan.sensor for scan in heard].count("slow/4") == 1
+def test_trouble_and_notices_are_of_the_name():
+    class Telling(FakeLink):
+        def notices(self):
+            return [Notice(self.reads, "back", "fake", f"before read {self.reads}")]
 
-
-class Telling(FakeLink):
-    def notices(self):
-        return [Notice(self.reads, "back", "fake", f"before read {self.reads}")]
-
-
-def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
-    heard = read_all(SeveralLinks([Telling([[make_scan(n)] for n in range(20)])]))
-    order = [heard.text if isinstance(heard, Notice) else heard.number for heard in heard]
-    assert order[:40] == [x for n in range(20) for x in (f"before read {n + 1}", n)]
-
-
-def test_what_is_told_is_about_the_sensors_of_its_link():
-    with NamedLink("left", Telling([[make_scan(0)]])) as link:
-        link.read(0)
+    inner = Telling([[make_scan(0)]])
+    inner.trouble = "bus-off"
+    with MountedLink(inner, "left") as link:
+        assert [scan.sensor for scan in link.read(0)] == ["left/4"]
+        assert link.trouble == "bus-off"
         assert [(notice.sensors, notice.text) for notice in link.notices()] == [("left/", "left: before read 1")]
 
 
-def test_one_that_gives_up_is_told_after_its_scans():
-    links = [FakeLink([[make_scan(0)]], error=LinkLostError("gone")), FakeLink([], endless=True)]
-    heard = []
-    with pytest.raises(LinkLostError, match="gone"), SeveralLinks(links) as link:
-        while True:
-            heard += link.read(0.05)
-    assert len(heard) == 1
+class SlowToClose(WorldLink):
+    """Takes a second to close, as an adapter does that takes no more bytes."""
+
+    def __exit__(self, *exc_info):
+        self.world.sleep(1.0)
+        super().__exit__(*exc_info)
+
+    def wait_on(self):
+        return Wait(7, 0.02)
 
 
-class Hesitant(SimpleQueue):
-    """Whoever puts a marker is held up until somebody has met it and asks for more, or for a while."""
-
-    def __init__(self):
-        super().__init__()
-        self._met = False
-        self._asked_for_more = threading.Event()
-
-    def put(self, item):
-        super().put(item)
-        if item is None:
-            self._asked_for_more.wait(0.2)
-
-    def get(self, *, timeout):
-        if self._met:
-            self._asked_for_more.set()
-        item = super().get(timeout=timeout)
-        self._met = self._met or item is None
-        return item
-
-
-def test_one_that_gives_up_is_told_also_if_its_marker_is_met_at_once(monkeypatch):
-    monkeypatch.setattr("firmware_bridge.links.merged.SimpleQueue", Hesitant)
-    links = [FakeLink([], error=LinkLostError("gone")), FakeLink([], endless=True)]
-    with SeveralLinks(links) as link, pytest.raises(LinkLostError, match="gone"):
-        for _ in range(20):
-            link.read(0.05)
-
-
-def test_the_kind_of_several_is_what_they_are_once_open():
-    class Late(FakeLink):
-        def __enter__(self):
-            self.kind = "emulated"
-            return self
-
-    with SeveralLinks([Late([]), NamedLink("b", Late([]))]) as link:
-        assert link.kind == "emulated"
-    with pytest.raises(SourceError, match="of several kinds"):
-        SeveralLinks([Late([]), FakeLink([])]).__enter__()
-
-
-def test_pretended_and_real_sources_are_not_mixed():
-    with pytest.raises(SourceError, match=r"\(fake is device, fake is emulated\), expected one"):
-        SeveralLinks([FakeLink([]), FakeLink([], kind="emulated")])
+@pytest.mark.parametrize("stretches", [{"away": [(0.1, 3.0)]}, {"mute": [(0.1, 3.0)]}])
+def test_a_read_that_may_take_long_is_asked_for_a_thread_of_its_own(stretches):
+    """Whoever shares a thread reads only while `wait_on` names a descriptor, and never waits then."""
+    world = World(**stretches)
+    with LastingLink(SlowToClose(world), clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
+        apart = 0
+        while world.now_ns < 6 * S:
+            shared, begun_ns = link.wait_on() is not None, world.now_ns
+            link.read(0 if shared else 0.1)
+            assert not shared or world.now_ns - begun_ns <= 0.02 * S
+            apart += not shared
+        assert apart and link.wait_on() == Wait(7, 0.02)

@@ -161,7 +161,7 @@ def read_notices(link, count):
 
 
 def test_it_is_opened_again_until_the_server_is_back():
-    with ServerEmulator(looping()) as server, open_sources([f"finger=xela-server:{server.url}"]) as link:
+    with ServerEmulator(looping()) as server, open_sources([f"finger=xela-server:{server.url}"])[0] as link:
         assert read_scans(link, 3)[0].vendor_force_n is not None
         server.kill()
         notices = read_notices(link, 1)
@@ -173,7 +173,7 @@ def test_it_is_opened_again_until_the_server_is_back():
 
 def test_a_dead_sensor_is_told_of_once_and_not_taken_for_back():
     vendor = looping()
-    with ServerEmulator(vendor) as server, open_sources([f"xela-server:{server.url}"]) as link:
+    with ServerEmulator(vendor) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
         read_scans(link, 3)
         vendor.silent = frozenset(range(16))
         notices = read_notices(link, 2)
@@ -369,7 +369,7 @@ def test_a_handshake_that_hangs(monkeypatch):
 def test_a_server_that_was_met_and_hangs_holds_up_its_reader_for_less(monkeypatch):
     monkeypatch.setattr(xela_server, "OPENING_S", 20.0)
     monkeypatch.setattr(xela_server, "REOPENING_S", 0.2)
-    with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"]) as link:
+    with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
         read_scans(link, 3)
         server.freeze()
         silent, lost = read_notices(link, 2)

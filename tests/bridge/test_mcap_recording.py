@@ -34,7 +34,6 @@ from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
-from edge.pipeline.scan_reader import Arrival
 from edge.sinks import mcap_writer as mcap_file
 from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
@@ -45,6 +44,7 @@ from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
@@ -65,7 +65,7 @@ def environment():
 
 def scans_of(source):
     while (taken := source.take(1.0)) is not None:
-        yield from (heard.scan for heard in taken if isinstance(heard, Arrival))
+        yield from (heard for heard in taken if isinstance(heard, Scan))
 
 
 def scans_on_disk(path):

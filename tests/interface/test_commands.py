@@ -1,11 +1,25 @@
 import os
 import signal
 import sys
+import threading
 
 import pytest
 
 from edge.cli.user_commands import user_commands, zero_on_signal
-from edge.pipeline.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, LineCommands, obey, stdin_commands
+from edge.pipeline.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, CommandLines, Commands, obey, read_stdin
+
+
+def lines_of(descriptor):
+    commands = Commands()
+    lines = CommandLines(commands, descriptor)
+    commands.ask(lines.read)
+    return lines, commands
+
+
+def polled_stdin():
+    commands = Commands()
+    read_stdin(commands)
+    return commands.poll()
 
 
 @pytest.fixture
@@ -20,15 +34,15 @@ def pipe():
 
 
 def test_commands_come_as_lines_however_they_are_cut(pipe):
-    lines = LineCommands(pipe[0])
-    assert lines.poll() == []
+    _, commands = lines_of(pipe[0])
+    assert commands.poll() == []
     for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"'):
         os.write(pipe[1], piece)
-        got = lines.poll()
+        got = commands.poll()
     assert got == [RESET, RESET]
     os.write(pipe[1], b':"reset"}\r\n')
-    assert lines.poll() == [RESET]
-    assert lines.refused == 0
+    assert commands.poll() == [RESET]
+    assert commands.refused == 0
 
 
 @pytest.mark.parametrize(
@@ -36,60 +50,59 @@ def test_commands_come_as_lines_however_they_are_cut(pipe):
     [b"reset", b"{}", b'{"cmd": "rest"}', b'{"cmd": ["reset"]}', b'["reset"]', b"\xff\xfe", b"[" * 4000, b"1e999"],
 )
 def test_other_lines_are_counted(pipe, line):
-    lines = LineCommands(pipe[0])
+    _, commands = lines_of(pipe[0])
     os.write(pipe[1], line + b'\n\n  \n{"cmd": "reset"}\n')
-    assert lines.poll() == [RESET]
-    assert lines.refused == 1
+    assert commands.poll() == [RESET]
+    assert commands.refused == 1
 
 
 def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
-    lines = LineCommands(pipe[0])
+    lines, commands = lines_of(pipe[0])
     for _ in range(20):
         os.write(pipe[1], b"x" * 4000)
-        assert lines.poll() == []
+        assert commands.poll() == []
         assert len(lines._partial) <= LONGEST_LINE_BYTES + 1
     os.write(pipe[1], b'{"cmd": "reset"}\n{"cmd": "reset"}\n')
-    assert lines.poll() == [RESET]
-    assert lines.refused == 1
+    assert commands.poll() == [RESET]
+    assert commands.refused == 1
 
 
 def test_a_line_cut_for_its_length_is_no_command(pipe):
-    lines = LineCommands(pipe[0])
+    _, commands = lines_of(pipe[0])
     for piece in (b'{"cmd": "reset", "x": "', *[b"x" * 4000] * 3, b'"}\n'):
         os.write(pipe[1], piece)
-        assert lines.poll() == []
-    assert lines.refused == 1
+        assert commands.poll() == []
+    assert commands.refused == 1
 
 
 def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
-    lines = LineCommands(pipe[0])
+    _, commands = lines_of(pipe[0])
     os.write(pipe[1], b'{"cmd": "reset"}')
-    assert lines.poll() == []
+    assert commands.poll() == []
     os.close(pipe[1])
-    assert lines.poll() == [RESET]
-    assert lines.poll() == []
+    assert commands.poll() == [RESET]
+    assert commands.poll() == []
     os.close(pipe[0])
-    assert lines.poll() == [], "a pipe that has ended is not touched again"
+    assert commands.poll() == [], "a pipe that has ended is not touched again"
 
 
 def test_a_terminal_and_a_missing_stdin_are_left_alone(monkeypatch):
     leader, follower = os.openpty()
     with os.fdopen(follower) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
-        assert stdin_commands() is None
-    assert stdin_commands() is None  # closed
+        os.write(leader, b'{"cmd": "reset"}\n')
+        assert polled_stdin() == []
+    assert polled_stdin() == []  # closed
     monkeypatch.setattr(sys, "stdin", None)
-    assert stdin_commands() is None
+    assert polled_stdin() == []
     os.close(leader)
 
 
 def test_a_pipe_is_listened_to(monkeypatch, pipe):
     with os.fdopen(os.dup(pipe[0])) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
-        lines = stdin_commands()
-        assert lines is not None
         os.write(pipe[1], b'{"cmd": "reset"}\n')
-        assert lines.poll() == [RESET]
+        assert polled_stdin() == [RESET]
 
 
 @pytest.mark.parametrize(
@@ -102,9 +115,9 @@ def test_a_pipe_is_listened_to(monkeypatch, pipe):
     ],
 )
 def test_zeroing_names_a_sensor_or_all_and_may_be_forced(pipe, line, command):
-    lines = LineCommands(pipe[0])
+    _, commands = lines_of(pipe[0])
     os.write(pipe[1], line + b"\n")
-    assert lines.poll() == [command] and lines.refused == 0
+    assert commands.poll() == [command] and commands.refused == 0
 
 
 @pytest.mark.parametrize(
@@ -116,9 +129,9 @@ def test_zeroing_names_a_sensor_or_all_and_may_be_forced(pipe, line, command):
 )
 def test_a_zeroing_that_is_not_understood_is_none(pipe, more):
     """Least of all one of every sensor."""
-    lines = LineCommands(pipe[0])
+    _, commands = lines_of(pipe[0])
     os.write(pipe[1], b'{"cmd": "zero", ' + more + b"}\n")
-    assert lines.poll() == [] and lines.refused == 1
+    assert commands.poll() == [] and commands.refused == 1
 
 
 class Told:
@@ -135,7 +148,8 @@ class Told:
 def test_a_signal_asks_once_for_zeroing_and_is_let_go_afterwards():
     before = signal.getsignal(signal.SIGUSR1)
     runtime = Told()
-    with zero_on_signal() as commands:
+    commands = Commands()
+    with zero_on_signal(commands):
         obey(commands, runtime)
         assert runtime.done == []
         for _ in range(2):
@@ -156,3 +170,23 @@ def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
             obey(everything, runtime)
             assert everything.refused == 1
     assert runtime.done == [(None, False), "reset", ("4", True)]
+
+
+def test_commands_of_many_threads_come_each_once_and_in_their_threads_order():
+    commands, got = Commands(), []
+
+    def ask(name):
+        for number in range(200):
+            commands.put(Command("zero", f"{name}/{number}"))
+            commands.refuse()
+
+    threads = [threading.Thread(target=ask, args=(name,)) for name in "abcd"]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        got += commands.poll()
+    got += commands.poll()
+    for name in "abcd":
+        mine = [one.sensor for one in got if one.sensor and one.sensor.startswith(name)]
+        assert mine == [f"{name}/{number}" for number in range(200)]
+    assert len(got) == commands.refused == 800

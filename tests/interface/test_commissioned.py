@@ -13,6 +13,7 @@ from edge.doctor.write_sensor_file import keep
 from edge.errors import UsageError
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import TaxelWatch
+from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import references, settled
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.links.parse import open_sources
@@ -20,6 +21,7 @@ from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
 from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
@@ -197,7 +199,7 @@ def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
         (tmp_path / folder / "4.csv").write_text("\n".join([header, row, ""]))
     texts = [f"{name}=replay:{tmp_path}/{name}/4.csv" for name in ("left", "right")]
     found = {}
-    with open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])}) as link:
-        while not link.ended:
-            found |= {one.sensor: one.counts for one in link.read(0.2)}
+    with Source(*open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])})) as source:
+        while (taken := source.take(0.2)) is not None:
+            found |= {one.sensor: one.counts for one in taken if isinstance(one, Scan)}
     assert np.array_equal(found["left/4"], turned_rest()) and np.array_equal(found["right/4"], REST)

@@ -5,7 +5,7 @@ import pytest
 from edge_samples import REST, FakeLink, make_scan
 
 from edge.pipeline.baseline_capture import take_baselines
-from edge.pipeline.scan_reader import Arrival, Source
+from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import BaselineRefusedError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Notice
 
@@ -51,7 +51,7 @@ def test_silence_is_told_and_measured_from_the_last_scan():
 
         def take(self, timeout_s):
             self.taken += 1
-            return [Arrival(make_scan(self.taken, noise=3), {})] if self.taken <= 30 else []
+            return [make_scan(self.taken, noise=3)] if self.taken <= 30 else []
 
     source = Script()
     with pytest.raises(DeviceError, match=r"no scan from fake for 10 s"):

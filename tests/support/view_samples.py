@@ -10,6 +10,7 @@ from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_sca
 from websockets.sync.client import connect
 
 from edge.perception.runtime import Runtime
+from edge.pipeline.commands import Commands
 from edge.sinks.binary_message import unpack
 from edge.sinks.registry import open_sink
 from edge.view.live_view import LiveView
@@ -45,10 +46,10 @@ class Press:
 class Page:
     """A live page over loopback, and who looks at it."""
 
-    def __init__(self, view):
+    def __init__(self, view, commands):
         self.view = view
         self.port = int(view.url.partition("//")[2].partition("/")[0].rpartition(":")[2])
-        self.asked = view.commands(NoCommands())
+        self.asked = commands
         self.messages = []
         self.press = Press()
 
@@ -159,17 +160,11 @@ class Swallowing:
                         giving.sendall(data)
 
 
-class NoCommands:
-    refused = 0
-
-    def poll(self):
-        return []
-
-
 @contextmanager
 def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT):
-    with LiveView(host, port, token, tmp_path, contract) as view:
-        page = Page(view)
+    commands = Commands()
+    with LiveView(host, port, token, tmp_path, contract, commands) as view:
+        page = Page(view, commands)
         view.begin("pretended", "emulated", "fake", partial(open_sink, contract=contract), page.messages.append)
         yield page
 

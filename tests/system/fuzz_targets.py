@@ -31,7 +31,7 @@ from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
-from edge.pipeline.commands import LONGEST_LINE_BYTES, LineCommands
+from edge.pipeline.commands import LONGEST_LINE_BYTES, CommandLines, Commands
 from edge.sinks.mcap_writer import McapFile
 from firmware_bridge.can.gs_usb import BitTiming, BitTimingLimits, GsUsbDecoder, bit_timing, channel_count
 from firmware_bridge.can.slcan import LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
@@ -384,13 +384,15 @@ def commands(data: bytes) -> None:
     try:
         os.write(write_end, data)
         os.close(write_end)
-        lines = LineCommands(read_end)
-        got = [command for _ in range(len(data) // 4096 + 2) for command in lines.poll()]
+        asked = Commands()
+        lines = CommandLines(asked, read_end)
+        asked.ask(lines.read)
+        got = [command for _ in range(len(data) // 4096 + 2) for command in asked.poll()]
         for command in got:
             assert command.name in ("reset", "zero")
             assert command.sensor is None or (isinstance(command.sensor, str) and command.name == "zero")
             assert isinstance(command.force, bool)
-        assert len(got) + lines.refused <= data.count(b"\n") + 1
+        assert len(got) + asked.refused <= data.count(b"\n") + 1
         assert len(got) <= data.count(b"reset") + data.count(b"zero") + data.count(b"\\u")
         assert len(lines._partial) <= LONGEST_LINE_BYTES + 1
     finally:

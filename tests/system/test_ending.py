@@ -50,6 +50,7 @@ import onnxruntime, numpy as np, sys
 from onnx import TensorProto as Type, helper
 from edge.terminal.stop_signals import stop_on_signals
 from edge.cli.keyboard import terminal_keys
+from edge.pipeline.commands import Commands
 
 def value(name, kind, shape):
     return helper.make_tensor_value_info(name, kind, shape)
@@ -65,7 +66,7 @@ always = helper.make_tensor("always", Type.BOOL, [], [True])
 graph = helper.make_graph([loop], "endless", [value("x", Type.FLOAT, [1])], [value("y", Type.FLOAT, [1])], [always])
 model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-with stop_on_signals(), terminal_keys():
+with stop_on_signals(), terminal_keys(Commands()):
     print("runs", flush=True)
     session.run(None, {"x": np.ones(1, dtype=np.float32)})
 """

@@ -13,12 +13,12 @@ from view_samples import CONTRACT, TIMEOUT_S, Press, wait_for
 
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
-from edge.pipeline.commands import Command, obey
+from edge.pipeline.commands import WAITING, Command, Commands, obey
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
 from edge.view.access import grant, is_loopback
-from edge.view.recorder import RecordCommands, Recorder
-from edge.view.viewer_commands import LONGEST_BYTES, WAITING, Asked
+from edge.view.recorder import Recorder
+from edge.view.viewer_commands import LONGEST_BYTES, hear
 from edge.view.viewer_state import Viewer
 from firmware_bridge.recording.formats import load_recording
 
@@ -171,8 +171,8 @@ class TestAccess:
 
 class TestAsked:
     def hear(self, *messages):
-        asked = Asked()
-        why = [asked.hear(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer()) for m in messages]
+        asked = Commands()
+        why = [hear(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer(), asked) for m in messages]
         return asked, why
 
     def test_commands_are_polled_once_in_their_order(self):
@@ -183,15 +183,11 @@ class TestAsked:
             {"cmd": "record", "on": True},
             {"cmd": "record", "on": False},
         )
+        recorded = []
+        asked.record = recorded.append
         assert why == [None] * 5 and asked.refused == 0
-        assert asked.poll() == [
-            Command("zero"),
-            Command("zero", "4", True),
-            Command("reset"),
-            Command("record", on=True),
-            Command("record", on=False),
-        ]
-        assert asked.poll() == []
+        assert asked.poll() == [Command("zero"), Command("zero", "4", True), Command("reset")]
+        assert recorded == [True, False] and asked.poll() == []
 
     @pytest.mark.parametrize(
         "message",
@@ -224,19 +220,19 @@ class TestAsked:
     @settings(max_examples=40)
     @given(st.text() | st.binary() | st.recursive(st.none() | st.booleans() | st.text(), st.lists).map(json.dumps))
     def test_nothing_raises(self, message):
-        Asked().hear(message, Viewer())
+        hear(message, Viewer(), Commands())
 
     def test_pausing_is_the_viewers_own(self):
-        asked, viewer, other = Asked(), Viewer(), Viewer()
-        assert asked.hear('{"cmd": "pause", "on": true}', viewer) is None
+        asked, viewer, other = Commands(), Viewer(), Viewer()
+        assert hear('{"cmd": "pause", "on": true}', viewer, asked) is None
         assert viewer.paused and not other.paused and asked.poll() == []
-        asked.hear('{"cmd": "pause", "on": false}', viewer)
+        hear('{"cmd": "pause", "on": false}', viewer, asked)
         assert not viewer.paused
 
     def test_where_nobody_polls_a_few_wait_and_the_others_are_refused(self):
         asked, why = self.hear(*[{"cmd": "reset"}] * (WAITING + 3))
         assert why.count(None) == WAITING and asked.refused == 3 and len(asked.poll()) == WAITING
-        assert asked.hear('{"cmd": "reset"}', Viewer()) is None
+        assert hear('{"cmd": "reset"}', Viewer(), asked) is None
 
     def test_the_longest_message_holds_any_command(self):
         assert len(json.dumps({"cmd": "zero", "sensor": "s" * 1000, "force": False})) < LONGEST_BYTES
@@ -424,16 +420,16 @@ class TestRecorder:
 
             zero = reset
 
-        asked = Asked()
-        asked.hear('{"cmd": "record", "on": true}', Viewer())
+        asked = Commands()
+        hear('{"cmd": "record", "on": true}', Viewer(), asked)
         obey(asked, Untouched())
 
     def test_commands_to_record_are_done_and_the_others_handed_on(self, tmp_path):
         recorder, _ = self.recorder(tmp_path, lambda text: Failing(9))
-        asked = Asked()
-        commands = RecordCommands(asked, recorder)
+        commands = Commands()
+        commands.record = recorder.record
         for message in ({"cmd": "zero"}, {"cmd": "record", "on": True}, {"cmd": "reset"}, {"cmd": "jump"}):
-            asked.hear(json.dumps(message), Viewer())
+            hear(json.dumps(message), Viewer(), commands)
         assert recorder.path is None  # not before the loop asks
         assert list(commands.poll()) == [Command("zero"), Command("reset")]
         wait_for(lambda: recorder.wait() or recorder.path is not None)

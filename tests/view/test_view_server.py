@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 
 from edge.errors import SinkError
 from edge.perception.event import Event
-from edge.pipeline.commands import Command
+from edge.pipeline.commands import Command, Commands
 from edge.pipeline.pump import uncollected
 from edge.view import connection_limits as connections
 from edge.view import server
@@ -134,12 +134,12 @@ class TestPage:
             rf"no live page: port {page.port} of 127.0.0.1 is in use; name another with --view, or 0 for any free one"
         )
         with pytest.raises(SinkError, match=words):
-            LiveView("127.0.0.1", page.port, None, tmp_path, CONTRACT)
+            LiveView("127.0.0.1", page.port, None, tmp_path, CONTRACT, Commands())
 
     @pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
     def test_an_address_that_is_not_ours_is_one_line(self, tmp_path, host):
         with pytest.raises(SinkError, match=rf"no live page: {host} is no address of this machine; name one with"):
-            LiveView(host, 0, None, tmp_path, CONTRACT)
+            LiveView(host, 0, None, tmp_path, CONTRACT, Commands())
 
 
 class TestFrames:

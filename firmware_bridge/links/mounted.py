@@ -1,0 +1,71 @@
+"""Another link, its sensors named after it, their taxels put where they lie on the pad."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Self
+
+from firmware_bridge.links.base import Link, Notice, SourceKind, Wait
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
+
+
+class MountedLink(Link):
+    """A link of which names and places are known that it does not know itself.
+
+    Links that sort readings by their id take a `placed_map` instead of places, which costs nothing.
+
+    Attributes:
+        wrapped: the link.
+    """
+
+    def __init__(self, link: Link, name: str = "", places: Mapping[str, Mounting] = MappingProxyType({})) -> None:
+        """Wrap a link that is not open yet.
+
+        Args:
+            link: gives the scans.
+            name: sensor "4" of "left" is "left/4"; without one, sensors are called as the link does.
+            places: of taxels that come in the order of an id map, by the link's name of their sensor.
+        """
+        self.name = link.name
+        self.kind: SourceKind = link.kind
+        self.ended = link.ended
+        self.patient = link.patient
+        self.unix_offset_ns = link.unix_offset_ns
+        self.origin = link.origin
+        self.wrapped = link
+        self._prefix = f"{name}/" if name else ""
+        self._told = f"{name}: " if name else ""
+        self._places = dict(places)
+        self.mountings = {f"{self._prefix}{sensor}": one for sensor, one in link.mountings.items()}
+
+    def __enter__(self) -> Self:
+        self.wrapped.__enter__()
+        self.kind = self.wrapped.kind  # some know it only now
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.wrapped.__exit__(*exc_info)
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Scans that closed since the last call, named and in place; waits at most `timeout_s` for the first."""
+        scans = self.wrapped.read(timeout_s)
+        self.ended, self.trouble = self.wrapped.ended, self.wrapped.trouble
+        if self._places:
+            scans = [self._places[scan.sensor].place(scan) if scan.sensor in self._places else scan for scan in scans]
+        return [replace(scan, sensor=f"{self._prefix}{scan.sensor}") for scan in scans] if self._prefix else scans
+
+    def wait_on(self) -> Wait | None:
+        """Return what the link waits for."""
+        return self.wrapped.wait_on()
+
+    def notices(self) -> list[Notice]:
+        """The link's, under the user's name for it."""
+        return [
+            notice._replace(sensors=f"{self._prefix}{notice.sensors}", text=f"{self._told}{notice.text}")
+            for notice in self.wrapped.notices()
+        ]
+
+    def counters(self) -> dict[str, int]:
+        """The link's."""
+        return self.wrapped.counters()
