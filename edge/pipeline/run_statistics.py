@@ -5,7 +5,7 @@ from bisect import bisect_left
 from itertools import accumulate
 from typing import Final
 
-from edge.perception.event import Event
+from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
@@ -77,7 +77,7 @@ class Statistics:
         self.overruns = 0
         self.missed = 0
         self.unwritten = 0
-        self.events: dict[str, int] = {}
+        self.events: dict[EventKind, int] = {}
         self.torn_wire = 0
         self.torn_source = 0
         self.repeated = 0
@@ -88,7 +88,7 @@ class Statistics:
         self.model_changes = 0
         self.sink_trouble: str | None = None
         self._model: str | None = None
-        self._last_event: str | None = None
+        self._last_change: str | None = None
         self._spans: dict[str, _Span] = {}
         self._zeroed: dict[str, Result] = {}
         self._farthest: dict[str, Result] = {}
@@ -110,7 +110,7 @@ class Statistics:
             self.model_patterns[result.model] = self.model_patterns.get(result.model, 0) + 1
         if self._model not in (None, result.model):
             self.model_changes += 1
-            self._last_event = result.event
+            self._last_change = next((event.text for event in result.events if event.kind == "model"), None)
         self._model = result.model
         if result.latency_us is not None:
             self.latency_us.add(result.latency_us)
@@ -155,7 +155,7 @@ class Statistics:
                 lines.append(f"{name}: p50 {p50_us:.0f} us, p99 {p99_us:.0f} us, max {times.max:.0f} us{more}")
         if self.model_changes:
             patterns = ", ".join(f"{name} {count}" for name, count in self.model_patterns.items())
-            lines.append(f"model changes: {self.model_changes} (patterns: {patterns}); at last {self._last_event}")
+            lines.append(f"model changes: {self.model_changes} (patterns: {patterns}); at last {self._last_change}")
         lines += self._without_pattern()
         rates = [
             f"{rate_hz:.1f} Hz (sensor {name})"

@@ -29,7 +29,7 @@ class MessageSink(Sink):
 
         Args:
             stream: written to; stderr unless given.
-            said: what was said before the first result, which tells it once more, such as why it is this model.
+            said: text of an event that was printed before the first result, which has it once more.
             hint: what to do while no scan has come at all; it is said ever more seldom.
             clock_s: monotonic, in [s].
         """
@@ -42,11 +42,10 @@ class MessageSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Say what happened before this scan, but for what was said already."""
-        event, said, self._said, self._hint = result.event, self._said, None, ""
-        if event is not None and said is not None:
-            event = f"{event}; ".removeprefix(f"{said}; ").removesuffix("; ")
-        if event:
-            self._say(event)
+        said, self._said, self._hint = self._said, None, ""
+        for event in result.events:
+            if event.text != said:
+                self.say(event)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Say what happened."""

@@ -6,7 +6,7 @@ from edge_samples import BASELINE, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.perception.result import Result
 from edge.pipeline.run_statistics import Histogram, Statistics
 
@@ -96,7 +96,8 @@ def test_summary_tells_all_of_it():
 
 
 def noted(number, state, note=None, sensor="4"):
-    return replace(result(make_scan(number, sensor=sensor), state), note=note)
+    notes = () if note is None else (Note("zeroing_restarted", note),)
+    return replace(result(make_scan(number, sensor=sensor), state), notes=notes)
 
 
 @pytest.mark.parametrize(
@@ -141,13 +142,15 @@ def test_summary_of_nothing():
 
 def test_a_change_of_model_is_counted_and_told():
     statistics = Statistics()
-    for number, (model, event) in enumerate(
-        [("a", "chosen"), ("a", None), ("b", "stepped down"), ("b", None), ("a", "stepped up"), ("a", None)]
-    ):
-        statistics.add(Result(make_scan(number), "device", model, "contact", run_time_us=9.0, event=event))
+    changes = [("a", "chosen"), ("a", None), ("b", "stepped down"), ("b", None), ("a", "stepped up"), ("a", None)]
+    for number, (model, why) in enumerate(changes):
+        events = () if why is None else (Event(number, "model", None, why), Event(number, "reset", None))
+        statistics.add(Result(make_scan(number), "device", model, "contact", run_time_us=9.0, events=events))
     assert statistics.model_changes == 2 and statistics.model_patterns == {"a": 4, "b": 2}
     lines = statistics.summary(source="x").splitlines()
     assert "model changes: 2 (patterns: a 4, b 2); at last stepped up" in lines
     statistics = Statistics()
-    statistics.add(Result(make_scan(), "device", "a", "contact", run_time_us=9.0, event="chosen"))
+    statistics.add(
+        Result(make_scan(), "device", "a", "contact", run_time_us=9.0, events=(Event(0, "model", None, "chosen"),))
+    )
     assert "model changes" not in statistics.summary(source="x")

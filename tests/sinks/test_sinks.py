@@ -440,17 +440,18 @@ def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
 @pytest.mark.parametrize(
     ("events", "lines"),
     [
-        (["zeroing refused: no sensor was heard yet"], ["zeroing refused: no sensor was heard yet"]),
-        (["slow, so small"], []),
-        (["slow, so small; zeroing refused"], ["zeroing refused"]),
-        ([None, "slow, so small"], ["slow, so small"]),
+        ([["zeroing refused"]], ["zeroing refused"]),
+        ([["slow, so small"]], []),
+        ([["slow, so small", "zeroing refused; again"]], ["zeroing refused; again"]),
+        ([[], ["slow, so small"]], ["slow, so small"]),
     ],
 )
 def test_of_the_first_event_only_what_was_said_before_is_left_out(events, lines):
     stream = io.StringIO()
     messages = MessageSink(stream, said="slow, so small")
-    for number, event in enumerate(events):
-        messages.write(Result(make_scan(number), "device", "tiny", "idle", event=event), {})
+    for number, texts in enumerate(events):
+        told = tuple(Event(number, "refused", None, text) for text in texts)
+        messages.write(Result(make_scan(number), "device", "tiny", "idle", events=told), {})
     assert stream.getvalue().splitlines() == [f"edge-sr: {line}" for line in lines]
 
 
