@@ -1,11 +1,23 @@
-"""What happens beside scans, for those who follow a run: in records, on the terminal."""
+"""Events and notes of a run, each of a closed set of kinds: programs read the kind, text is made where it is shown.
 
+An event happens once; a note holds for as long as results have it.
+"""
+
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal, NamedTuple, get_args
 
-from firmware_bridge.links.base import Notice
+from firmware_bridge.links.base import Notice, NoticeKind
 
-KINDS: Final = ("lost", "silent", "back", "trouble", "well", "sink", "note", "refused")
+EventKind = Literal[
+    NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level", "model"
+]
+TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
+ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
+NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]
+KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
+NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
+_HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,20 +26,99 @@ class Event:
 
     Attributes:
         time_ns: monotonic time, in [ns].
-        kind: one of KINDS: the link's ("lost", "silent", "back", "trouble", "well"), of one sensor's silence while
-            others go on ("silent", "back"), "sink", one was given up or nobody reads it, "note", what is to be known of
-            a recording, or what is told to those who look alone: "refused", what was asked for and is not done, and
-            "note", all else.
-        sensor: of which sensor, or None.
-        text: in a user's words.
+        kind: one of KINDS.
+
+            Of a link, as in `Notice`, or of one sensor while others go on: "lost", "silent", "back", "trouble", "well".
+            Of a recording that is played or made: "note". Of where results go: "sink", it was given up, or nobody
+            reads it.
+
+            Of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was asked for;
+            "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
+            has ended without a baseline; "refused", something else that was asked for is not done; "rest_level", a
+            step in it, or its end; "model", another one makes the patterns.
+        sensor: name of the sensor, or None where it is about all, or none.
+        detail: what the kind does not say, in a user's words.
+
+    Raises:
+        ValueError: the kind is not one of KINDS.
     """
 
     time_ns: int
-    kind: str
+    kind: EventKind
     sensor: str | None
-    text: str
+    detail: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"event kind is {self.kind!r}, expected one of {', '.join(sorted(KINDS))}")
+
+    @property
+    def text(self) -> str:
+        """The event in a user's words."""
+        match self.kind:
+            case "reset":
+                return "earlier taps forgotten"
+            case "zeroing":
+                return f"sensor {self.sensor}: no baseline yet, zeroing since the start"
+            case "zeroed":
+                return f"sensor {self.sensor} zeroed on demand: {self.detail}"
+            case "in_contact":
+                remedy = f"free the pad, or force it ({_HOW_TO_FORCE})"
+                return f"zeroing refused: sensor {self.sensor} is in contact: {remedy}"
+            case "given_up":
+                return f"sensor {self.sensor}: zeroing given up, the old baseline stays: {self.detail}"
+            case "rest_level":
+                return f"sensor {self.sensor}: {self.detail}"
+            case _:
+                return self.detail
 
     @classmethod
     def of(cls, notice: Notice) -> "Event":
-        """What a link had to tell."""
+        """Return the event of a link's notice."""
         return cls(notice.time_ns, notice.kind, None, notice.text)
+
+
+class Untimed(NamedTuple):
+    """An event whose time will be that of the next scan; fields as in `Event`."""
+
+    kind: EventKind
+    sensor: str | None = None
+    detail: str = ""
+
+    def at(self, time_ns: int) -> Event:
+        """Return the event at a time in [ns]."""
+        return Event(time_ns, *self)
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """One thing that a user should know of a result.
+
+    Attributes:
+        kind: one of NOTE_KINDS.
+
+            Of taxels: "held", the last reading of one stands for the present; "estimated", dead ones are, from their
+            neighbours; "dead", and there is no pattern; "frozen", the whole sensor.
+
+            Of zeroing: "zeroing", it goes on; "zeroing_restarted", and why; "no_stored_baseline", so the sensor is
+            zeroed; "not_in_sensor_file".
+
+            Of the rest level: "rest_level", it has stepped; "all_alike", a contact looks like drift. Of time: "late",
+            the reading was old when it came.
+        text: in a user's words.
+
+    Raises:
+        ValueError: the kind is not one of NOTE_KINDS.
+    """
+
+    kind: NoteKind
+    text: str
+
+    def __post_init__(self) -> None:
+        if self.kind not in NOTE_KINDS:
+            raise ValueError(f"note kind is {self.kind!r}, expected one of {', '.join(sorted(NOTE_KINDS))}")
+
+
+def joined(parts: Iterable[Event | Note]) -> str | None:
+    """Return the texts of events or notes in one line; None without any."""
+    return "; ".join(part.text for part in parts) or None

@@ -8,6 +8,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.event import Event, Note, joined
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.scan import Scan
@@ -75,9 +76,9 @@ class Result:
             them.
         filled: what stood for the dead ones: an estimate from their "neighbours"; None where none is dead, or there is
             no pattern.
-        note: what the user should know, such as why zeroing started over.
-        event: what happened before this scan: why there is another model, what came of zeroing on demand, a step in
-            rest level; else None.
+        notes: what the user should know, such as why zeroing started over.
+        events: what happened before this scan: taps were forgotten, zeroing was done or refused, the rest level made a
+            step, another model makes the patterns.
     """
 
     scan: Scan
@@ -109,8 +110,18 @@ class Result:
     drift: Drift | None = None
     dead: Mapping[int, str] = field(default_factory=dict)
     filled: Filled | None = None
-    note: str | None = None
-    event: str | None = None
+    notes: tuple[Note, ...] = ()
+    events: tuple[Event, ...] = ()
+
+    @property
+    def note(self) -> str | None:
+        """The notes in one line, for a person; None without any."""
+        return joined(self.notes)
+
+    @property
+    def event(self) -> str | None:
+        """The events in one line, for a person; None without any."""
+        return joined(self.events)
 
     def baseline_text(self) -> str:
         """Which baseline, how old."""

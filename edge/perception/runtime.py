@@ -13,11 +13,11 @@ from edge.inference.contract import Contract
 from edge.inference.expected_error import expect
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import TaxelEstimator, widening
+from edge.perception.event import Event, EventKind, Note, Untimed
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
 from edge.perception.wrench import wrench_of
-from edge.perception.zero_on_demand import REFUSED
 from edge.validation import check_baselines, check_mountings, check_pads, check_positive
 from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
@@ -28,8 +28,6 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 OLD_NS: Final = 50_000_000
 """Later by the device's own time stamps than its fastest reading of late: three times what a slow adapter keeps."""
-TAPS_FORGOTTEN: Final = "earlier taps forgotten"
-"""What is told of `reset`."""
 
 
 class Model(Protocol):
@@ -120,7 +118,7 @@ class Runtime:
         check_pads(pad, geometry)
         check_mountings(mountings or {}, geometry)
         self._model = model
-        self._event: str | None = None
+        self._events: list[Untimed] = []
         self._source: SourceKind = source
         self._estimator = estimator
         self._geometry = geometry
@@ -148,7 +146,7 @@ class Runtime:
         """Forget the taps of every sensor, as when the robot moves to another object; an event tells. Zeroing stays."""
         for sensor in self._sensors.values():
             sensor.taps.reset()
-        self._tell(TAPS_FORGOTTEN)
+        self._report("reset")
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
         """Zero again from the next scans; the old baselines stay in use until then, and an event tells what came of it.
@@ -158,10 +156,10 @@ class Runtime:
             force: also in contact.
         """
         if not self._sensors:
-            self._tell(f"{REFUSED}: no sensor was heard yet")
+            self._report("refused", "zeroing refused: no sensor was heard yet")
         elif name is not None and name not in self._sensors:
-            known = ", ".join(sorted(self._sensors)) or "none yet"
-            self._tell(f"{REFUSED}: no sensor {name}, there are {known}")
+            known = ", ".join(sorted(self._sensors))
+            self._report("refused", f"zeroing refused: no sensor {name}, there are {known}")
         for sensor in self._sensors.values() if name is None else filter(None, [self._sensors.get(name)]):
             sensor.zero_again(force=force)
 
@@ -175,8 +173,8 @@ class Runtime:
             if name.startswith(sensors):
                 sensor.lose_touch()
 
-    def _tell(self, event: str) -> None:
-        self._event = event if self._event is None else f"{self._event}; {event}"
+    def _report(self, kind: EventKind, detail: str = "") -> None:
+        self._events.append(Untimed(kind, None, detail))
 
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan; see `push_together`."""
@@ -219,15 +217,10 @@ class Runtime:
         zeroed = sensor.hear(scan)
         readings = None if zeroed is None else sensor.fill(zeroed)
         filled = None if readings is None else readings.filled
-        notes = (sensor.watch.note(filled), sensor.note, sensor.drift_note, _age_note(scan))
-        note = "; ".join(text for text in notes if text) or None
-
+        notes = (*sensor.watch.notes(filled), *sensor.zeroing_notes, *sensor.drift_notes, *_age_notes(scan))
         unit, dead = self._model.contract.output_unit, sensor.watch.reasons
-        if sensor.events:
-            self._tell("; ".join(sensor.events))
-            sensor.events.clear()
-        known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "note": note, "event": self._event}
-        self._event = None
+        events = self._take_events(sensor, scan.time_ns) if self._events or sensor.events else ()
+        known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "notes": notes, "events": events}
         if sensor.baseline is None or zeroed is None:
             return Result(scan, self._source, self._model.name, "zeroing", **known), None
         age_s = sensor.age_s(scan.time_ns)
@@ -264,6 +257,13 @@ class Runtime:
         )
         made_by = (self._model.name, tap.tap, taps_used, filled)
         return result, None if window is None else _Due(sensor, window, made_by)
+
+    def _take_events(self, sensor: Sensor, time_ns: int) -> tuple[Event, ...]:
+        """Return what has happened up to a scan of a sensor, at its time in [ns]."""
+        events = tuple(event.at(time_ns) for event in (*self._events, *sensor.events))
+        self._events.clear()
+        sensor.events.clear()
+        return events
 
     def _unchanged(self, result: Result, due: "_Due") -> Result | None:
         """The result with the pattern before, where there is no need of another."""
@@ -334,17 +334,17 @@ class Runtime:
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor
         baseline = self._baselines.get(name)
-        note = None
-        if baseline is None and self._baselines:
-            note = f"no stored baseline for sensor {name}, only for {', '.join(sorted(self._baselines))}: zeroing"
+        notes: list[Note] = []
         if self._mounted and name not in self._mounted:
             known = ", ".join(sorted(self._mounted))
-            note = f"the sensor file knows no sensor {name}, only {known}: taken as wired" + (
-                f"; {note}" if note else ""
-            )
+            text = f"the sensor file knows no sensor {name}, only {known}: taken as wired"
+            notes.append(Note("not_in_sensor_file", text))
+        if baseline is None and self._baselines:
+            text = f"no stored baseline for sensor {name}, only for {', '.join(sorted(self._baselines))}: zeroing"
+            notes.append(Note("no_stored_baseline", text))
         mounting = self._mountings.get(name)
         self._sensors[name] = sensor = Sensor(
-            name, self._geometry, self._new_tracker(), self._estimator, note, mounting, self._unix_time_s
+            name, self._geometry, self._new_tracker(), self._estimator, tuple(notes), mounting, self._unix_time_s
         )
         per_newton = self._counts_per_newton
         sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton
@@ -361,15 +361,16 @@ class Runtime:
         return TapTracker(self._model.contract.taps, *self._thresholds, grid_shape=grid_shape)
 
 
-def _age_note(scan: Scan) -> str | None:
-    """What to tell of readings that lay about before they came."""
+def _age_notes(scan: Scan) -> tuple[Note, ...]:
+    """Return what to know of readings that were old when they came."""
     if scan.device_ns is None:
         if scan.unread_ns <= OLD_NS:
-            return None
-        return f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it came: nobody read meanwhile"
+            return ()
+        text = f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it came: nobody read meanwhile"
+        return (Note("late", text),)
     if scan.time_ns - scan.device_ns <= OLD_NS:
-        return None
-    return f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it came"
+        return ()
+    return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it came"),)
 
 
 class _Due(NamedTuple):

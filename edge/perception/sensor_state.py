@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.perception.change_gate import LastReading, TapsThatMatter
 from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
+from edge.perception.event import EventKind, Note, Untimed
 from edge.perception.result import Result, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
-from edge.perception.zero_on_demand import GIVEN_UP, Rezeroing, in_contact
+from edge.perception.zero_on_demand import Rezeroing
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.geometry import AXES, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
@@ -25,7 +26,6 @@ from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
 
 LONGEST_GAP_NS: Final = 1_000_000_000
 """Between two scans of one sensor: a tap is over within, and the slowest sensor on record gives four."""
-HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
 
 
 class Sensor:
@@ -34,14 +34,14 @@ class Sensor:
     Attributes:
         baseline: subtracted from the scans, drift and all; None before there is one.
         drift: what has become of the rest level since it was zeroed; None without a baseline.
-        note: why there is no baseline yet, or how a zeroing on demand stands.
-        drift_note: what the user should know of the rest level.
+        zeroing_notes: why there is no baseline yet, or how a zeroing on demand stands.
+        drift_notes: what the user should know of the rest level.
         counts_per_newton: summed z per [N], if that is known.
         pad: what is known of it.
         pad_row: the same as the model takes it.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
         wrench_origin: whether the model is told the counts per newton.
-        events: what has happened to the zeroing since the last scan; whoever tells them clears them.
+        events: what has happened to the zeroing since the last scan; the reader clears them.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Sensor:
         geometry: SensorGeometry,
         taps: TapTracker,
         estimator: TaxelEstimator | None,
-        note: str | None,
+        notes: tuple[Note, ...] = (),
         mounting: Mounting | None = None,
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
@@ -61,9 +61,9 @@ class Sensor:
         # Plain attributes: a property of each would cost a scan at rest a twentieth.
         self.baseline: Baseline | None = None
         self.drift: Drift | None = None
-        self.note = note
-        self.drift_note: str | None = None
-        self.events: list[str] = []
+        self.zeroing_notes = notes
+        self.drift_notes: tuple[Note, ...] = ()
+        self.events: list[Untimed] = []
         self.counts_per_newton: float | None = None
         self.pad: Pad | None = None
         self.pad_row: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
@@ -106,7 +106,7 @@ class Sensor:
         self.baseline = self._taken = baseline
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
         self._tracker = DriftTracker(baseline)
-        self.drift, self.drift_note = self._tracker.summary, None
+        self.drift, self.drift_notes = self._tracker.summary, ()
 
     def age_s(self, time_ns: int) -> float | None:
         """How old the baseline is, in [s]; None where that is not known."""
@@ -130,8 +130,8 @@ class Sensor:
         if self._tracker is not None:
             self._tracker.forget()
         if self._rezeroing is not None:
-            self._rezeroing = self.note = None
-            self.events.append(f"{GIVEN_UP}: sensor {self._name} was away, the old baseline stays; ask again")
+            self._end_rezeroing()
+            self._report("given_up", "the sensor was away; ask again")
 
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
         """The newest reading of every taxel over the baseline (3, rows, cols); None without a baseline."""
@@ -158,10 +158,12 @@ class Sensor:
         if tracker is None or taken is None or not tracker.push(scan, contact, self.watch.dead):
             return
         self.baseline = taken.moved(tracker.counts)
-        self.drift, self.drift_note = tracker.summary, tracker.note
+        self.drift, note = tracker.summary, tracker.note
+        kind = "all_alike" if tracker.doubted else "rest_level"
+        self.drift_notes = () if note is None else (Note(kind, note),)
         event = tracker.take_event()
         if event is not None:
-            self.events.append(f"sensor {self._name}: {event}")
+            self._report("rest_level", event)
 
     def zero_again(self, *, force: bool) -> None:
         """Take a new baseline from the next scans; the old one stays in use until then. An event tells what came of it.
@@ -170,13 +172,12 @@ class Sensor:
             force: also in contact.
         """
         if self.baseline is None:
-            self.events.append(f"sensor {self._name}: no baseline yet, zeroing since the start")
+            self._report("zeroing")
         elif self._touched and not force:
-            remedy = f"free the pad, or force it ({HOW_TO_FORCE})"
-            self.events.append(f"{in_contact(self._name)}: {remedy}")
+            self._report("in_contact")
         else:
-            self._rezeroing = Rezeroing(self._name, self.baseline, force=force, unix_time_s=self._unix_time_s)
-            self.note = self._rezeroing.note
+            self._rezeroing = Rezeroing(self.baseline, force=force, unix_time_s=self._unix_time_s)
+            self.zeroing_notes = (self._rezeroing.note,)
 
     @property
     def _touched(self) -> bool:
@@ -192,33 +193,39 @@ class Sensor:
             self._filler = self._estimator.filler(self.watch.dead)
 
     def _zero(self, scan: Scan) -> None:
-        """Use the scan for the baseline; a refusal becomes the note, and zeroing starts over."""
+        """Use the scan for the baseline; a refusal becomes a note, and zeroing starts over."""
         try:
             baseline = self._zeroing.push(scan, self._silent())
         except BaselineRefusedError as refusal:
-            self.note = f"zeroing started over: {refusal}"
+            self.zeroing_notes = (Note("zeroing_restarted", f"zeroing started over: {refusal}"),)
             return
         if baseline is not None:
             self.use(baseline, 0.0, scan.time_ns)
-            self.note = None
+            self.zeroing_notes = ()
 
     def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> bool:
         """Whether there is a new baseline."""
         try:
             baseline = rezeroing.push(scan, self._touched, self._silent())
         except BaselineRefusedError as refusal:
-            self._rezeroing = self.note = None
-            self.events.append(str(refusal))
+            self._end_rezeroing()
+            self._report("given_up", str(refusal))
             return False
-        self.note = rezeroing.note
+        self.zeroing_notes = (rezeroing.note,)
         if baseline is None:
             return False
         old = "" if self._taken is None else f" instead of {self._taken.id}"
-        self.events.append(f"sensor {self._name} zeroed on demand: baseline {baseline.id}{old}")
-        self._rezeroing = self.note = None
+        self._report("zeroed", f"baseline {baseline.id}{old}")
+        self._end_rezeroing()
         self.use(baseline, 0.0, scan.time_ns)
         self.taps.reset()  # earlier taps were read over another rest level
         return True
+
+    def _end_rezeroing(self) -> None:
+        self._rezeroing, self.zeroing_notes = None, ()
+
+    def _report(self, kind: EventKind, detail: str = "") -> None:
+        self.events.append(Untimed(kind, self._name, detail))
 
     def _silent(self) -> NDArray[np.bool_] | None:
         silent = self.watch.silent_long

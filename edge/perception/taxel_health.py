@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.event import Note
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline, deformation
@@ -160,37 +161,39 @@ class TaxelWatch:
         self._judge(scan, read, zeroed)
         return zeroed
 
-    def note(self, filled: str | None) -> str | None:
-        """What to tell of taxels that are not believed; None while there is nothing to tell.
+    def notes(self, filled: str | None) -> tuple[Note, ...]:
+        """Return what to know of taxels that are not believed.
 
         Args:
             filled: what stands for dead ones; None where there is no pattern for them.
         """
         if self._sound:
-            return None
-        notes = []
+            return ()
+        notes: list[Note] = []
         overloaded = np.flatnonzero(self._saturated & ~self.dead)
         if overloaded.size:
-            notes.append(f"its last reading is held, {_named(overloaded)} {_WORDS['saturated']}{_OVERLOADED}")
+            text = f"its last reading is held, {_named(overloaded)} {_WORDS['saturated']}{_OVERLOADED}"
+            notes.append(Note("held", text))
         kinds = {reason: self._dead_by(reason) for reason in dict.fromkeys(self._reasons.values())}
         if filled is not None and kinds:
             dead = ", ".join(f"{_named(taxels)} {_WORDS[reason]}" for reason, taxels in kinds.items())
             owner = "its" if len(self._reasons) == 1 else "their"
-            notes.append(f"{dead}: estimated from {owner} neighbours")
-            return "; ".join(notes)
+            notes.append(Note("estimated", f"{dead}: estimated from {owner} neighbours"))
+            return tuple(notes)
         silent_long = self.silent_long
         id_map = 2 * np.count_nonzero(silent_long) == silent_long.size
         remedies = {"saturated": _OVERLOADED, "unzeroed": ": zero again"}
         if self._repeats >= FROZEN_SENSOR_SCANS:
-            notes.append(f"no pattern, the sensor is frozen: its last {self._repeats} scans are alike bit for bit")
+            text = f"no pattern, the sensor is frozen: its last {self._repeats} scans are alike bit for bit"
+            notes.append(Note("frozen", text))
             kinds.pop("stuck", None)
         for reason, taxels in kinds.items():
             remedy = remedies.get(reason, ": it may be broken")
             if reason == "silent":
                 remedy = ": try another --id-map" if id_map else remedy if silent_long.any() else ""
             if taxels:
-                notes.append(f"no pattern, {_named(taxels)} {_WORDS[reason]}{remedy}")
-        return "; ".join(notes) or None
+                notes.append(Note("dead", f"no pattern, {_named(taxels)} {_WORDS[reason]}{remedy}"))
+        return tuple(notes)
 
     def _dead_by(self, reason: str) -> list[int]:
         return [taxel for taxel, why in self._reasons.items() if why == reason]

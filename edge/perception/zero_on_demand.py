@@ -8,20 +8,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.event import Note
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
-REFUSED: Final = "zeroing refused"
-GIVEN_UP: Final = "zeroing given up"
-"""What an event says of a zeroing that was asked for and is not done."""
 GIVE_UP_NS: Final = 15_000_000_000
 """Of scan time: ten tries at 100 Hz, and four at 30."""
-
-
-def in_contact(sensor: str) -> str:
-    """What an event says of a zeroing that is refused, and may be forced."""
-    return f"{REFUSED}: sensor {sensor} is in contact"
 
 
 class Rezeroing:
@@ -31,19 +24,15 @@ class Rezeroing:
         note: how it stands.
     """
 
-    def __init__(
-        self, sensor: str, old: Baseline, *, force: bool, unix_time_s: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, old: Baseline, *, force: bool, unix_time_s: Callable[[], float] = time.time) -> None:
         """Start with the next scan.
 
         Args:
-            sensor: name of the sensor.
             old: the baseline so far; against it a load is seen.
             force: zero away a contact or a load.
             unix_time_s: dates the new one, in [s] since 1970.
         """
-        self.note = "zeroing: keep the pad still and free"
-        self._sensor = sensor
+        self.note = Note("zeroing", "zeroing: keep the pad still and free")
         self._old = old
         self._force = force
         self._unix_time_s = unix_time_s
@@ -60,13 +49,12 @@ class Rezeroing:
             silent: taxels (rows, cols) to zero without, as in `BaselineEstimator.push`.
 
         Raises:
-            BaselineRefusedError: it has tried for long enough, and the old baseline stays.
+            BaselineRefusedError: it has tried for long enough, and why it did not succeed; the old baseline stays.
         """
         if self._end_ns is None:
             self._end_ns = scan.time_ns + GIVE_UP_NS
         if scan.time_ns >= self._end_ns:
-            name = f"sensor {self._sensor}: {GIVEN_UP} after {GIVE_UP_NS / 1e9:.0f} s, the old baseline stays"
-            raise BaselineRefusedError(f"{name}: {self._why}")
+            raise BaselineRefusedError(f"{self._why}; tried for {GIVE_UP_NS / 1e9:.0f} s")
         try:
             if contact and not self._force:
                 if self._estimator.scans:
@@ -75,7 +63,7 @@ class Rezeroing:
             taken = self._estimator.push(scan, silent)
         except BaselineRefusedError as refusal:
             self._why = str(refusal)
-            self.note = f"zeroing started over: {refusal}"
+            self.note = Note("zeroing_restarted", f"zeroing started over: {refusal}")
             return None
         return None if taken is None else replace(taken, origin="demand")
 

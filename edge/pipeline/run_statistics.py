@@ -5,7 +5,7 @@ from bisect import bisect_left
 from itertools import accumulate
 from typing import Final
 
-from edge.perception.event import Event
+from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
@@ -76,7 +76,7 @@ class Statistics:
         self.overruns = 0
         self.missed = 0
         self.unwritten = 0
-        self.events: dict[str, int] = {}
+        self.events: dict[EventKind, int] = {}
         self.torn_wire = 0
         self.torn_source = 0
         self.repeated = 0

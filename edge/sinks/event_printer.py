@@ -38,10 +38,10 @@ class MessageSink(Sink):
         self._patience_s = FIRST_HINT_S
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Say what happened before this scan."""
+        """Print what happened before this scan."""
         self._hint = ""
-        if result.event:
-            self._say(result.event)
+        for event in result.events:
+            self.say(event)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Say what happened."""

@@ -144,8 +144,8 @@ class McapSink(Sink):
             force = wrench(result, unix_ns)
             if force is not None:
                 self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
-            if result.event is not None:
-                self._log(Event(scan.time_ns, "note", sensor, result.event))
+            for event in result.events:
+                self._log(event)
             self._file.look()  # once all of the scan is there
         except OSError as error:
             raise self._failure(error) from error

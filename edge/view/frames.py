@@ -81,6 +81,7 @@ class Frames:
         header: dict[str, Any] = {
             **record(result, newest.counters),
             "kind": "result",
+            "note_kinds": [note.kind for note in result.notes],
             "rate_hz": None if newest.rate_hz is None else round(newest.rate_hz, 2),
             "age_s": _seconds(self.now_ns - newest.heard_ns),
             # Heard meanwhile may be more than what is packed here; the next frame begins behind this one.

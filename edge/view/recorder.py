@@ -8,7 +8,7 @@ from threading import get_native_id
 from typing import Final
 
 from edge.errors import SinkError
-from edge.perception.event import Event
+from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 
@@ -144,7 +144,7 @@ class Recorder(Sink):
         if not self._wanted:
             self._end(self.path)
 
-    def _say(self, kind: str, text: str) -> None:
+    def _say(self, kind: EventKind, text: str) -> None:
         self._tell(Event(self._clock_ns(), kind, None, text))
 
 

@@ -11,8 +11,6 @@ from typing import Final, NamedTuple
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.perception.runtime import TAPS_FORGOTTEN
-from edge.perception.zero_on_demand import GIVEN_UP, REFUSED, in_contact
 from edge.pipeline.scan_rate import Rate
 
 TRACE_S: Final = 60.0
@@ -102,8 +100,8 @@ class Heard:
             # Replaced, not added to: who iterates over the one before is not disturbed.
             self._traces = {**self._traces, scan.sensor: trace}
         trace.add(result)
-        if result.event is not None:
-            self.tell(_event_of(result, result.event), counters)
+        for event in result.events:
+            self.tell(event, counters)
         heard_ns = self._clock_ns()
         newest = Newest(trace.number, result, counters, heard_ns, trace.rate.rate_hz)
         if scan.sensor in self.newest:
@@ -124,14 +122,6 @@ class Heard:
     def points(self, sensor: str, since: int) -> list[Point]:
         """What to draw of a sensor's scans behind number `since`: all, or if these are too many, one in 50 ms."""
         return self._traces[sensor].points(since)
-
-
-def _event_of(result: Result, text: str) -> Event:
-    """What a result tells: taps are forgotten of all sensors; a refusal is of one where zeroing it may be forced."""
-    sensor = result.scan.sensor
-    if REFUSED not in text and GIVEN_UP not in text:
-        return Event(result.scan.time_ns, "note", None if TAPS_FORGOTTEN in text else sensor, text)
-    return Event(result.scan.time_ns, "refused", sensor if in_contact(sensor) in text else None, text)
 
 
 class _Trace:

@@ -70,6 +70,7 @@ def test_in_contact_it_is_refused_unless_forced():
     bench.runtime.zero()
     results = bench.play(120, LOCAL)
     (event,) = events(results)
+    assert [(one.kind, one.sensor) for one in results[0].events] == [("in_contact", "4")]
     assert event.startswith("zeroing refused: sensor 4 is in contact: free the pad, or force it")
     assert {result.baseline.id for result in results} == {BASELINE.id}
     bench.runtime.zero(force=True)
@@ -106,7 +107,7 @@ def test_it_gives_up_after_a_stated_time_and_says_why():
     bench.runtime.zero()
     results = [bench.play(1, 40 * (n % 2))[0] for n in range(GIVE_UP_NS // PERIOD_NS + 5)]
     (event,) = events(results)
-    assert event.startswith("sensor 4: zeroing given up after 15 s, the old baseline stays: taxel (")
+    assert event.startswith("sensor 4: zeroing given up, the old baseline stays: taxel (") and "tried for 15 s" in event
     assert results[-1].note is None and results[-1].baseline.id == BASELINE.id
 
 
@@ -203,6 +204,7 @@ def test_after_a_step_the_record_and_the_live_line_tell_it():
         messages.write(result, {})
     assert "rest off by 6" in status.line()
     assert stream.getvalue() == f"edge-sr: {event}\n"
+    assert [note.kind for note in results[-1].notes] == ["rest_level"]
 
 
 def test_a_link_that_was_away_is_followed_by_a_comparison():

@@ -6,7 +6,7 @@ from edge_samples import BASELINE, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.perception.result import Result
 from edge.pipeline.run_statistics import Histogram, Statistics
 
@@ -96,7 +96,8 @@ def test_summary_tells_all_of_it():
 
 
 def noted(number, state, note=None, sensor="4"):
-    return replace(result(make_scan(number, sensor=sensor), state), note=note)
+    notes = () if note is None else (Note("zeroing_restarted", note),)
+    return replace(result(make_scan(number, sensor=sensor), state), notes=notes)
 
 
 @pytest.mark.parametrize(

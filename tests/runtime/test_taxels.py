@@ -9,6 +9,7 @@ from edge_samples import BASELINE, PERIOD_NS, REST, ROOT
 from fault_judge import HELD_US
 
 from edge.inference.bundled import demo_recording
+from edge.perception.event import joined
 from edge.perception.taxel_health import (
     BACK_SCANS,
     FAR_SCANS,
@@ -118,7 +119,7 @@ def test_a_sensor_that_sends_one_scan_for_ever_is_frozen_after_ten():
     assert not any(pad.read(FROZEN_SENSOR_SCANS))
     assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
     assert not pad.watch.may_be_estimated
-    assert pad.watch.note(None) == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
+    assert joined(pad.watch.notes(None)) == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
 
 
 @pytest.mark.parametrize(
@@ -146,7 +147,7 @@ def test_half_of_the_taxels_silent_are_a_wrong_id_map():
     pad = Pad()
     pad.read(SILENT_SCANS, *(silent(taxel) for taxel in range(8)))
     assert not pad.watch.may_be_estimated
-    assert pad.watch.note(None) == "no pattern, taxel 0, 1, 2, 3, 4, 5, 6, 7 silent: try another --id-map"
+    assert joined(pad.watch.notes(None)) == "no pattern, taxel 0, 1, 2, 3, 4, 5, 6, 7 silent: try another --id-map"
 
 
 def test_a_taxel_alone_far_from_rest_is_not_pressed():
@@ -193,11 +194,13 @@ def test_an_hour_of_noise_raises_nothing():
 def test_what_is_told():
     pad = Pad()
     pad.read(STUCK_SCANS + 3, at(3, 1, 2, 3), silent(7))
-    assert pad.watch.note("neighbours") == "taxel 7 silent, taxel 3 stuck: estimated from their neighbours" or (
-        pad.watch.note("neighbours") == "taxel 3 stuck, taxel 7 silent: estimated from their neighbours"
+    (estimated,) = pad.watch.notes("neighbours")
+    assert estimated.kind == "estimated" and estimated.text in (
+        "taxel 7 silent, taxel 3 stuck: estimated from their neighbours",
+        "taxel 3 stuck, taxel 7 silent: estimated from their neighbours",
     )
-    told = "no pattern, taxel 3 stuck: it may be broken", "no pattern, taxel 7 silent"
-    assert sorted(str(pad.watch.note(None)).split("; ")) == sorted(told)
+    told = [("dead", "no pattern, taxel 3 stuck: it may be broken"), ("dead", "no pattern, taxel 7 silent")]
+    assert sorted((note.kind, note.text) for note in pad.watch.notes(None)) == told
 
 
 def raised(counts, baseline):
@@ -247,7 +250,7 @@ def test_one_at_its_end_among_others_that_are_pressed_is_held_from_the_first_sca
     before = pad.watch.held[2, 1, 1]
     pad.read(1, press, at_the_end)
     assert pad.watch.held[2, 1, 1] == before
-    assert "its last reading is held, taxel 5 at the end of its range" in (pad.watch.note(None) or "")
+    assert "its last reading is held, taxel 5 at the end of its range" in (joined(pad.watch.notes(None)) or "")
 
 
 def test_no_reading_is_held_for_longer_than_the_judge_of_faults_allows():

@@ -423,12 +423,13 @@ def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
     assert stream.getvalue().splitlines() == hints
 
 
-def test_the_event_of_a_result_is_a_line():
+def test_the_events_of_a_result_are_lines():
     stream = io.StringIO()
     messages = MessageSink(stream)
-    for number, event in enumerate([None, "zeroing refused"]):
-        messages.write(Result(make_scan(number), "device", "tiny", "idle", event=event), {})
-    assert stream.getvalue() == "edge-sr: zeroing refused\n"
+    for number, texts in enumerate([[], ["zeroing refused", "zeroed; again"]]):
+        events = tuple(Event(number, "refused", None, text) for text in texts)
+        messages.write(Result(make_scan(number), "device", "tiny", "idle", events=events), {})
+    assert stream.getvalue() == "edge-sr: zeroing refused\nedge-sr: zeroed; again\n"
 
 
 class TestNpz:

@@ -28,7 +28,7 @@ from zenoh_load import _figures as figures_of
 
 from edge import api
 from edge.errors import SinkError, UsageError
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.perception.runtime import Runtime
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_record import event_record, record
@@ -287,7 +287,7 @@ class TestWhoComesAndGoes:
         sink.write(results[1], {})
         second = consume(endpoint)
         wait_for(lambda: sink._events.matching_status.matching)
-        sink.write(replace(results[1], note="again"), {})
+        sink.write(replace(results[1], notes=(Note("late", "again"),)), {})
         sink.close()
         messages, _ = second.until_gone()
         assert json.loads(messages[0][-1])["note"] == "again"

@@ -66,8 +66,8 @@ def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     program's own count of missing ones alone tells; so that account can be no more than consistent, and with it the
     one of readings closes exactly.
 
-    Lines of events that were left out are counted with those of scans; scans that the program counted and that are in no
-    record nor left out are missed all the same.
+    Lines of events that were left out are counted with those of scans. A scan that the program counted, and that is in
+    no record and not left out, is missed all the same.
 
     An opening drops what lies in the terminal. Where the injector did not run meanwhile, it finds nothing there and
     takes it as read. How many bytes were dropped the program counts, how many of them the injector has as unread it

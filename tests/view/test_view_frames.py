@@ -184,10 +184,15 @@ def test_who_was_away_long_gets_what_was_missed_thinned_and_nothing_twice(heard,
     assert got == sorted(set(got))
 
 
+AGAIN = Event(0, "zeroed", "4", "again")
+
+
 def test_memory_does_not_grow_with_the_run(heard):
     idle = Press().next(0)
     for number in range(20_000):
-        heard.add(replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), event="again"), {})
+        heard.add(
+            replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), events=(AGAIN,)), {}
+        )
     assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
 
 
@@ -219,10 +224,12 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
 def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     press, viewer = Press(), Viewer()
     heard.add(press.next(), {})
-    heard.add(replace(press.next(), event="zeroed again"), {})
+    heard.add(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
     heard.add(press.next(), {})
     event, result = look(viewer, heard, clock)
-    assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == ("note", "4", "zeroed again")
+    assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == (
+        *("zeroed", "4", "sensor 4 zeroed on demand: baseline b"),
+    )
     assert result[0]["scan"] == 2
 
 
@@ -272,7 +279,7 @@ def test_what_is_refused_is_an_event():
     assert "number" not in header and header["sensor"] is None
 
 
-def test_what_a_runtime_refuses_is_told_as_that_and_of_the_sensor_that_may_be_forced(heard, clock):
+def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(heard, clock):
     four, viewer = Press("4"), Viewer()
 
     def told(press_counts=3000):
@@ -282,15 +289,15 @@ def test_what_a_runtime_refuses_is_told_as_that_and_of_the_sensor_that_may_be_fo
     four.runtime.zero()
     assert told() == [("refused", None)]  # no sensor was heard yet
     four.runtime.zero("4")
-    assert told() == [("refused", "4")]
+    assert told() == [("in_contact", "4")]
     four.runtime.zero("6")
     assert told() == [("refused", None)]
     four.runtime.zero("4", force=True)
     assert told() == []
     four.runtime.lose_touch()
-    assert told() == [("refused", None)]  # given up
+    assert told() == [("given_up", "4")]
     four.runtime.reset()
-    assert told() == [("note", None)]  # of all sensors, though this one's result tells it
+    assert told() == [("reset", None)]  # of all sensors, though this one's result tells it
 
 
 class TestSink:

@@ -12,7 +12,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from edge.perception.event import Event
+from edge.perception.event import Event, EventKind
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
@@ -54,7 +54,10 @@ string record              # all of it as JSON, as in a line of jsonl:
 )
 Vector = tuple[float, float, float]
 _WARN, _ERROR, _INFO = 30, 40, 20
-_LEVELS: Final = {"lost": _ERROR, "silent": _WARN, "trouble": _WARN, "sink": _ERROR}
+_LEVELS: Final[Mapping[EventKind, int]] = {
+    **dict.fromkeys(("lost", "sink"), _ERROR),
+    **dict.fromkeys(("silent", "trouble", "refused", "in_contact", "given_up", "rest_level"), _WARN),
+}
 
 
 def frame_of(result: Result) -> str:

@@ -143,8 +143,8 @@ class Ros2Sink(Sink):
             self._publish_wrench(sensor, time_ns, *force)
         elif result.state != "dropped":
             self._withdraw_force(sensor, time_ns)
-        if result.event is not None:
-            self._tell(Event(time_ns, "runtime", result.scan.sensor, result.event))
+        for event in result.events:
+            self._tell(event)
         self._diagnose_if_due()
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:

@@ -277,7 +277,7 @@ def play(scene: Scene, seconds: float, model: ModelSession) -> dict[str, Tally]:
         tallies["followed"].run_s += time.perf_counter() - start_s
         moved: list[Counts] = []
         for index, result in enumerate(results):
-            tallies["followed"].steps += result.event is not None
+            tallies["followed"].steps += len(result.events)
             if index and result.baseline is results[index - 1].baseline:
                 moved.append(moved[-1])
             else:
