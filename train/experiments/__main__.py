@@ -45,16 +45,16 @@ _PAPER: Final = {
     *("table3", "table4", "fig5", "fig7", "angle", "taps", "bound", "trained_out"),
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
-"""Those in train.experiments.paper; the others are in train.experiments.sensor."""
+"""Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
 
 
 def module_of(name: str) -> str:
-    """Return the module of an experiment."""
+    """Return the name of an experiment's module."""
     return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the experiments named on the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m train.experiments",
         description=(__doc__ or "").splitlines()[0],
