@@ -126,7 +126,7 @@ def _blob(rng: np.random.Generator, largest_mm: float) -> BaseGeometry:
 
 
 def _placed(rng: np.random.Generator, drawn: BaseGeometry, reach_mm: float) -> BaseGeometry | None:
-    """Return the drawing without its finest detail, moved to a random place; None if it is too large, small or invalid."""
+    """Return the drawing without its finest detail, moved to a random place; None if too large, small or invalid."""
     fine = _FINEST_MM / 2
     shut = drawn.buffer(fine, join_style="mitre").buffer(-2 * fine, join_style="mitre")
     cleaned = shut.buffer(fine, join_style="mitre").simplify(0.02)

@@ -36,7 +36,7 @@ def edge_distance_mm(touched: NDArray[np.bool_], scale: int) -> NDArray[np.float
 
 
 def let_through(wavelength_mm: ArrayLike) -> NDArray[np.float64]:
-    """Return the share of a surface's wave that reaches the magnets, as a share of an even press's; 1 for long waves."""
+    """Return the share of a surface's wave that reaches the magnets, relative to an even press; 1 for long waves."""
     q_per_mm = 2 * np.pi / np.append(np.ravel(np.asarray(wavelength_mm, dtype=np.float64)), np.inf)
     layer = Layer()
     share = inner_displacement(layer, q_per_mm, Magnet().height_mm)[0] / surface_compliance(layer, q_per_mm)
@@ -44,7 +44,7 @@ def let_through(wavelength_mm: ArrayLike) -> NDArray[np.float64]:
 
 
 def kept_back(patterns: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
-    """Return the part of patterns (n, H, W) that the layer keeps from the magnets; windows are mirrored at their sides."""
+    """Return the part of patterns (n, H, W) that the layer keeps from magnets; windows are mirrored at the sides."""
     pixel_mm = USPA44.pixel_pitch_mm(scale)
     down_per_mm, right_per_mm = (np.arange(length) / (2 * length * pixel_mm) for length in patterns.shape[1:])
     waves_per_mm = np.hypot(down_per_mm[:, None], right_per_mm)

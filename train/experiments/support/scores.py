@@ -23,7 +23,7 @@ def own_peak_db(psnr_db: NDArray[np.floating], truth: NDArray[np.floating], full
 
 
 def pattern_cells(figures: Figures, truth: NDArray[np.floating], full_scale: float, groups: NDArray[np.integer]) -> Row:
-    """Return the errors of patterns as cells of a row, with intervals by group: frames of a group are not independent."""
+    """Return errors of patterns as cells of a row, with intervals by group: frames of a group are not independent."""
     psnr_db = figures["psnr_db"]
     return {
         "PSNR dB": with_interval(psnr_db, groups),

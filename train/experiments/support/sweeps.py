@@ -28,7 +28,7 @@ class Sweep:
     Attributes:
         name: of the nuisance.
         unit: of its severity.
-        severities: in rising order.
+        severities: from the weakest to the strongest nuisance.
         default: severity at which all other sweeps are evaluated.
         frozen: function from a severity to its frozen set.
     """

@@ -68,7 +68,7 @@ def at_scale(scale: int) -> Training:
 
 
 def at_angle(angle_step_deg: float) -> Training:
-    """Return the training of the compact MTSR-2 for taps turned by an angle, started from the STSR, which has no angle."""
+    """Return the training of the compact MTSR-2 for taps turned by an angle, started from the STSR."""
     recipe = Recipe(steps=_ANGLE_STEPS, learning_rate=1e-3, given=given_taps(2))
     return Training(f"taps-mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start=BASE.name, seed=3)
 

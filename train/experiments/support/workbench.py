@@ -1,4 +1,4 @@
-"""Workbench of the experiments: datasets and networks that are made once and kept, and the errors and cost of networks."""
+"""Workbench of the experiments: datasets and networks made once and kept, and errors and cost of networks."""
 
 import hashlib
 import json
