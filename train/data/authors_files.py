@@ -1,4 +1,4 @@
-"""The authors' recordings (`C.npy`, ...): object arrays of dicts, pickled, read without running anything in them.
+"""Reader of the authors' recordings (`C.npy`, ...): pickled object arrays of dicts, read without executing any code.
 
 Source: Wu and Liu 2024, Sec. IV-A, and the layout of the files that their code reads.
 """
@@ -20,21 +20,21 @@ from train.surfaces.poses import position_and_angle
 
 FRAMES_KEPT: Final = 16
 FIRST_SHARE: Final = 0.3
-"""Frames are kept from this share of the largest sum of z up to it."""
+"""Share of the largest sum of z from which frames are kept."""
 
 _KEYS: Final = ("sample_idx", "depth", "LRs")
 _BROKEN_HEADER: Final = (SyntaxError, TokenError)
-"""What numpy's reader of the header lets through."""
+"""Exceptions that numpy's reader of the header lets through."""
 _READINGS: Final = USPA44.taxel_count * len(AXES)
 
 
 @dataclass(frozen=True, slots=True)
 class AuthorsTaps:
-    """Taps of one of the authors' surfaces.
+    """Taps on one of the authors' surfaces.
 
     Attributes:
-        counts: (n, FRAMES_KEPT, 3, 4, 4) float32 as they stand in the file, rows from the top.
-        depth: n depth images (H, W) as they stand in the file.
+        counts: (n, FRAMES_KEPT, 3, 4, 4) float32 as in the file, rows from the top.
+        depth: n depth images (H, W) as in the file.
         position: (n,) 0 to 8.
         angle_deg: (n,) turn of the pad, in [deg].
     """
@@ -52,11 +52,11 @@ def load_authors_taps(path: Path) -> AuthorsTaps:
     """Read one of the authors' files.
 
     Raises:
-        DatasetError: absent, not of that kind, cut short, or a pickle that names what no array needs.
+        DatasetError: absent, of another format, cut short, or a pickle with names that no array needs.
     """
     try:
         with path.open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that look like Python 2's, and of escapes in strings
+            warnings.simplefilter("ignore")  # about headers that look like Python 2's, and escapes in strings
             records = _records(file)
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
@@ -79,13 +79,14 @@ def load_authors_taps(path: Path) -> AuthorsTaps:
 
 
 def kept_frames(readings: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The frames that are learnt from, (FRAMES_KEPT, 3, 4, 4), of readings (frames, 48) x, y, z by taxel.
+    """Return the frames to train on, (FRAMES_KEPT, 3, 4, 4), from readings (frames, 48) x, y, z by taxel.
 
-    From the first frame that has FIRST_SHARE of the largest sum of z, up to the one that has it all, evenly spaced;
-    a short press gives some frames twice. Rows are turned over: theirs count from the bottom.
+    Frames are evenly spaced from the first with FIRST_SHARE of the largest sum of z to the one with the largest; in a
+    short
+    press some frames appear twice. Rows are reversed, because the file counts them from the bottom.
 
     Raises:
-        ValueError: no frame, or none with a positive sum of z.
+        ValueError: no frame, or no frame with a positive sum of z.
     """
     scans = readings.reshape(-1, USPA44.rows, USPA44.cols, len(AXES)).transpose(0, 3, 1, 2)[:, :, ::-1]
     force = scans[:, 2].sum(axis=(1, 2))
@@ -97,7 +98,7 @@ def kept_frames(readings: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _records(file: BinaryIO) -> list[Any]:
-    """The objects of an npy file's object array."""
+    """Return the objects of an npy file's object array."""
     if npy.read_magic(file) != (1, 0):
         raise ValueError("its npy version is not 1.0")
     shape, _, dtype = npy.read_array_header_1_0(file)
@@ -110,7 +111,7 @@ def _records(file: BinaryIO) -> list[Any]:
 
 
 def _tap(record: Any, where: str) -> tuple[int, NDArray[np.float32], NDArray[np.floating]]:
-    """Number, kept frames and depth image of one record."""
+    """Return number, kept frames and depth image of one record."""
     if not isinstance(record, dict) or not all(key in record for key in _KEYS):
         found = ", ".join(map(str, record)) if isinstance(record, dict) else type(record).__name__
         raise DatasetError(f"{where} has {found}, expected a dict with {', '.join(_KEYS)}")
@@ -127,7 +128,7 @@ def _tap(record: Any, where: str) -> tuple[int, NDArray[np.float32], NDArray[np.
 
 
 def _numbers(value: Any, name: str, width: int | None) -> NDArray[np.floating]:
-    """A table of finite numbers, (rows, columns), of an array or of a list of rows."""
+    """Return a table of finite numbers, (rows, columns), from an array or a list of rows."""
     plain = plain_value(value)
     if isinstance(plain, list):
         rows = [plain_value(row) for row in plain]

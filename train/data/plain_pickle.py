@@ -1,9 +1,8 @@
-"""Pickles of numpy arrays, dicts, lists, numbers and strings, read without running anything in them.
+"""Pickles of numpy arrays, dicts, lists, numbers and strings, read without executing any code.
 
-A pickle names functions and has them called. Here no name is looked up at all: the handful that a pickled array
-needs stand for classes of our own, which check what they are given and know only bytes, shapes and plain number
-types. numpy's own ones are not used, as they trust their input. Any other name ends the reading before anything
-was called with it.
+A pickle names functions to be called. Here no name is imported at all: the few that a pickled array needs stand for
+classes of this module, which check their arguments and accept only bytes, shapes and plain number types. numpy's own
+classes are not used, because they trust their input. Any other name ends the reading before a call.
 """
 
 import io
@@ -31,7 +30,7 @@ BROKEN: Final = (
     MemoryError,
     RecursionError,
 )
-"""What a broken pickle makes the unpickler raise."""
+"""Exceptions that the unpickler raises on a broken pickle."""
 
 MOST_BYTES: Final = 1 << 30
 _KEEPING: Final = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
@@ -46,10 +45,10 @@ _PLAIN_CODE: Final = re.compile(r"[biuf][0-9]{1,2}|U[1-9][0-9]{0,5}|O8?")
 
 
 def load_plain(file: BinaryIO) -> Any:
-    """The object pickled next in a file; arrays in it are to be taken with `plain_value`.
+    """Load the next pickled object of a file; arrays in it are to be read with `plain_value`.
 
     Raises:
-        pickle.UnpicklingError: a name that no array needs, or an array that is none; broken ones raise any of BROKEN.
+        pickle.UnpicklingError: a name that no array needs, or an invalid array; broken ones raise any of BROKEN.
         OSError: it cannot be read, or is larger than MOST_BYTES.
     """
     content = read_up_to(file, MOST_BYTES)
@@ -58,7 +57,7 @@ def load_plain(file: BinaryIO) -> Any:
 
 
 def _check_operations(content: bytes) -> None:
-    """Refuse what the unpickler allocates for on a word alone: lengths beyond the end, places far off in its memo."""
+    """Refuse operations that allocate memory by a stated size: lengths beyond the end, distant places in the memo."""
     for count, (operation, argument, _) in enumerate(pickletools.genops(content), 1):
         if operation.name not in _OPERATIONS:
             raise pickle.UnpicklingError(f"the operation {operation.name}, which no array needs")
@@ -67,12 +66,12 @@ def _check_operations(content: bytes) -> None:
 
 
 def plain_value(value: Any) -> Any:
-    """An array itself, a list for an array of objects, and all else as it is."""
+    """Return an array itself, a list for an array of objects, and any other value unchanged."""
     return value.value if isinstance(value, _Array) else value
 
 
 class _Dtype:
-    """What stands for a `numpy.dtype`: numbers, strings and objects, in either byte order."""
+    """Replacement for `numpy.dtype`: numbers, strings and objects, in either byte order."""
 
     def __init__(self, code: object, *_: object) -> None:
         if not isinstance(code, str) or not _PLAIN_CODE.fullmatch(code):
@@ -80,7 +79,7 @@ class _Dtype:
         self.type = np.dtype(object) if code.startswith("O") else np.dtype(code)
 
     def __setstate__(self, state: object) -> None:
-        # Version, byte order, then what only compound types have, sizes and flags; numpy believes all of it.
+        # Version, byte order, three parts for compound types only, sizes and flags; numpy would trust all of it.
         if not isinstance(state, tuple) or len(state) != 8 or any(part is not None for part in state[2:5]):
             raise pickle.UnpicklingError("an array of a compound type, expected plain numbers")
         if state[1] in ("<", ">"):
@@ -88,7 +87,7 @@ class _Dtype:
 
 
 class _Array:
-    """What stands for a `numpy.ndarray`: an array of its own numbers, or the list of its objects."""
+    """Replacement for `numpy.ndarray`: an array of its own numbers, or the list of its objects."""
 
     def __init__(self) -> None:
         self.value: NDArray[Any] | list[Any] | None = None
@@ -100,7 +99,7 @@ class _Array:
         self.fill(content, dtype, shape, "F" if fortran else "C")
 
     def fill(self, content: object, dtype: object, shape: object, order: object) -> "_Array":
-        """Take the bytes, or the list of objects, of an array of this type and shape."""
+        """Set the bytes, or the list of objects, of an array of this type and shape."""
         if not isinstance(dtype, _Dtype) or not isinstance(shape, tuple) or order not in ("C", "F"):
             raise pickle.UnpicklingError("an array without type, shape and order")
         if not all(isinstance(length, int) and length >= 0 for length in shape):
@@ -135,14 +134,14 @@ def _scalar(dtype: object, content: object) -> int | float | bool | str:
 
 
 def _encode(text: object, codec: object) -> bytes:
-    """Bytes as protocols before 3 write them; of all codecs this one alone."""
+    """Return bytes as protocols before 3 write them, which use the latin1 codec only."""
     if codec != "latin1" or not isinstance(text, str):
         raise pickle.UnpicklingError(f"bytes in {codec!r}, expected latin1")
     return text.encode("latin1")
 
 
 class _Name:
-    """What a name in a pickle gives: it can be called, and nothing else can be done to it."""
+    """Value of a name in a pickle: it can be called, and has no other operation."""
 
     __slots__ = ("_make",)
 
@@ -173,7 +172,7 @@ _NAMES: Final[Mapping[tuple[str, str], _Name]] = {
 
 
 class _PlainUnpickler(pickle.Unpickler):
-    """Knows the names above and no others, and imports nothing."""
+    """Unpickler that resolves only the names above and imports nothing."""
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         try:
