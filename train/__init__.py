@@ -1,4 +1,4 @@
-"""The simulated sensor, its truth, and the networks that learn from both. Knows no ONNX."""
+"""The simulated sensor, its truth, and the networks trained on both. This package imports no ONNX."""
 
 from firmware_bridge.extras import need
 

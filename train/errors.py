@@ -1,7 +1,7 @@
 """Errors of training.
 
 TrainError
-+-- SurfaceError (ValueError)  a name that stands for no surface
++-- SurfaceError (ValueError)  unknown name of a surface
 +-- MeshError (ValueError)     a mesh file that cannot be tapped
 +-- CheckpointError (ValueError)  weights that cannot be used
 +-- DatasetError (ValueError)  a file of taps that cannot be read or written
@@ -13,7 +13,7 @@ class TrainError(Exception):
 
 
 class SurfaceError(TrainError, ValueError):
-    """A name that stands for no surface."""
+    """Unknown name of a surface."""
 
 
 class MeshError(TrainError, ValueError):
@@ -21,8 +21,8 @@ class MeshError(TrainError, ValueError):
 
 
 class DatasetError(TrainError, ValueError):
-    """A file of taps that cannot be read or written: absent, not ours, newer, damaged, or hostile."""
+    """File of taps that cannot be read or written: absent, of another format, newer, damaged, or hostile."""
 
 
 class CheckpointError(TrainError, ValueError):
-    """Weights or their configuration are absent, damaged, or do not fit each other."""
+    """Weights or configuration that are absent, damaged, or do not fit each other."""

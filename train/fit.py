@@ -4,10 +4,11 @@
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
     python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start seed-stsr --steps 5000
 
-The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older taps
-drop out at random in training, so a network is right with fewer taps than it takes; and what is known of a pad does, so
-it is right without.
-A run that was cut short goes on where it was. `tensorboard --logdir checkpoints/logs` shows how it goes.
+The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older
+taps and the pads' constants are dropped at random in training, so that a network works with fewer taps than it takes
+and
+without constants. An interrupted run resumes with the same command. `tensorboard --logdir checkpoints/logs` shows its
+progress.
 """
 
 import argparse
@@ -31,7 +32,7 @@ from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
 
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}
-"""Share of windows with 1, 2, ... K taps given."""
+"""Share of windows with 1, 2, ... K taps."""
 
 _KNOWN: Final = {"known": KNOWN}
 BUNDLED: Final = (
@@ -47,7 +48,7 @@ BUNDLED: Final = (
 
 
 def given_taps(taps: int) -> tuple[float, ...]:
-    """Shares of windows with 1, 2, ... K taps given: half of them whole, the rest one tap first."""
+    """Return the shares of windows with 1, 2, ... K taps: about half of them whole, most of the rest with one tap."""
     if taps in GIVEN:
         return GIVEN[taps]
     shares = [0.3, *[0.25 / (taps - 2)] * (taps - 2), 0.45]
@@ -83,7 +84,7 @@ def _say(line: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     options = _parser().parse_args(arguments)
     started_s = time.monotonic()
     try:
@@ -131,7 +132,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
 
 
 def _name(network: str) -> str:
-    """Not that of a bundled one, which a network of the paper must not overwrite."""
+    """Return a checkpoint's name that differs from a bundled one's, which a network of the paper must not overwrite."""
     return network if network.startswith(("compact-", "small-")) else f"seed-{network}"
 
 

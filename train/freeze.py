@@ -2,8 +2,8 @@
 
 python -m train.freeze edge/models --data data/gripped.npz data/gripped4.npz
 
-A frozen test set that is there stays, since models name it by its hash and processors round differently: delete it to
-freeze it again.
+An existing frozen test set is kept, because models name it by its hash and processors round differently: delete it
+to freeze it again.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split,
 
 SCALE: Final = 10
 TEST_FORCE_N: Final = 5.0
-"""Every tap of a frozen set ends at this force, or as deep as the sensor allows."""
+"""Force at which every tap of a frozen set ends, unless the sensor's largest depth is reached before, in [N]."""
 CLASSICAL_WINDOWS: Final = 12_000
 DEMO_SURFACE: Final = "S"
 DEMO_ANGLE_DEG: Final = 30.0
@@ -47,18 +47,18 @@ DEMO_TAPS: Final = 4
 DEMO_RATE_HZ: Final = 100.0
 REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES = 150, 20, 24, 12, 24
 FIRST_FRAME: Final = 6
-"""Frames of a press before the first one kept: the kept ones begin at about 30 % of the set force, as the paper's."""
+"""Frames of a press before the first one kept: kept frames begin at about 30 % of the set force, as in the paper."""
 
 
 def held_out(split: Split, surfaces: tuple[str, ...] = SURFACES, taps: int = MAX_TAPS) -> Sequences:
-    """The sequences of a held-out position, truth at x20: every surface at the four test angles."""
+    """Return the sequences of a held-out position, truth at x20: every surface at the four test angles."""
     return solve_all(Generation(surfaces=surfaces, poses="paper", split=split, taps=taps, seed=SEED))
 
 
 def freeze(
     sequences: Sequences, nuisances: Nuisances, seed: int, force_n: float = TEST_FORCE_N, scale: int = SCALE
 ) -> FrozenSet:
-    """The frames of flat sequences, as read by sensors of their own, one for each sequence."""
+    """Return the frames of flat sequences, with a different sensor for each sequence."""
     flat = sequences.at_scale(scale)
     index = np.arange(len(flat))
     share = flat.share_at_force(index, force_n)
@@ -80,7 +80,7 @@ def freeze(
 
 
 def fit_classical(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
-    """Gains of bilinear and bicubic interpolation, in mm per count, and the linear map (48, pixels)."""
+    """Return the gains of bilinear and bicubic interpolation, in mm per count, and the linear map (48, pixels)."""
     newest, patterns = drawn(taps, windows)
     matrix = fit_linear_map(newest.reshape(len(newest), -1), patterns.reshape(len(patterns), -1))
     return {
@@ -91,16 +91,16 @@ def fit_classical(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) 
 
 
 def fit_taxels(taps: PressSet | Sequences, windows: int = 2 * CLASSICAL_WINDOWS) -> dict[str, NDArray]:
-    """Covariances (kinds, 48, 48) of taxels' readings, x of all first; none is dead, and the pad is turned all ways."""
+    """Return covariances (kinds, 48, 48) of healthy taxels' readings, all x first, with the pad in all four turns."""
     newest, patterns = drawn(taps, windows)
     turned = [quarter_turns(newest[:, None], patterns, turns)[0][:, 0] for turns in range(4)]
     return {"covariances": fit_kinds(np.concatenate(turned))}
 
 
 def drawn(taps: PressSet | Sequences, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Readings (n, 3, rows, cols) of newest taps in zeroed counts, each by a sensor of its own, and their patterns.
+    """Return readings (n, 3, rows, cols) of newest taps in zeroed counts, with a different sensor each, and patterns.
 
-    None of the taxels is dead: what is fitted has to learn what one that lives reads. Patterns are (n, H, W) in [mm].
+    No taxel is dead, because the fits are to learn the readings of healthy ones. Patterns are (n, H, W) in [mm].
     """
     if isinstance(taps, PressSet):
         index = np.random.default_rng(SEED).permutation(len(taps))[np.arange(windows) % len(taps)]
@@ -112,7 +112,7 @@ def drawn(taps: PressSet | Sequences, windows: int) -> tuple[NDArray[np.float32]
 
 
 def demo_recording() -> dict[str, NDArray]:
-    """Four taps of one surface as a controller would send them, with the truth of every frame.
+    """Return four taps of one surface as a controller would send them, with the truth of every frame.
 
     The pad rests, then presses, holds and lifts four times, turned a step each time, at the held-out position.
     """
@@ -125,7 +125,7 @@ def demo_recording() -> dict[str, NDArray]:
     )
     course[PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES :] = 0
     shares = np.tile(course, (DEMO_TAPS, 1))
-    # Zeroed a second before: nothing has drifted, and the pad has not left its place in the earth's field.
+    # The zero is a second old: no drift yet, and the pad has not moved in the earth's field.
     nuisances = Nuisances().without("thermal_drift_counts", "earth_field_counts")
     pressed = apply_nuisances(
         between_frames(taps.counts, shares)[None, ::-1],
@@ -157,7 +157,7 @@ def demo_recording() -> dict[str, NDArray]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write classical.npz, taxels.npz, demo.npz, and frozen.npz where there is none."""
+    """Write classical.npz, taxels.npz, demo.npz, and frozen.npz where it does not exist."""
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="where to write frozen.npz, classical.npz, taxels.npz and demo.npz")
     parser.add_argument(

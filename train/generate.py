@@ -2,10 +2,11 @@
 
     python -m train.generate data/train.npz --glyphs 2000 --polygons 2000 --count 9000
 
-Chunks of sequences are solved by joblib's workers and written beside the file as they come, in `data/train.npz.parts`;
-at the end they are joined and removed. The arrays are the same, to the bit, however often a run was cut short.
+Chunks of sequences are solved by joblib's workers and written next to the file as they are completed, in
+`data/train.npz.parts`; at the end they are joined and removed. The arrays are the same, to the bit, however often a run
+was interrupted.
 
-A cluster that is already there takes the work through joblib's own backends. With Dask:
+An existing cluster takes the work through joblib's own backends. With Dask:
 
     import joblib
     from distributed import Client
@@ -41,8 +42,8 @@ from train.surfaces.named_surfaces import PLATES, SURFACES, surface_mesh
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
 _INTERRUPTED: Final = 130
-# Joblib's resource tracker, a process of its own, finds now and then that an interrupted pool's semaphore is gone
-# before it could be signed off, and says so on the terminal. It has no other switch than Python's own.
+# Joblib's resource tracker, a separate process, occasionally reports on the terminal that an interrupted pool's
+# semaphore is gone before it was unregistered. Python's warning filter is its only switch.
 _TRACKER_QUIET: Final = "ignore:resource_tracker:UserWarning"
 _NAMED: Final = {"all": SURFACES, "plate1": PLATES[0], "plate2": PLATES[1], "none": ()}
 
@@ -50,17 +51,17 @@ _NAMED: Final = {"all": SURFACES, "plate1": PLATES[0], "plate2": PLATES[1], "non
 def generate(
     config: Generation, path: Path, jobs: int = -1, progress: Callable[[int], object] = lambda poses: None
 ) -> Sequences:
-    """Solve what a configuration asks for, and write it; called again after a kill, go on. A bar tells how far it is.
+    """Solve the sequences of a configuration, and write them; an interrupted call resumes. A bar shows the progress.
 
     Args:
-        config: what.
+        config: configuration of the dataset.
         path: of the npz.
         jobs: processes, -1 for one on each core; joblib's configured backend may have its own number.
-        progress: called with the number of poses that have become ready.
+        progress: called with the number of poses that have been completed.
 
     Raises:
-        DatasetError: what lies at `path` or beside it was made with another configuration, or cannot be written.
-        SurfaceError: a surface's name means nothing.
+        DatasetError: the file at `path` or its parts were made with another configuration, or cannot be written.
+        SurfaceError: a surface's name is unknown.
         MeshError: a user's mesh cannot be used.
     """
     if path.exists():
@@ -71,7 +72,7 @@ def generate(
     if jobs == 0:
         raise DatasetError("jobs is 0, expected 1 or more, or -1 for one on each core")
     for name in config.surfaces:
-        if name.startswith("mesh:"):  # before any work: the likeliest to fail
+        if name.startswith("mesh:"):  # checked before any work, because meshes fail most often
             surface_mesh(name)
     folder = path.with_name(path.name + ".parts")
     missing = _missing_chunks(config, folder, progress)
@@ -94,7 +95,7 @@ def _part_path(folder: Path, chunk: int) -> Path:
 
 
 def _missing_chunks(config: Generation, folder: Path, progress: Callable[[int], object]) -> list[int]:
-    """Numbers of the chunks that an earlier run has not left; damaged ones are solved anew."""
+    """Return the numbers of chunks that no earlier run has left; damaged ones are solved again."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -114,13 +115,13 @@ def _missing_chunks(config: Generation, folder: Path, progress: Callable[[int], 
 
 
 def _solved(config: Generation, chunks: Sequence[int], jobs: int) -> Iterator[tuple[int, Sequences]]:
-    """Chunks and their numbers, as they become ready."""
+    """Yield chunks with their numbers, as they are completed."""
     tasks = [joblib.delayed(_numbered)(config, chunk) for chunk in chunks]
     if len(tasks) == 1:
-        jobs = 1  # a process of its own takes seconds to begin
+        jobs = 1  # a separate process takes seconds to start
     try:
         pool, at_once = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered"), len(tasks)
-    except ValueError:  # a backend without generators, such as Ray's: in rounds, so that parts are kept all the same
+    except ValueError:  # a backend without generators, such as Ray's: run in rounds, so that parts are kept as well
         pool, at_once = joblib.Parallel(n_jobs=jobs), 4 * joblib.effective_n_jobs(jobs)
     for start in range(0, len(tasks), max(at_once, 1)):
         yield from cast("Iterable[tuple[int, Sequences]]", pool(tasks[start : start + at_once]))
@@ -131,10 +132,10 @@ def _numbered(config: Generation, chunk: int) -> tuple[int, Sequences]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
+    """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
     options = _parser().parse_args(arguments)
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), _TRACKER_QUIET)))
-    # Joblib warns of it when an interruption leaves chunks unsolved, which is what was asked for.
+    # Joblib warns when an interruption leaves chunks unsolved, which is intended here.
     warnings.filterwarnings("ignore", r"\d+ tasks which were still being processed")
     started_s = time.monotonic()
     try:

@@ -2,9 +2,10 @@
 
     python -m train.identify recordings --out sensor.toml
 
-RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed. What
-contacts tell is written into the sensor file's [pad] section with its 90 % interval; what they leave as open as the
-range of simulated pads does is left out. What simulated pads read is fitted once, beside the presses.
+RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed.
+Constants that contacts determine are written into the sensor file's [pad] section with their 90 % intervals; constants
+that remain as open as the range of simulated pads are left out. The mixture of simulated readings is fitted once, and
+kept with the presses.
 """
 
 import argparse
@@ -30,12 +31,12 @@ from train.learning.gain_estimate import Estimate, estimate
 from train.physics.pad_draws import RANGES, input_scale
 
 _APART: Final = 0.1
-"""Least difference of two contacts that count as two, over the RMS of their z: five times what noise and drift make."""
+"""Least difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
 _PREFIX: Final = "xela_"
 
 
 def mixture_beside(presses: Path) -> ContactMixture:
-    """The mixture of contacts fitted to a file of presses: read if it is there, else fitted and kept.
+    """Return the mixture of contacts fitted to a file of presses, loaded if it exists, else fitted and kept.
 
     Raises:
         DatasetError: there are no presses, or one of the files is damaged.
@@ -47,10 +48,10 @@ def mixture_beside(presses: Path) -> ContactMixture:
 
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
-    """Distinct contacts (n, 3, rows, cols) of each sensor.
+    """Return the distinct contacts (n, 3, rows, cols) of each sensor.
 
     Raises:
-        DatasetError: no recordings there, or one cannot be read.
+        DatasetError: the folder has no recordings, or one cannot be read.
     """
     if not recording_paths(folder):
         raise DatasetError(f"{folder} holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv")
@@ -62,7 +63,7 @@ def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
 
 
 def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Scans that differ from all kept before them: a grip that is held is one contact, however long."""
+    """Return the scans that differ from all kept before them: a held grip is one contact, however long."""
     contacts, _ = normalise(counts)
     kept: list[int] = []
     for number, contact in enumerate(contacts):
@@ -73,7 +74,7 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def found_pad(found: Estimate) -> Pad:
-    """What is told of a pad, as the sensor file holds it."""
+    """Return the estimated pad as the sensor file holds it; undetermined constants are left out."""
     constants: dict[str, float] = {}
     intervals: dict[str, tuple[float, float]] = {}
     for number, (name, centre, spread) in enumerate(input_scale()):
@@ -87,7 +88,7 @@ def found_pad(found: Estimate) -> Pad:
 
 
 def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
-    """The sensor file that is there with these pads, or one with nothing else."""
+    """Return the existing sensor file with these pads, or a new one with these pads alone."""
     before = load_sensor_file(path) if path.exists() else SensorFile()
     sensors = dict(before.sensors)
     for name, pad in pads.items():
@@ -97,7 +98,7 @@ def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
 
 
 def table(sensor: str, found: Estimate) -> str:
-    """What is known of a sensor, line by line."""
+    """Return the estimate of a sensor as lines of text."""
     pad = found_pad(found)
     lines = [
         f"{sensor}: {found.contacts} distinct contacts",
@@ -119,7 +120,7 @@ def table(sensor: str, found: Estimate) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; 0 when done, 1 on a clear error."""
+    """Run the command line; 0 when done, 1 on an error of the user."""
     options = _parser().parse_args(arguments)
     try:
         contacts = recorded_contacts(options.recordings)

@@ -1,4 +1,4 @@
-"""A report: one table as CSV and Markdown, one plot as PNG, and what they were made from."""
+"""Report of an experiment: a table as CSV and Markdown, a plot as PNG, and the command and machine that made them."""
 
 import csv
 import os
@@ -25,12 +25,12 @@ _DPI: Final = 110
 
 
 class Report:
-    """Collects what an experiment found, and writes it as NAME.csv, NAME.md and NAME.png.
+    """Collector of an experiment's results, written as NAME.csv, NAME.md and NAME.png.
 
     Args:
         name: of the experiment, and of its files.
-        folder: where they go; made if absent.
-        quick: the run was cut short for a test: said at the top of the page.
+        folder: where the files are written; made if absent.
+        quick: True where the run was cut short for a test, which the top of the page states.
     """
 
     def __init__(self, name: str, folder: Path, *, quick: bool = False) -> None:
@@ -40,23 +40,23 @@ class Report:
         folder.mkdir(parents=True, exist_ok=True)
 
     def say(self, text: str) -> None:
-        """A paragraph of the page."""
+        """Add a paragraph to the page."""
         self._parts.append(text)
 
     def table(self, rows: Sequence[Row], caption: str, part: str = "") -> None:
-        """A table of the page, and a CSV of its own: NAME.csv, or NAME-PART.csv."""
+        """Add a table to the page, and write it as NAME.csv or NAME-PART.csv."""
         self.keep(rows, part)
         self.show(rows, caption)
 
     def keep(self, rows: Sequence[Row], part: str = "") -> None:
-        """A CSV: NAME.csv, or NAME-PART.csv."""
+        """Write rows as NAME.csv or NAME-PART.csv."""
         with self._file(".csv", part).open("w", newline="") as file:
             writer = csv.DictWriter(file, _columns(rows), lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
 
     def show(self, rows: Sequence[Row], caption: str) -> None:
-        """A table of the page."""
+        """Add a table to the page."""
         columns = _columns(rows)
         lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
         lines += [" | ".join(_shown(row.get(column)) for column in columns) for row in rows]
@@ -64,7 +64,7 @@ class Report:
 
     @contextmanager
     def figure(self, part: str = "", size: tuple[float, float] = (8, 5)) -> Iterator[Figure]:
-        """A plot of the page: NAME.png, or NAME-PART.png."""
+        """Add a plot to the page, saved as NAME.png or NAME-PART.png."""
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
@@ -73,7 +73,7 @@ class Report:
         self._parts.append(f"![{path.stem}]({path.name})")
 
     def write(self) -> Path:
-        """Write the page, and say where it lies."""
+        """Write the page, and return its path."""
         head = [f"# {self._path.name}", _circumstances()]
         if self._quick:
             head.append("**A quick run, for the tests: no figure here means anything.**")
@@ -86,7 +86,7 @@ class Report:
 
 
 def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the mean of (n,) values, by drawing whole taps: frames of one tap are not independent."""
+    """Return the 95 % interval of the mean of (n,) values, resampled by tap: frames of one tap are not independent."""
     order, start = np.unique(taps, return_inverse=True)
     sums = np.bincount(start, weights=values, minlength=len(order))
     counts = np.bincount(start, minlength=len(order))
@@ -97,7 +97,7 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
 
 
 def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:
-    """Mean of (n,) values with its interval, as a table shows it: 35.92 (35.5..36.3)."""
+    """Format the mean of (n,) values with its interval, as tables show it: 35.92 (35.5..36.3)."""
     low, high = bootstrap_interval(values, taps)
     return f"{float(np.mean(values)):.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
 

@@ -1,1 +1,1 @@
-"""Datasets to learn from, and the batches drawn from them."""
+"""Datasets to train on, and the batches drawn from them."""

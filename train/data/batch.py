@@ -1,4 +1,4 @@
-"""A batch to learn from."""
+"""Batch to train on."""
 
 from dataclasses import dataclass, replace
 
@@ -13,8 +13,8 @@ class Batch:
     Attributes:
         window: (n, 3K, rows, cols) in network units.
         pattern: (n, H, W) in [mm].
-        pad: (n, known), what is known of the pads, or None.
-        traction: (n, 3, h, w) in [kPa], or None where it is not learned.
+        pad: (n, known), inputs of the pads, or None.
+        traction: (n, 3, h, w) in [kPa], or None if it is not trained on.
     """
 
     window: Tensor
@@ -23,7 +23,7 @@ class Batch:
     traction: Tensor | None = None
 
     def mirrored(self, which: Tensor) -> "Batch":
-        """Return the same with the mirror images, left for right, of some windows of one tap, (n,) of bool."""
+        """Return the batch with mirror images, left for right, of some windows of one tap, (n,) of bool."""
 
         def flipped(maps: Tensor, vectors: bool) -> Tensor:
             image = maps.flip(-1)

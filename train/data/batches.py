@@ -1,4 +1,4 @@
-"""Batches to train on: each follows from its number alone, so a run that is cut short goes on as if it were not."""
+"""Batches to train on: each depends on its number alone, so that an interrupted run resumes with the same batches."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -16,18 +16,18 @@ COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)
 """Counts of x, y, z that make one unit of network input."""
 
 _SET_FORCE_SPREAD: Final = (0.85, 1.15)
-"""A robot does not end every tap at the same force."""
+"""Bounds of the spread of set forces: a robot does not end every tap at the same force."""
 
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """How windows are drawn from sequences of taps.
+    """Settings by which windows are drawn from sequences of taps.
 
     Attributes:
         set_force_n: bounds of the force at which taps end, in [N].
-        depth_share: bounds of the share of the newest tap that is over.
-        nuisances: every window is read by a sensor of its own.
-        figure_share: share of windows that are of random figures; None: as many as their share of the sequences.
+        depth_share: bounds of the completed share of the newest tap.
+        nuisances: of the sensors, one for every window.
+        figure_share: share of windows with random figures; None: their share of the sequences.
     """
 
     set_force_n: tuple[float, float] = (1.5, 8.0)
@@ -40,14 +40,14 @@ class WindowBatches:
     """Batches of windows and patterns.
 
     Args:
-        sequences: to draw from, with the truth at the network's scale, of at least as many taps as it takes.
-        draw: how.
-        given: share of windows with 1, 2, ... K taps given, older ones dropped.
+        sequences: with the truth at the network's scale, of at least as many taps as it takes.
+        draw: settings of the draw.
+        given: share of windows with 1, 2, ... K taps; older taps are dropped.
         batch: windows in a batch.
-        seed: of everything that is drawn.
+        seed: of all draws.
 
     Raises:
-        ValueError: a share of figures is not between 0 and 1, or all of the sequences are figures, or none.
+        ValueError: a share of figures is not between 0 and 1, or the sequences are all figures or have no figure.
     """
 
     def __init__(self, sequences: Sequences, draw: Draw, given: tuple[float, ...], batch: int, seed: int) -> None:
@@ -59,12 +59,12 @@ class WindowBatches:
         self._streams = _streams(sequences.surfaces, draw, seed)
 
     def __call__(self, number: int) -> Batch:
-        """The batch of a number; nothing is known of its pads."""
+        """Return the batch of a number, without pad inputs."""
         readings, patterns = self.draw(number)
         return Batch(network_input(readings), torch.from_numpy(patterns))
 
     def draw(self, number: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Windows (batch, K, 3, rows, cols) in zeroed counts and patterns (batch, H, W) in [mm]."""
+        """Return windows (batch, K, 3, rows, cols) in zeroed counts and patterns (batch, H, W) in [mm]."""
         index = self.index(number)
         rng = np.random.default_rng([self._seed, 1, number])
         taps = len(self._given)
@@ -80,7 +80,7 @@ class WindowBatches:
         return np.ascontiguousarray(readings), np.ascontiguousarray(patterns)
 
     def index(self, number: int) -> NDArray[np.int64]:
-        """The sequences of a batch, (batch,)."""
+        """Return the sequences of a batch, (batch,)."""
         if self._draw.figure_share is None:
             (everything,) = self._streams
             epoch, part = divmod(number, len(everything) // self._batch)  # all batches are whole
@@ -93,7 +93,7 @@ class WindowBatches:
 
 
 class _Stream:
-    """Sequences, (n,) of their indices, over and over, in another order each time."""
+    """Endless stream of sequence indices (n,), in another order in each epoch."""
 
     def __init__(self, index: NDArray[np.int64], seed: list[int]) -> None:
         self._index, self._seed = index, seed
@@ -104,7 +104,7 @@ class _Stream:
         return len(self._index)
 
     def take(self, first: int, count: int) -> NDArray[np.int64]:
-        """So many of them, from a place in the stream on."""
+        """Return `count` of them, from a place in the stream."""
         epoch, start = divmod(first, len(self))
         if epoch != self._epoch:
             self._order = self._index[np.random.default_rng([*self._seed, epoch]).permutation(len(self))]
@@ -131,6 +131,6 @@ def _streams(surfaces: NDArray[np.str_], draw: Draw, seed: int) -> list[_Stream]
 
 
 def network_input(window_counts: NDArray[np.float32]) -> torch.Tensor:
-    """Windows (n, K, 3, rows, cols) in zeroed counts to network input (n, 3K, rows, cols)."""
+    """Convert windows (n, K, 3, rows, cols) in zeroed counts to network input (n, 3K, rows, cols)."""
     per_unit = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
     return torch.from_numpy((window_counts / per_unit).reshape(len(window_counts), -1, *window_counts.shape[3:]))

@@ -1,4 +1,4 @@
-"""Kinds of contact in the readings of simulated presses, by which dead taxels are estimated."""
+"""Kinds of contact in the readings of simulated presses, used to estimate dead taxels."""
 
 from typing import Final
 
@@ -8,25 +8,27 @@ from numpy.typing import NDArray
 from edge.perception.dead_taxel_fill import Kinds, ridged
 
 KINDS: Final = 16
-"""RMS error of a hidden taxel's z on validation presses, over that of the scan: with 1 kind .61, with 16 .56. With more
-it falls on figures, but not on contacts that vary little over the pad."""
+"""Number of kinds. RMS error of a hidden taxel's z over that of the scan is .61 with 1 kind and .56 with 16.
+
+More kinds reduce it on figures, but not on contacts that vary little over the pad.
+"""
 _PASSES: Final = 10
 _PARTS: Final = 40
-"""That scans are weighed in, so as not to take a gigabyte."""
+"""Parts in which scans are weighed, to use less than a gigabyte."""
 _LEAST_COUNTS: Final = 20.0
-"""RMS of a reading below which noise is not scaled up."""
+"""Least RMS of a reading, below which noise would be scaled up, in [counts]."""
 _FELT: Final = 0.5
 _STRONG: Final = 0.9
 
 
 def fit_kinds(readings: NDArray[np.floating], kinds: int = KINDS) -> NDArray[np.float32]:
-    """Covariances (kinds, 3 taxels, 3 taxels) of scans scaled to one strength, by expectation maximisation.
+    """Return covariances (kinds, 3 taxels, 3 taxels) of scans scaled to one strength, by expectation maximisation.
 
-    Scans are sorted to begin with by the share of taxels that read nearly as much as the strongest ones.
+    Scans are sorted initially by the share of taxels that read nearly as much as the strongest ones.
 
     Args:
         readings: (n, 3, rows, cols) in zeroed counts.
-        kinds: equally many scans begin in each.
+        kinds: number of kinds; each starts with equally many scans.
     """
     flat = readings.reshape(len(readings), -1).astype(np.float64)
     flat /= np.maximum(np.sqrt(np.square(flat).mean(axis=1, keepdims=True)), _LEAST_COUNTS)

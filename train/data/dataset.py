@@ -1,8 +1,8 @@
-"""Sequences of taps to learn from and to be judged on, as one npz file with a schema, a seed and a hash.
+"""Sequences of taps to train and evaluate on, as one npz file with a schema, a seed and a hash.
 
 A sequence is K taps on one surface, newest first; the newest is the target. Every tap is stored as a whole press,
-FRAMES frames to its end, so that readings and truth are there at any force below: frame i lies at (i + 1) / FRAMES
-of the press, nothing is felt at 0, and between frames all goes along straight lines.
+FRAMES frames to its end, so that readings and truth are available at any lower force: frame i lies at (i + 1) / FRAMES
+of the press, readings at 0 are zero, and values between frames are interpolated linearly.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ SCHEMA: Final = "tactile-edge-sr sequences"
 VERSION: Final = 1
 
 _MOST_FACTS_BYTES: Final = 1 << 22
-"""A configuration takes some kB."""
+"""Largest configuration read, in bytes; real ones take a few kB."""
 _RESAMPLED_AT_ONCE: Final = 256
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "surfaces": ("U", "n"),
@@ -46,7 +46,7 @@ class Sequences:
 
     Attributes:
         surfaces: (n,) names.
-        poses: (n, K, 3) float64, where the pad truly was: x, y in [mm], angle in [deg].
+        poses: (n, K, 3) float64, true poses of the pad: x, y in [mm], angle in [deg].
         counts: (n, K, FRAMES, 3, rows, cols) float32, zeroed, without nuisances.
         force_n: (n, K, FRAMES) float32, in [N].
         indentation_mm: (n, K, FRAMES) float32, in [mm], even steps.
@@ -54,8 +54,8 @@ class Sequences:
             are flat and one map times the indentation is every frame's pattern; else L = FRAMES.
         touching: (n, L, H, W) bool, pixels that the surface touches.
         scale: pattern pixels per taxel pitch.
-        seed: that they were drawn from.
-        config: what they were made with, as JSON gives it back.
+        seed: of the poses.
+        config: configuration of the generation, as read from JSON.
     """
 
     surfaces: NDArray[np.str_]
@@ -74,14 +74,14 @@ class Sequences:
 
     @property
     def taps(self) -> int:
-        """K."""
+        """Number of taps in a sequence, K."""
         return self.counts.shape[1]
 
     def newest(self, taps: int) -> "Sequences":
-        """The same with the newest `taps` taps alone.
+        """Return the sequences with only their newest `taps` taps.
 
         Raises:
-            DatasetError: there are not as many.
+            DatasetError: the sequences have fewer taps.
         """
         if not 1 <= taps <= self.taps:
             raise DatasetError(f"{taps} taps asked for, but these sequences have {self.taps}: make others with --taps")
@@ -89,11 +89,11 @@ class Sequences:
         return replace(self, **{name: getattr(self, name)[:, :taps] for name in several})
 
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "Sequences":
-        """The sequences of the given indices."""
+        """Return the sequences at the indices."""
         return replace(self, **{name: getattr(self, name)[index] for name in _AXES})
 
     def at_scale(self, scale: int) -> "Sequences":
-        """The same with the truth resampled to another scale: once after loading, not for every batch."""
+        """Return the sequences with the truth resampled to another scale, to be called once after loading."""
         if scale == self.scale:
             return self
         patterns, touching = [], []
@@ -107,7 +107,7 @@ class Sequences:
         return replace(self, unit_patterns=np.concatenate(patterns), touching=np.concatenate(touching), scale=scale)
 
     def share_at_force(self, index: NDArray[np.integer], force_n: ArrayLike) -> NDArray[np.float64]:
-        """Shares (B, K) of the presses at which they reach their set forces; 1 where a press ends before.
+        """Return the shares (B, K) of the presses at which they reach their set forces; 1 if a press ends before.
 
         Args:
             index: (B,) sequences.
@@ -123,22 +123,22 @@ class Sequences:
     def presses(
         self, index: NDArray[np.integer], share: NDArray[np.floating], frames: int = FRAMES
     ) -> NDArray[np.float32]:
-        """Clean readings (B, K, frames, 3, rows, cols) of presses that end at shares (B, K) of the stored ones."""
+        """Return clean readings (B, K, frames, 3, rows, cols) of presses ending at shares (B, K) of the stored ones."""
         counts = self.counts[index]
         moments = share[..., None] * np.arange(1, frames + 1) / frames
         readings = between_frames(counts.reshape(-1, *counts.shape[2:]), moments.reshape(-1, frames))
         return readings.reshape(*moments.shape, *counts.shape[3:])
 
     def force_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Force of the newest tap, (B, m) in [N], at shares (B, m) of its press."""
+        """Return the force of the newest tap, (B, m) in [N], at shares (B, m) of its press."""
         return between_frames(self.force_n[index, 0], share)
 
     def indentation_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Indentation of the newest tap, (B, m) in [mm], at shares (B, m) of its press."""
+        """Return the indentation of the newest tap, (B, m) in [mm], at shares (B, m) of its press."""
         return between_frames(self.indentation_mm[index, 0], share)
 
     def patterns_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Truth of the newest tap, (B, H, W) in [mm], at shares (B,) of its press."""
+        """Return the truth of the newest tap, (B, H, W) in [mm], at shares (B,) of its press."""
         unit, end_mm = self.unit_patterns[index].astype(np.float32), self.indentation_mm[index, 0]
         if unit.shape[1] == 1:
             depth_mm = (end_mm[:, -1] * share).astype(np.float32)
@@ -146,12 +146,12 @@ class Sequences:
         return between_frames(unit * end_mm[..., None, None], share[:, None])[:, 0]
 
     def touching_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Pixels touched by the newest tap, (B, H, W), in the frame nearest to shares (B,) of its press."""
+        """Return the pixels touched by the newest tap, (B, H, W), in the frame nearest to shares (B,) of its press."""
         nearest = np.clip(np.rint(share * FRAMES).astype(int) - 1, 0, self.touching.shape[1] - 1)
         return self.touching[index, nearest]
 
     def sha256(self) -> str:
-        """Hash over all that is here, whatever file it lies in."""
+        """Return the hash over all data and the configuration, independent of the file."""
         digest = hashlib.sha256(json.dumps([self.scale, self.seed, self.config], sort_keys=True).encode())
         for name in _AXES:
             array = np.ascontiguousarray(getattr(self, name))
@@ -160,7 +160,7 @@ class Sequences:
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write as one npz, whole or not at all.
+        """Write the sequences as one npz, atomically.
 
         Raises:
             DatasetError: the file cannot be written.
@@ -174,17 +174,17 @@ class Sequences:
                 np.savez(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=json.dumps(facts), **arrays)
 
         try:
-            # Read back for its facts alone: all of it would take as much memory again.
+            # Only the facts are read back: reading all arrays would need as much memory again.
             write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], _MOST_FACTS_BYTES), keep_before=False)
         except OSError as error:
             raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def load_sequences(path: Path) -> Sequences:
-    """Read a file that `Sequences.save` has written.
+    """Load a file that `Sequences.save` has written.
 
     Raises:
-        DatasetError: absent, not ours, of a newer schema, incomplete, or damaged.
+        DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
     """
     try:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
@@ -213,9 +213,9 @@ def load_sequences(path: Path) -> Sequences:
 
 
 def join(parts: Sequence[Sequences]) -> Sequences:
-    """Sequences one after the other, with the first part's scale, seed and configuration.
+    """Concatenate sequences, with the first part's scale, seed and configuration.
 
-    Where some parts have one map for a press and others one for each frame, the one is repeated.
+    If some parts have one map for a press and others one for each frame, the single map is repeated.
 
     Raises:
         DatasetError: they have different numbers of taps.
@@ -241,16 +241,16 @@ def windows(
     seed: Seed,
     tap_s: ArrayLike | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What as many sensors read, and the truth: the newest tap is on its way, the earlier ones have come to their ends.
+    """Return the readings of B sensors and their truth; the newest tap is in progress, the earlier ones have ended.
 
     Args:
-        sequences: with the truth at the scale asked for.
+        sequences: with the truth at the required scale.
         index: (B,) sequences.
-        depth_share: how much of the newest press is over, above 0 to 1, broadcast to (B,).
+        depth_share: completed share of the newest press, above 0 to 1, broadcast to (B,).
         force_n: set force of every tap, broadcast to (B, K), in [N].
         nuisances: of these sensors.
         seed: of the nuisances.
-        tap_s: time that the stored presses take, broadcast to (B, K), or None to draw it.
+        tap_s: duration of the stored presses, broadcast to (B, K), in [s], or None to draw it.
 
     Returns:
         Windows (B, K, 3, rows, cols) in whole zeroed counts, and patterns (B, H, W) in [mm].
@@ -265,7 +265,7 @@ def windows(
 def quarter_turns(
     windows: NDArray[np.float32], patterns: NDArray[np.float32], quarters: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The same contacts felt by a pad turned clockwise: maps turn, and the shear (x, y) turns with them."""
+    """Return the same contacts on a pad turned clockwise: maps turn, and the shear (x, y) turns with them."""
     turned, maps = windows, np.rot90(patterns, quarters, axes=(-2, -1))
     for _ in range(quarters % 4):
         x, y, z = np.moveaxis(np.rot90(turned, 1, axes=(-2, -1)), -3, 0)
@@ -279,14 +279,14 @@ def turns_of(windows: NDArray[np.float32], quarters: int) -> int:
 
 
 def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Values (b, m, ...) at shares (b, m) of presses whose frames (b, FRAMES, ...) are known, and 0 at their start."""
+    """Return values (b, m, ...) at shares (b, m) of presses, between frames (b, FRAMES, ...) and 0 at the start."""
     away = np.abs(share[..., None] * FRAMES - np.arange(1, FRAMES + 1))
     weights = np.maximum(1 - away, 0).astype(np.float32)
     return (weights @ frames.reshape(*frames.shape[:2], -1)).reshape(*share.shape, *frames.shape[2:])
 
 
 def _unpacked(touching: NDArray[np.uint8], patterns: NDArray[np.float16]) -> NDArray[np.bool_]:
-    """Masks that a file keeps as bits, along the last axis."""
+    """Return masks that a file keeps as bits along the last axis."""
     if not patterns.ndim:
         raise ValueError("unit_patterns has no axes")
     if touching.ndim != patterns.ndim or touching.shape[-1] != -(-patterns.shape[-1] // 8):

@@ -1,4 +1,4 @@
-"""Files of taps of either kind: presses of the world as it is gripped, or whole taps of the paper's protocol."""
+"""Files of taps of either kind: presses of the simulated world, or whole taps of the paper's protocol."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +12,10 @@ _MOST_SCHEMA_BYTES = 4096
 
 
 def load_taps(paths: Sequence[Path]) -> PressSet | Sequences:
-    """Read files of one kind, one after the other.
+    """Load files of one kind, and concatenate them.
 
     Raises:
-        DatasetError: a file cannot be used, or they are of two kinds.
+        DatasetError: a file cannot be used, or the files are of two kinds.
     """
     presses = [_holds_presses(path) for path in paths]
     if any(presses) and not all(presses):
@@ -30,4 +30,4 @@ def _holds_presses(path: Path) -> bool:
     try:
         return str(read_npz(path, ("schema",), _MOST_SCHEMA_BYTES)["schema"]) == SCHEMA
     except (OSError, ValueError, KeyError):
-        return False  # what is wrong with it is said by who reads it
+        return False  # its reader reports the error

@@ -23,16 +23,16 @@ from train.physics.sensor_noise import NAMES, Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
-"""The frozen set of every family on pads of their own; nothing is chosen by it."""
+"""Frozen set of every family on pads of its own; nothing is selected by it."""
 _BEFORE_GAIN: Final = ("pose_error_mm", "pose_error_deg", "hysteresis", "cross_talk", "gain_spread")
 
 
 @dataclass(frozen=True, slots=True)
 class FrozenPresses:
-    """n sequences of presses and what was read of them.
+    """Readings of n sequences of presses.
 
     Attributes:
-        presses: their counts are what was read, whole and zeroed.
+        presses: their counts are the readings, whole and zeroed.
         gains: (n, 3, rows, cols) of each sequence's sensor.
     """
 
@@ -43,31 +43,31 @@ class FrozenPresses:
         return len(self.presses)
 
     def windows(self, taps: int, *, gains_known: bool = False) -> NDArray[np.float32]:
-        """Windows (n, taps, 3, rows, cols) in zeroed counts, over the sensors' gains where these are known."""
+        """Return windows (n, taps, 3, rows, cols) in zeroed counts, divided by the sensors' gains if `gains_known`."""
         windows = self.presses.with_taps(taps).counts
         return windows / self.gains[:, None] if gains_known else windows
 
     def pads(self, *, known: bool) -> NDArray[np.float32]:
-        """The pads as a network takes them, (n, `pad_draws.KNOWN`): all of each with its gains, or nothing."""
+        """Return the pad inputs of a network, (n, `pad_draws.KNOWN`): all constants and gains, or none."""
         flags = np.full(self.presses.constants.shape, known)
         return known_numbers(self.presses.constants, flags, flags[:, 0])
 
     def pad(self, index: int, *, gains: bool = False) -> Pad:
-        """The pad of a sequence as a sensor file holds it, with its sensor's gains if asked for."""
+        """Return the pad of a sequence as a sensor file holds it, with its sensor's gains if asked for."""
         scaled = self.presses.constants[index].tolist()
         values = {name: c + spread * v for (name, c, spread), v in zip(input_scale(), scaled, strict=True)}
         return Pad(**values, gains=tuple(self.gains[index].ravel().tolist()) if gains else None)
 
     def patterns(self) -> NDArray[np.float32]:
-        """Truth, (n, H, W) in [mm]."""
+        """Return the truth, (n, H, W) in [mm]."""
         return self.presses.patterns.astype(np.float32)
 
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "FrozenPresses":
-        """The sequences of the given indices."""
+        """Return the sequences at the indices."""
         return FrozenPresses(self.presses.pick(index), self.gains[index])
 
     def as_frozen_set(self) -> FrozenSet:
-        """The same as the runtime's evaluation takes it: one frame a tap, nothing known of the pads."""
+        """Return the set in the form of the runtime's evaluation: one frame a tap, without pad inputs."""
         one = self.presses
         depth_mm = one.indentation_mm
         return FrozenSet(
@@ -85,10 +85,10 @@ class FrozenPresses:
 
 
 def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances | None = None) -> FrozenPresses:
-    """Read every sequence once, by a sensor of its own.
+    """Read every sequence once, each with a different sensor.
 
     Gains act after hysteresis and cross-talk and before drift and noise, as in `train.physics.sensor_noise`; here they
-    are drawn apart, so that they are known.
+    are drawn separately, so that they can be returned.
     """
     nuisances = Nuisances() if nuisances is None else nuisances
     before = nuisances.without(*(name for name in NAMES if name not in _BEFORE_GAIN), "gain_spread")
@@ -101,10 +101,10 @@ def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances | None = N
 
 
 def load_frozen_presses(path: Path = WIDE_TEST) -> FrozenPresses:
-    """Read a set that `FrozenPresses.presses.save` has written.
+    """Load a set that `FrozenPresses.presses.save` has written.
 
     Raises:
-        DatasetError: absent, not ours, or damaged.
+        DatasetError: absent, of another format, or damaged.
     """
     presses = load_presses(path)
     return FrozenPresses(presses, _gains(presses.config["read with seed"], presses, presses.config["gain spread"]))
@@ -117,7 +117,7 @@ def _gains(seed: int, presses: PressSet, spread: float) -> NDArray[np.float32]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m train.data.frozen_presses", description=(__doc__ or "").splitlines()[0]
     )

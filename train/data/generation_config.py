@@ -1,4 +1,4 @@
-"""What to generate: surfaces, poses and presses, in chunks that depend on the configuration and their number alone."""
+"""Configuration of a dataset: surfaces, poses and presses, in chunks that depend on it and their number alone."""
 
 import hashlib
 from collections.abc import Iterator
@@ -38,29 +38,29 @@ from train.surfaces.poses import (
 )
 
 SEED: Final = 20240228
-"""Of all that is frozen: the paper's day of publication; never to be changed, or no two figures can be compared."""
+"""Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
 FORCE_N: Final = 9.2
-"""Presses go this far, so that set forces up to 8 N with 15 % of spread lie on them."""
+"""Force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them."""
 _FIGURES_PER_SEED: Final = 1_000_000
 _PADS: Final = {pad.name: pad for pad in PADS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Generation:
-    """All that decides a dataset.
+    """Configuration that determines a dataset.
 
     Attributes:
-        surfaces: names, taken in turn by random poses.
-        poses: the paper's schedule or drawn at random.
+        surfaces: names, used in turn by random poses.
+        poses: the paper's schedule, or poses drawn at random.
         split: positions of the paper's schedule; random poses always keep away from the held-out ones.
         count: sequences with random poses; the paper's schedule has its own number.
         taps: K.
         angle_step_deg: turn between taps.
-        force_n: at which presses end, unless they are as deep as the sensor allows before.
+        force_n: at which presses end, unless they reach the sensor's largest depth before.
         pose_error_mm: of every tap, as in Nuisances; the truth is that of the true pose.
         pose_error_deg: the same of its angle.
         seed: of the poses.
-        chunk: sequences solved in one go.
+        chunk: sequences solved at once.
         pad: name of the sensor model.
     """
 
@@ -101,16 +101,16 @@ class Generation:
 
     @property
     def sequences(self) -> int:
-        """How many there will be."""
+        """Number of sequences."""
         return self.count if self.poses == "random" else len(self._paper_targets())
 
     @property
     def chunks(self) -> int:
-        """How many chunks that makes."""
+        """Number of chunks."""
         return ceil(self.sequences / self.chunk)
 
     def facts(self) -> dict[str, Any]:
-        """The configuration as JSON gives it back, and the world it is tapped in: a file of another one is stale."""
+        """Return the configuration as read from JSON, with the simulator's constants: other files are stale."""
         world = {
             "layer": asdict(Layer()),
             "magnet": asdict(Magnet()),
@@ -125,7 +125,7 @@ class Generation:
         return facts | ({"meshes": meshes} if meshes else {})
 
     def targets(self, chunk: int, rng: np.random.Generator) -> Targets:
-        """The targets of one chunk."""
+        """Return the targets of one chunk."""
         first = chunk * self.chunk
         if self.poses == "random":
             return random_targets(rng, min(self.chunk, self.count - first), self.surfaces, first)
@@ -137,7 +137,7 @@ class Generation:
 
 
 def mesh_sha256(name: str) -> str:
-    """Of a user's file: the same name may stand for another surface tomorrow."""
+    """Return the hash of a user's file, because the content under a name may change."""
     try:
         return hashlib.sha256(Path(name.removeprefix("mesh:")).read_bytes()).hexdigest()
     except OSError as error:
@@ -145,10 +145,10 @@ def mesh_sha256(name: str) -> str:
 
 
 def random_figures(glyphs: int, polygons: int, seed: int) -> tuple[str, ...]:
-    """Names of random figures; those of different seeds have nothing in common.
+    """Return names of random figures; those of different seeds have nothing in common.
 
     Raises:
-        DatasetError: more than a seed has.
+        DatasetError: more than one seed provides.
     """
     if not 0 <= min(glyphs, polygons) <= max(glyphs, polygons) <= _FIGURES_PER_SEED:
         raise DatasetError(f"{glyphs} glyphs and {polygons} polygons: expected 0 to {_FIGURES_PER_SEED} of each")
@@ -161,7 +161,7 @@ def random_figures(glyphs: int, polygons: int, seed: int) -> tuple[str, ...]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch and BLAS use one thread each: a sum that is split over threads ends in other bits."""
+    """Limit torch and BLAS to one thread each: a sum split over threads differs in its last bits."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -173,7 +173,7 @@ def one_thread() -> Iterator[None]:
 
 @one_thread()
 def solve_chunk(config: Generation, chunk: int) -> Sequences:
-    """Tap the sequences of one chunk; the same on every machine of a kind, whatever was solved before or beside it."""
+    """Tap the sequences of one chunk; the result is the same on every machine of a kind, whatever was solved before."""
     rng = np.random.default_rng([config.seed, chunk])
     targets = config.targets(chunk, rng)
     sent = as_poses(turned_back(targets, config.taps, config.angle_step_deg))
@@ -185,7 +185,7 @@ def solve_chunk(config: Generation, chunk: int) -> Sequences:
         solved = _sensor(config.pad).tap(names, poses, config.force_n, newest)
     except TrainError:
         raise
-    except ValueError as error:  # the pad meets nothing at all: a user's mesh is smaller than the poses' reach
+    except ValueError as error:  # nothing under the pad: a user's mesh is smaller than the poses' reach
         raise DatasetError(f"chunk {chunk}: {error}") from error
     shape = (len(targets), config.taps)
     indentation_mm = solved.indentation_mm[newest]
@@ -204,7 +204,7 @@ def solve_chunk(config: Generation, chunk: int) -> Sequences:
 
 
 def solve_all(config: Generation) -> Sequences:
-    """All chunks, one after the other: for small sets that need no file."""
+    """Solve all chunks, one after the other, for small sets that need no file."""
     return join([solve_chunk(config, chunk) for chunk in tracked(range(config.chunks), "solving", "chunk")])
 
 

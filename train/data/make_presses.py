@@ -3,7 +3,7 @@
     python -m train.data.make_presses data/gripped.npz --count 24000
     python -m train.data.make_presses data/parts.npz --mesh part.stl --count 2000
 
-Every pad's presses are solved by one of joblib's workers and written beside the file as they come, in
+Every pad's presses are solved by one of joblib's workers and written next to the file as they are completed, in
 `data/gripped.npz.parts`; at the end they are joined and removed.
 """
 
@@ -31,16 +31,16 @@ _AT_ONCE: Final = 16
 
 
 def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
-    """Solve what a world asks for, and write it; called again after a kill, go on.
+    """Solve the presses of a world, and write them; an interrupted call resumes.
 
     Args:
-        world: what is asked for.
+        world: configuration of the presses.
         path: of the npz.
         jobs: processes, -1 for one on each core.
         compressed: a smaller file, slower to write.
 
     Raises:
-        DatasetError: what lies at `path` or beside it was made otherwise, or cannot be written.
+        DatasetError: the file at `path` or its parts were made otherwise, or cannot be written.
         SurfaceError: nothing of a user's mesh lies under the pad.
         MeshError: a user's mesh cannot be used.
     """
@@ -79,7 +79,7 @@ def _part(folder: Path, number: int) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; 0 when done, 1 on a clear error, 130 when interrupted."""
+    """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
     options = _parser().parse_args(arguments)
     if options.jobs == 0:
         _parser().error("--jobs is 0, expected a number of processes, or -1 for one on each core")

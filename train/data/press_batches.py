@@ -1,4 +1,4 @@
-"""Batches of presses: each window is read by a sensor of its own, of which more or less is known."""
+"""Batches of presses: a different sensor reads each window, with a random part of its constants as network input."""
 
 from dataclasses import replace
 from typing import Final
@@ -16,26 +16,26 @@ from train.physics.sensor_noise import Nuisances, read_windows
 
 _NOTHING: Final = 0.35
 _ALL: Final = 0.35
-"""Shares of windows of whose pads nothing or all is known; of the others each constant is by a toss of a coin."""
+"""Shares of windows with no or all constants of the pad as input; in the others each is drawn with probability .5."""
 _GAINS: Final = 0.45
-"""Share of windows whose sensor's gains are known."""
+"""Share of windows with the sensor's gains as input."""
 _SURE: Final = 0.1
-"""Standard deviation of a known constant, over its spread: what calibration leaves open."""
+"""Standard deviation of a constant used as input, over its spread: error that calibration leaves."""
 _LEFT_GAIN: Final = 0.015
-"""Standard deviation of a gain that is known: what calibration leaves open."""
+"""Standard deviation of a gain used as input: error that calibration leaves."""
 
 
 class PressBatches:
-    """Batches of windows, what is known of their pads, and their truth.
+    """Batches of windows, pad inputs, and truth.
 
     Args:
-        presses: to draw from, some of them of all K taps; windows of one tap are drawn from those of fewer, if there
-            are any: these are many more.
-        given: share of windows with 1, 2, ... K taps given, older ones dropped.
+        presses: some of them with all K taps; windows of one tap are drawn from sequences with fewer taps where these
+            exist, because they are many more.
+        given: share of windows with 1, 2, ... K taps; older taps are dropped.
         batch: windows in a batch.
-        seed: of everything that is drawn.
+        seed: of all draws.
         nuisances: of the sensors.
-        mirror: give mirror images of half of the windows, where K is 1.
+        mirror: mirror half of the windows, where K is 1.
 
     Raises:
         DatasetError: there are no presses of K taps.
@@ -68,7 +68,7 @@ class PressBatches:
         self._nuisances = Nuisances(dead_taxels=0.02) if nuisances is None else nuisances
 
     def __call__(self, number: int) -> Batch:
-        """The batch of a number."""
+        """Return the batch of a number."""
         rng = np.random.default_rng([self._seed, 1, number])
         index = np.concatenate([part(number) for part in self._parts])
         picked = self._presses.pick(index)
@@ -91,7 +91,7 @@ class PressBatches:
             pad=torch.from_numpy(self._known(rng, picked.constants, gains_known)),
             traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
         )
-        if taps > 1 or not self._mirror:  # from tap to tap a mirrored pad is turned the other way
+        if taps > 1 or not self._mirror:  # a mirrored pad would turn the other way from tap to tap
             return batch
         return batch.mirrored(torch.from_numpy(rng.random(len(index)) < 0.5))
 
@@ -107,14 +107,14 @@ class PressBatches:
 
 
 class _Part:
-    """What one part of every batch is drawn from: each row once in each epoch, but for what does not fill a batch."""
+    """Rows for one part of every batch: each row once in each epoch, except for those that do not fill a batch."""
 
     def __init__(self, rows: NDArray[np.int64], count: int, seed: list[int]) -> None:
         self._rows, self._count, self._seed = rows, min(count, len(rows)), seed
         self._epoch, self._order = -1, rows
 
     def __call__(self, number: int) -> NDArray[np.int64]:
-        """Rows of the batch of a number, (count,)."""
+        """Return the rows of the batch of a number, (count,)."""
         epoch, place = divmod(number, len(self._rows) // self._count)
         if epoch != self._epoch:
             self._order = np.random.default_rng([*self._seed, epoch]).permutation(self._rows)
@@ -123,7 +123,7 @@ class _Part:
 
 
 def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[np.float32]:
-    """Windows (n, K, 3, rows, cols) in whole zeroed counts, each read at the end of its presses; absent taps stay 0."""
+    """Return windows (n, K, 3, rows, cols) in whole zeroed counts at the ends of presses; absent taps stay 0."""
     readings = read_windows(presses.counts[:, :, None], 1.0, nuisances, seed, angle_deg=presses.angle_deg)
     absent = ~presses.counts.any(axis=(2, 3, 4))
     readings[absent] = 0

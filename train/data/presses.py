@@ -1,4 +1,4 @@
-"""Presses to learn from and to be evaluated on, each with a pad of its own, as one npz file with a hash."""
+"""Presses to train and evaluate on, with the constants of each pad, as one npz file with a hash."""
 
 import contextlib
 import hashlib
@@ -16,7 +16,7 @@ from train.errors import DatasetError
 
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 2
-"""2: outlines lie where they are, magnets sit more alike."""
+"""Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets."""
 _MOST_FACTS_BYTES: Final = 1 << 22
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "family": ("U", "n"),
@@ -50,7 +50,7 @@ class PressSet:
         force_n: (n, 3).
         twist_nmm: (n,).
         indentation_mm: (n,).
-        config: what they were made with, as JSON gives it back.
+        config: configuration of the presses, as read from JSON.
     """
 
     family: NDArray[np.str_]
@@ -71,21 +71,21 @@ class PressSet:
 
     @property
     def taps(self) -> int:
-        """K."""
+        """Number of presses in a sequence, K."""
         return self.counts.shape[1]
 
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PressSet":
-        """The sequences of the given indices."""
+        """Return the sequences at the indices."""
         return replace(self, **{name: getattr(self, name)[index] for name in _AXES})
 
     def with_taps(self, taps: int) -> "PressSet":
-        """The same with the newest `taps` taps; those that are not there are absent, all zeros."""
+        """Return the sequences with their newest `taps` taps; absent taps are all zeros."""
         more = max(taps - self.taps, 0)
         counts = np.pad(self.counts[:, :taps], [(0, 0), (0, more), (0, 0), (0, 0), (0, 0)])
         return replace(self, counts=counts, angle_deg=np.pad(self.angle_deg[:, :taps], [(0, 0), (0, more)]))
 
     def sha256(self) -> str:
-        """Hash over all that is here, whatever file it lies in."""
+        """Return the hash over all data and the configuration, independent of the file."""
         digest = hashlib.sha256(json.dumps(self.config, sort_keys=True).encode())
         for name in _AXES:
             array = np.ascontiguousarray(getattr(self, name))
@@ -94,7 +94,7 @@ class PressSet:
         return digest.hexdigest()
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
-        """Write as one npz, whole or not at all.
+        """Write the presses as one npz, atomically.
 
         Raises:
             DatasetError: the file cannot be written.
@@ -116,10 +116,10 @@ class PressSet:
 
 
 def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
-    """Read a file that `PressSet.save` has written.
+    """Load a file that `PressSet.save` has written.
 
     Raises:
-        DatasetError: absent, not ours, of a newer schema, incomplete, or damaged.
+        DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
     """
     try:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
@@ -147,10 +147,10 @@ def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
 
 
 def join_presses(parts: Sequence[PressSet]) -> PressSet:
-    """Put sequences one after the other, of as many taps as the longest has; pads keep apart.
+    """Concatenate sequences, padded to the taps of the longest; pads are renumbered, so that they stay distinct.
 
     Raises:
-        DatasetError: there are none.
+        DatasetError: there are no parts.
     """
     if not parts:
         raise DatasetError("no presses to join: name at least one file")

@@ -1,4 +1,4 @@
-"""Real grips, whole and with a taxel hidden, and linear methods that say what it reads."""
+"""Real grips, whole and with a taxel hidden, and linear methods that predict the hidden taxel."""
 
 import os
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deform
 from train.errors import DatasetError
 
 REST_SCANS: Final = 20
-"""At the end of a recording, where one of the grips has been let go."""
+"""Scans at the end of a recording, where one of the grips has been released."""
 _TAXELS: Final = USPA44.taxel_count
 _Z: Final = AXES.index("z")
 
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """One sensor's recording of one trial, as it came.
+    """Raw recording of one sensor in one trial.
 
     Attributes:
         trial: scans of one trial are not independent.
@@ -42,7 +42,7 @@ class ScanSet:
     """Pressed scans of one contact.
 
     Attributes:
-        sensor: whose taxels these are.
+        sensor: name of the sensor.
         trial: scans of one trial are not independent.
         counts: (n, 3, rows, cols) zeroed.
     """
@@ -53,36 +53,36 @@ class ScanSet:
 
 
 def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Readings of z, (n, taxels), of scans (n, 3, rows, cols)."""
+    """Return readings of z, (n, taxels), from scans (n, 3, rows, cols)."""
     return counts[:, _Z].reshape(-1, _TAXELS)
 
 
 def loaded(counts: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Scans (n,) of zeroed counts (n, 3, rows, cols) in which some taxel is pressed."""
+    """Return a mask of scans (n,) from zeroed counts (n, 3, rows, cols) in which some taxel is pressed."""
     return counts[:, _Z].max(axis=(1, 2)) > LOAD_LIMIT_COUNTS
 
 
 def recordings_folder() -> Path:
-    """Where TACTILE_RECORDINGS says, else beside the repository."""
+    """Return the folder in TACTILE_RECORDINGS, or the default one next to the repository."""
     beside = Path(__file__).parents[2] / "../shared/recordings/imanlab"
     return Path(os.environ.get("TACTILE_RECORDINGS", beside))
 
 
 def recording_paths(folder: Path) -> list[Path]:
-    """Recordings in a folder of folders, one for each trial, of `xela_SENSOR.csv`."""
+    """Return the recordings `xela_SENSOR.csv` in a folder with one subfolder for each trial."""
     return sorted(folder.glob("*/xela_*.csv"))
 
 
 def recorded_grips(folder: Path) -> list[Grip]:
-    """Recordings of real sensors, each with its sensor's rest level.
+    """Load the recordings of real sensors, each with its sensor's rest level.
 
-    That is taken from the end of the trial that ends with the least load: where a grip is let go.
+    The rest level is taken from the end of the trial that ends with the least load: there the grip was released.
 
     Args:
         folder: see `recording_paths`.
 
     Raises:
-        DatasetError: no such folder or no recordings in it, or one cannot be read.
+        DatasetError: the folder or recordings in it do not exist, or one cannot be read.
     """
     paths = recording_paths(folder)
     if not paths:
@@ -101,13 +101,13 @@ def recorded_grips(folder: Path) -> list[Grip]:
 
 
 def recorded_sets(folder: Path) -> list[ScanSet]:
-    """Real scans under load, one set for each trial and sensor; scans sent again are left out.
+    """Return real scans under load, one set for each trial and sensor; repeated scans are left out.
 
     Args:
         folder: see `recording_paths`.
 
     Raises:
-        DatasetError: no such folder or no recordings in it, or one cannot be read.
+        DatasetError: the folder or recordings in it do not exist, or one cannot be read.
     """
     sets: list[ScanSet] = []
     for grip in recorded_grips(folder):
@@ -118,14 +118,14 @@ def recorded_sets(folder: Path) -> list[ScanSet]:
 
 
 def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Mean of the taxels over each one's edges, (n, taxels): bilinear in its place, fewer at the rim."""
+    """Return the mean of each taxel's edge neighbours, (n, taxels): bilinear at its place, with fewer at the rim."""
     row, col = np.divmod(np.arange(_TAXELS), USPA44.cols)
     beside = (np.abs(row[:, None] - row) + np.abs(col[:, None] - col)) == 1
     return z @ (beside / beside.sum(axis=0))
 
 
 def linear_from_others(fitted_on: NDArray[np.floating], z: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Each taxel of z (n, taxels) from the others, least squares over the rows of `fitted_on` (m, taxels)."""
+    """Return each taxel of z (n, taxels) from the others, by least squares over the rows of `fitted_on` (m, taxels)."""
     said = np.empty_like(z)
     for taxel in range(_TAXELS):
         others = np.arange(_TAXELS) != taxel
@@ -134,7 +134,7 @@ def linear_from_others(fitted_on: NDArray[np.floating], z: NDArray[np.floating])
 
 
 def from_other_trials(trials: Sequence[str], z: Sequence[NDArray[np.floating]]) -> list[NDArray[np.floating]]:
-    """`linear_from_others` of each set's z (n, taxels), fitted on the sets of all other trials."""
+    """Return `linear_from_others` of each set's z (n, taxels), fitted on the sets of all other trials."""
     return [
         linear_from_others(
             np.concatenate([other for name, other in zip(trials, z, strict=True) if name != trial]), mine

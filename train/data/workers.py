@@ -1,4 +1,4 @@
-"""Joblib's workers, started so that an interruption is the caller's alone."""
+"""Start of joblib's workers with SIGINT blocked, so that an interruption reaches the caller alone."""
 
 import signal
 
@@ -6,9 +6,9 @@ import joblib
 
 
 def start_workers(jobs: int) -> None:
-    """Start joblib's processes with SIGINT blocked: a terminal sends Ctrl-C to them too, and each would complain of it.
+    """Start joblib's processes with SIGINT blocked, because Ctrl-C reaches them too and each would print a traceback.
 
-    Whoever calls joblib next with as many jobs is given them; one that is interrupted ends them.
+    Later calls of joblib with as many jobs use these processes; an interrupted call ends them.
 
     Args:
         jobs: processes, -1 for one on each core.

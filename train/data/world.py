@@ -1,4 +1,4 @@
-"""The world as it is gripped: which pads meet which families of shapes, how deep, and how they are dragged."""
+"""Simulated world of grips: pads, families of shapes, depths and drags."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -19,11 +19,11 @@ from train.surfaces.named_surfaces import surface_mesh
 from train.surfaces.poses import MAX_TAPS
 
 INDENTATION_MM: Final = (0.03, 0.5)
-"""Bounds of the indentation, drawn uniformly; the upper one is what the layer is linear to."""
+"""Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
 LEAST_FORCE_N: Final = 0.1
-"""Presses below are left out: about twice what is told from noise as a contact."""
+"""Least force of a press that is kept: about twice the force at which a contact is detected above the noise."""
 _STILL: Final = 0.35
-"""Share of presses without any drag; of the others half are twisted as well."""
+"""Share of presses without any drag; half of the others are twisted as well."""
 _SLIDE_MM: Final = (0.02, 0.6)
 _TWIST_RAD: Final = 0.03
 _FRICTION: Final = (0.2, 1.2)
@@ -32,15 +32,15 @@ _FRICTION: Final = (0.2, 1.2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """All that decides a set of presses.
+    """Configuration that determines a set of presses.
 
     Attributes:
-        count: sequences drawn; those of less than LEAST_FORCE_N, and those beside the pattern, are left out.
-        taps: presses in each, the pad turned by a step from one to the next.
+        count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out.
+        taps: presses in each sequence, with the pad turned by a step from one to the next.
         per_pad: sequences of one pad.
         families: relative frequency of each family.
         spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
-        seed: of everything.
+        seed: of all draws.
     """
 
     count: int = 24_000
@@ -69,15 +69,15 @@ class World:
                 raise DatasetError(f"frequency of {name} is {share}, expected more than 0")
         for name in self.families:
             if name.startswith("mesh:"):
-                surface_mesh(name)  # before any work: the likeliest to fail
+                surface_mesh(name)  # checked before any work, because meshes fail most often
 
     @property
     def chunks(self) -> int:
-        """Pads, one a chunk."""
+        """Number of chunks, each with one pad."""
         return ceil(self.count / self.per_pad)
 
     def facts(self) -> dict[str, Any]:
-        """The configuration as JSON gives it back, with the ranges that pads are drawn from and the meshes' hashes."""
+        """Return the configuration as read from JSON, with the ranges of the pads' constants and the meshes' hashes."""
         ranges = {name: list(bounds) for name, bounds in RANGES.items()}
         facts = asdict(self) | {
             "families": dict(self.families),
@@ -91,13 +91,13 @@ class World:
 
 @one_thread()
 def solve_pad(world: World, number: int) -> PressSet:
-    """All sequences of one pad; the same whatever was solved before or beside it."""
+    """Solve all sequences of one pad; the result does not depend on other pads."""
     rng = np.random.default_rng([world.seed, number])
     pad = draw_pad(rng, world.spread) if world.spread else Pad()
     gripped = GrippedPad(pad)
     count = min(world.per_pad, world.count - number * world.per_pad)
     shares = np.array(list(world.families.values()), dtype=float)
-    # Families come round in turn over the pads, so that a small set has all of them.
+    # Families alternate over the pads, so that a small set has all of them.
     order = np.random.default_rng([world.seed, 0, 1]).permutation(world.count)[number * world.per_pad :][:count]
     at = (order + 0.5) / world.count
     family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
@@ -112,7 +112,7 @@ def solve_pad(world: World, number: int) -> PressSet:
 def press_shapes(
     rng: np.random.Generator, gripped: GrippedPad, family: NDArray[np.str_], tapped: list[Tapped], number: int
 ) -> PressSet:
-    """Press shapes onto a pad of that number, with drawn depths, drags and friction; light presses stay."""
+    """Press shapes onto pad `number` with drawn depths, drags and friction; light presses are kept."""
     n, taps = len(tapped), len(tapped[0].heights_mm)
     depth_mm = np.repeat(rng.uniform(*INDENTATION_MM, n), taps)
     depth_mm[np.arange(n * taps) % taps > 0] *= rng.uniform(0.85, 1.15, n * (taps - 1))  # ends of taps differ

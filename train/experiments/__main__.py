@@ -45,7 +45,7 @@ _PAPER: Final = {
     *("table3", "table4", "fig5", "fig7", "angle", "taps", "bound", "trained_out"),
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
-"""Those in train.experiments.paper; the others are in train.experiments.sensor."""
+"""Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
 _FILES: Final = {"identify": "gains_from_contacts"}
 """File names that differ from the experiment's: train.identify is the command of a user's own sensor."""
 
@@ -57,7 +57,7 @@ def module_of(name: str) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the experiments named on the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m train.experiments",
         description=(__doc__ or "").splitlines()[0],

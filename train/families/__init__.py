@@ -1,1 +1,1 @@
-"""Families of shapes that a gripper's pad meets, each drawn at random."""
+"""Families of shapes that a gripper's pad presses on, each drawn at random."""

@@ -1,4 +1,4 @@
-"""All families by name, how often each is met, and one shape of a family under the pad."""
+"""All families of shapes by name, their frequencies, and the drawing of one shape under the pad."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ SHARES: Final[Mapping[str, float]] = {
 """Relative frequency of each family in training."""
 
 _LEVEL: Final = 0.3
-"""Share of shapes that lie level; the others are tilted by up to three degrees, most of them by less than one."""
+"""Share of shapes that lie level; the others tilt by up to three degrees, most of them by less than one."""
 _REACH_MM: Final = 6.0
 _FIGURE_SLOPE: Final = float(np.tan(np.radians(0.5)))
 _FIGURES_PER_SEED: Final = 1_000_000
@@ -63,8 +63,8 @@ class Tapped:
 
     Attributes:
         heights_mm: (K, m, m) at the pad's places, newest tap first.
-        cover: what gives way beside the pad.
-        angle_deg: (K,), the pad's turn in each tap.
+        cover: compliant cover of the shape or the pad.
+        angle_deg: (K,), turn of the pad in each tap.
     """
 
     heights_mm: NDArray[np.float32]
@@ -75,14 +75,14 @@ class Tapped:
 def draw_shape(
     rng: np.random.Generator, family: str, pad: GrippedPad, taps: int, pose_error: tuple[float, float]
 ) -> Tapped:
-    """One shape of a family, tapped from poses that are a step of the paper's schedule apart.
+    """Draw one shape of a family, tapped from poses that are one step of the paper's schedule apart.
 
     Args:
         rng: draws the shape and where it lies.
         family: a key of SHARES, or `mesh:PATH`, a user's surface.
-        pad: that taps.
-        taps: K.
-        pose_error: standard deviations of where a tap lands, in [mm] and [deg].
+        pad: the pad that taps.
+        taps: number of taps, K.
+        pose_error: standard deviations of a tap's place, in [mm], and angle, in [deg].
 
     Raises:
         SurfaceError: nothing of a user's mesh lies under the pad.
@@ -122,7 +122,7 @@ def _another(rng: np.random.Generator) -> str:
 
 
 def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
-    """Where a shape lies; the second of two on the other side of the pad, at nearly the same height."""
+    """Draw the place of a shape; the second of two lies on the pad's other side, at nearly the same height."""
     reach = _REACH_MM
     x_mm, y_mm = rng.uniform(-reach, reach, 2)
     if family == "two":
@@ -137,7 +137,7 @@ def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
 
 
 def _turned(lie: Lie, turn_deg: float, x_mm: float, y_mm: float) -> Lie:
-    """The same shape seen by a pad that was turned about its centre and then moved.
+    """Return the shape's place as a pad sees it that was turned about its centre and then moved.
 
     In the pad's axes, x to the right and y down, a shape turns as the pad does seen from above
     (train.surfaces.depth_image.Pose).

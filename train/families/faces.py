@@ -9,12 +9,12 @@ SLOPE = float(np.tan(np.radians(3.0)))
 
 
 def flat(rng: np.random.Generator) -> Height:
-    """A face larger than the pad."""
+    """Return a face larger than the pad."""
     return lambda x, y: np.zeros_like(x)
 
 
 def block(rng: np.random.Generator) -> Height:
-    """A rectangle of 3 to 40 mm with rounded corners."""
+    """Draw a rectangle of 3 to 40 mm with rounded corners."""
     wide, long = log_uniform(rng, 3, 40) / 2, log_uniform(rng, 3, 40) / 2
     corner = rng.uniform(0, 0.5) * min(wide, long)
 
@@ -26,7 +26,7 @@ def block(rng: np.random.Generator) -> Height:
 
 
 def edge(rng: np.random.Generator) -> Height:
-    """A half plane; half of the edges are rounded."""
+    """Draw a half plane; half of the edges are rounded."""
     radius = float(rng.choice([0.0, log_uniform(rng, 0.3, 5.0)]))
 
     def height(x: Lengths, y: Lengths) -> Lengths:
@@ -39,7 +39,7 @@ def edge(rng: np.random.Generator) -> Height:
 
 
 def corner(rng: np.random.Generator) -> Height:
-    """A corner of 50 to 150 degrees, convex or cut out."""
+    """Draw a corner of 50 to 150 degrees, convex or cut out."""
     half, cut = np.radians(rng.uniform(50, 150)) / 2, rng.random() < 0.3
 
     def height(x: Lengths, y: Lengths) -> Lengths:
@@ -50,7 +50,7 @@ def corner(rng: np.random.Generator) -> Height:
 
 
 def slot(rng: np.random.Generator) -> Height:
-    """A face with one or two parallel slots of 1 to 8 mm."""
+    """Draw a face with one or two parallel slots of 1 to 8 mm."""
     width, depth = log_uniform(rng, 1, 8), log_uniform(rng, 0.1, 5)
     second = rng.uniform(4, 12) if rng.random() < 0.4 else 1e3
 
@@ -62,6 +62,6 @@ def slot(rng: np.random.Generator) -> Height:
 
 
 def step(rng: np.random.Generator) -> Height:
-    """Two faces side by side, one .05 to .5 mm lower."""
+    """Draw two faces side by side, one .05 to .5 mm lower."""
     drop = log_uniform(rng, 0.05, 0.5)
     return lambda x, y: np.where(x > 0, np.float32(-drop), np.float32(0))

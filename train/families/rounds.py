@@ -6,25 +6,25 @@ from train.families.shape import Height, Lengths, log_uniform, where
 
 
 def dome(rng: np.random.Generator) -> Height:
-    """A sphere of 3 to 300 mm radius."""
+    """Draw a sphere of 3 to 300 mm radius."""
     radius = log_uniform(rng, 3, 300)
     return lambda x, y: _fall(np.hypot(x, y), radius)
 
 
 def cylinder(rng: np.random.Generator) -> Height:
-    """A lying cylinder of 2 to 300 mm radius, some with an end."""
+    """Draw a lying cylinder of 2 to 300 mm radius, some with an end."""
     radius, end = log_uniform(rng, 2, 300), rng.uniform(0, 9) if rng.random() < 0.3 else 1e3
     return lambda x, y: where(y < end, _fall(x, radius))
 
 
 def cone(rng: np.random.Generator) -> Height:
-    """A cone of 2 to 45 degrees slope with a blunt tip."""
+    """Draw a cone of 2 to 45 degrees slope with a blunt tip."""
     slope, blunt = np.tan(np.radians(log_uniform(rng, 2, 45))), log_uniform(rng, 0.3, 3)
     return lambda x, y: (-slope * (np.sqrt(x * x + y * y + blunt**2) - blunt)).astype(np.float32)
 
 
 def ridge(rng: np.random.Generator) -> Height:
-    """A roof of 2 to 45 degrees on either side with a blunt top, some with an end."""
+    """Draw a roof of 2 to 45 degrees on either side with a blunt top, some with an end."""
     left, right = (np.tan(np.radians(log_uniform(rng, 2, 45))) for _ in range(2))
     blunt, end = log_uniform(rng, 0.1, 2), rng.uniform(0, 9) if rng.random() < 0.3 else 1e3
 
@@ -36,7 +36,7 @@ def ridge(rng: np.random.Generator) -> Height:
 
 
 def wire(rng: np.random.Generator) -> Height:
-    """A straight or bent wire of .3 to 2 mm radius on a plate."""
+    """Draw a straight or bent wire of .3 to 2 mm radius on a plate."""
     radius, bend = log_uniform(rng, 0.3, 2), rng.uniform(-0.06, 0.06) * (rng.random() < 0.5)
 
     def height(x: Lengths, y: Lengths) -> Lengths:
@@ -48,13 +48,13 @@ def wire(rng: np.random.Generator) -> Height:
 
 
 def saddle(rng: np.random.Generator) -> Height:
-    """A saddle or a bowl: two curvatures of their own sign, radii 8 to 300 mm."""
+    """Draw a saddle or a bowl: two curvatures with independent signs, radii 8 to 300 mm."""
     across, along = log_uniform(rng, 8, 300), log_uniform(rng, 8, 300) * rng.choice([-1, 1])
     return lambda x, y: (-x * x / (2 * across) + y * y / (2 * along)).astype(np.float32)
 
 
 def relief(rng: np.random.Generator) -> Height:
-    """A smooth random surface with waves of 4 to 20 mm and .05 to .6 mm RMS."""
+    """Draw a smooth random surface with waves of 4 to 20 mm and .05 to .6 mm RMS."""
     shortest, rms = log_uniform(rng, 4, 14), log_uniform(rng, 0.05, 0.6)
     waves = 24
     q = 2 * np.pi / rng.uniform(shortest, 2 * shortest, waves)
@@ -75,7 +75,7 @@ def relief(rng: np.random.Generator) -> Height:
 
 
 def grating(rng: np.random.Generator) -> Height:
-    """Bars or waves with a period of 2.5 to 14 mm, a few of them or as many as fit."""
+    """Draw bars or waves with a period of 2.5 to 14 mm."""
     period, duty, depth = log_uniform(rng, 2.5, 14), rng.uniform(0.3, 0.7), log_uniform(rng, 0.1, 2)
     phase, wavy = rng.uniform(0, 1), rng.random() < 0.4
 
@@ -89,6 +89,6 @@ def grating(rng: np.random.Generator) -> Height:
 
 
 def _fall(distance: Lengths, radius: float) -> Lengths:
-    """How far a circle lies below its top at a distance from it; a straight wall below its equator."""
+    """Return the height of a circle below its top at a distance from it; a straight wall below its equator."""
     square = radius**2 - distance**2
     return where(square > 0, np.sqrt(np.maximum(square, 0)) - radius)

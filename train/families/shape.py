@@ -1,4 +1,4 @@
-"""A shape under the pad: its height at any place, and how it lies there."""
+"""Shape under the pad: its height at any place, and its position under the pad."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Lengths = NDArray[np.float32]
 """Lengths at places on a grid, in [mm]."""
 Height = Callable[[Lengths, Lengths], Lengths]
-"""Height in [mm] at x and y in [mm], NOWHERE_MM off the shape; higher parts meet the pad first."""
+"""Height in [mm] at x and y in [mm], NOWHERE_MM off the shape; higher parts touch the pad first."""
 
 NOWHERE_MM: Final = -1e3
 """Height where there is no shape, out of any press's reach."""
@@ -18,11 +18,11 @@ NOWHERE_MM: Final = -1e3
 
 @dataclass(frozen=True, slots=True)
 class Lie:
-    """How a shape lies under the pad.
+    """Position, turn and tilt of a shape under the pad.
 
     Attributes:
-        x_mm: of the shape's origin, to the right of the pad's centre.
-        y_mm: of the shape's origin, below the pad's centre, down the rows.
+        x_mm: place of the shape's origin, to the right of the pad's centre.
+        y_mm: place of the shape's origin, below the pad's centre, down the rows.
         angle_deg: turn of the shape.
         slope_x: rise of the shape along the pad's x, in [mm/mm].
         slope_y: rise of the shape along the pad's y, in [mm/mm].
@@ -35,7 +35,7 @@ class Lie:
     slope_y: float = 0.0
 
     def seen(self, height: Height, x_mm: Lengths, y_mm: Lengths) -> Lengths:
-        """Return the heights of a shape that lies so, at places on the pad."""
+        """Return the heights of the shape, placed like this, at places on the pad."""
         turn = np.radians(self.angle_deg)
         cosine, sine = np.float32(np.cos(turn)), np.float32(np.sin(turn))
         right, down = x_mm - np.float32(self.x_mm), y_mm - np.float32(self.y_mm)
@@ -47,15 +47,15 @@ class Lie:
 
 
 def where(inside: NDArray[np.bool_], height: NDArray[np.floating] | float) -> Lengths:
-    """Heights where a shape is, NOWHERE_MM elsewhere."""
+    """Return the height inside a shape, NOWHERE_MM elsewhere."""
     return np.where(inside, height, np.float32(NOWHERE_MM)).astype(np.float32, copy=False)
 
 
 def raised(inside: NDArray[np.bool_], height_mm: float) -> Lengths:
-    """A figure raised by `height_mm` from a plate at height 0."""
+    """Return a figure raised by `height_mm` from a plate at height 0."""
     return np.where(inside, np.float32(height_mm), np.float32(0))
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """A number drawn so that its logarithm is uniform."""
+    """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))

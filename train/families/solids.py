@@ -1,4 +1,4 @@
-"""Everyday solids, as the pad meets them: coins, nuts, screws, buttons, keys, caps, studs and the like."""
+"""Everyday solids under the pad: coins, nuts, screws, buttons, keys, caps, studs and the like."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from train.families.shape import Height, Lengths, log_uniform, raised, where
 
 
 def solid(rng: np.random.Generator) -> Height:
-    """One of the solids, of a size of its own."""
+    """Draw one of the solids with random dimensions."""
     return _SOLIDS[int(rng.integers(len(_SOLIDS)))](rng)
 
 
@@ -148,7 +148,7 @@ def _plug(rng: np.random.Generator) -> Height:
 
 
 def _polygon_distance(x: Lengths, y: Lengths, sides: int) -> Lengths:
-    """Distance from the centre to the side of a regular polygon through each place."""
+    """Return the distance from the centre to the side of a regular polygon through each place."""
     sector = 2 * np.pi / sides
     turn = np.arctan2(y, x)
     return np.hypot(x, y) * np.cos(turn - sector * np.round(turn / sector))

@@ -1,4 +1,4 @@
-"""One network from its data to its checkpoint: NAME.pt (weights) beside NAME.json (configuration and figures)."""
+"""Training of one network from its data to its checkpoint: NAME.pt (weights) with NAME.json (settings, figures)."""
 
 import hashlib
 import json
@@ -44,15 +44,15 @@ _INFERRED_AT_ONCE: Final = 128
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """All that decides the weights of a network.
+    """Configuration that determines the weights of a network.
 
     Attributes:
         name: of the checkpoint.
         network: a name of train.networks.registry.
-        recipe: how it is trained.
+        recipe: hyperparameters of the training.
         scale: pattern pixels per taxel pitch.
         start: checkpoint whose weights it starts from, or None.
-        draw: how windows are drawn.
+        draw: settings by which windows are drawn.
         seed: of weights and draws.
         options: further arguments of the network's class.
     """
@@ -67,22 +67,22 @@ class Training:
     options: dict[str, Any] = field(default_factory=dict)
 
     def sha256(self, data_sha256: str) -> str:
-        """Hash of the configuration and the data, as written in the models' contract."""
+        """Return the hash of the configuration and the data, as written in the models' contract."""
         config = asdict(self)
         if self.draw.figure_share is None:
-            del config["draw"]["figure_share"]  # what was trained before there was a choice keeps its name
+            del config["draw"]["figure_share"]  # keeps the hash of networks that were trained before the option existed
         return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
 
 
 def fit_network(training: Training, data: Sequences | PressSet, validation: FrozenSet, folder: Path) -> dict[str, Any]:
-    """Train, calibrate, judge and write one network; returns what its NAME.json holds.
+    """Train, calibrate, evaluate and write one network, and return the content of its NAME.json.
 
-    A checkpoint that is there already, trained alike, is left as it is.
+    A checkpoint of the same training that already exists is left as it is.
 
     Args:
-        training: what to train.
-        data: sequences, some of them of as many taps as it takes.
-        validation: what contact level and deviations are set on.
+        training: configuration of the training.
+        data: sequences, some of which have as many taps as the network takes.
+        validation: set by which contact level and deviations are calibrated.
         folder: of the checkpoints.
 
     Raises:
@@ -133,7 +133,7 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
         **_judged(net, validation),
     }
     if rank == 0:
-        # The report last: what it says is true of the weights beside it.
+        # The report is written last, so that it never describes weights that do not exist.
         weights, text = net.state_dict(), json.dumps(report, indent=1) + "\n"
         write_in_place(
             path, lambda draft: torch.save(weights, draft), lambda draft: torch.load(draft, weights_only=True)
@@ -147,10 +147,10 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
 def batches_of(
     data: Sequences | PressSet, scale: int, recipe: Recipe, seed: int, draw: Draw | None = None
 ) -> Callable[[int], Batch]:
-    """Batches of a recipe; of presses those sequences alone that have all taps.
+    """Return batches for a recipe; of presses, only the sequences that have all taps.
 
     Raises:
-        DatasetError: there are no sequences of as many taps, or presses are asked for at another scale than theirs.
+        DatasetError: no sequence has as many taps, or the scale is not that of the presses.
     """
     if isinstance(data, Sequences):
         return WindowBatches(data.at_scale(scale), draw or Draw(), recipe.given, recipe.batch, seed)
@@ -160,7 +160,7 @@ def batches_of(
 
 
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
-    """The network of NAME.pt in evaluation mode, and NAME.json beside it.
+    """Load the network of NAME.pt in evaluation mode, with its report from NAME.json.
 
     Raises:
         CheckpointError: a file is missing, or the weights do not fit the configuration.
@@ -176,7 +176,7 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
 
 
 def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) in zeroed counts, and deviations where there are."""
+    """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) in zeroed counts, and deviations or None."""
     outputs = infer_all(net, windows)
     return outputs[0], outputs[1] if len(outputs) > 1 else None
 
@@ -184,7 +184,7 @@ def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.flo
 def infer_all(
     net: PatternNet, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
 ) -> list[NDArray[np.float32]]:
-    """All that a network gives of windows (n, K, 3, rows, cols) in zeroed counts, and of what is known of the pads."""
+    """Return all outputs of a network for windows (n, K, 3, rows, cols) in zeroed counts and the pads' inputs."""
     device = next(net.parameters()).device
     parts = torch.split(network_input(windows), _INFERRED_AT_ONCE)
     known = [()] * len(parts) if pads is None else [(pad,) for pad in torch.from_numpy(pads).split(_INFERRED_AT_ONCE)]
@@ -197,7 +197,7 @@ def infer_all(
 
 
 def best_contact_level(patterns: NDArray[np.float32], touching: NDArray[np.bool_]) -> float:
-    """Share of a pattern's maximum whose outline overlaps the true contact best."""
+    """Return the share of a pattern's maximum whose outline overlaps the true contact best."""
     overlap = [contact_iou(patterns, touching, level).mean() for level in _CONTACT_LEVELS]
     return _CONTACT_LEVELS[int(np.argmax(overlap))]
 
@@ -228,7 +228,7 @@ def _psnr(net: PatternNet, validation: FrozenSet) -> float:
 
 
 def _judged(net: PatternNet, validation: FrozenSet) -> Mapping[str, float]:
-    """Figures on the validation set; sets the factor of the deviations."""
+    """Return figures on the validation set, and set the factor of the deviations."""
     patterns, deviations = infer(net, validation.windows(net.taps))
     truth, full_scale = validation.patterns(), validation.full_scale_mm
     figures = {

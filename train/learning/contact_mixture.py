@@ -1,4 +1,4 @@
-"""What any pad may read in a contact: a mixture of Gaussians, each linear in the pad's constants.
+"""Distribution of a contact's readings on any pad: a mixture of Gaussians, each linear in the pad's constants.
 
 A contact's 48 readings over the root mean square of its z do not depend on its force. Within a component they are
 normal about a mean that is linear in the constants that networks take (`pad_draws.INPUTS`, over their spread).
@@ -21,7 +21,7 @@ from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, read_windows
 CHANNELS: Final = len(AXES) * USPA44.taxel_count
 Z: Final = slice(AXES.index("z") * USPA44.taxel_count, (AXES.index("z") + 1) * USPA44.taxel_count)
 LEAST_COUNTS: Final = 200.0
-"""Largest z of the weakest contact that is used: below, drift is a fifth of it."""
+"""Largest z of the weakest contact used: in weaker ones, drift is over a fifth of it."""
 _COMPONENTS: Final = 72
 _ROUNDS: Final = 12
 _RIDGE: Final = 1e-4
@@ -31,11 +31,11 @@ _MOST_BYTES: Final = 1 << 26
 
 @dataclass(frozen=True, slots=True)
 class ContactMixture:
-    """Density of normalised contacts, given the pad's constants.
+    """Density of normalised contacts as a function of the pad's constants.
 
     Attributes:
         share: (k,) of the components.
-        means: (k, 1 + p, channels), the mean of a middle pad, then what one spread of each constant adds.
+        means: (k, 1 + p, channels), the mean on a middle pad, then the change by one spread of each constant.
         covariances: (k, channels, channels).
     """
 
@@ -44,13 +44,13 @@ class ContactMixture:
     covariances: NDArray[np.float64]
 
     def centres(self, constants: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Means (k, channels) on a pad of these constants, (p,) over their spread."""
+        """Return the means (k, channels) on a pad of these constants, (p,) over their spread."""
         return np.append(1.0, constants) @ self.means
 
     def responsibilities(
         self, contacts: NDArray[np.floating], constants: NDArray[np.floating], channels: NDArray[np.integer]
     ) -> NDArray[np.float64]:
-        """How likely each contact (n, channels) is of each component, (n, k), by some of the channels."""
+        """Return the probabilities (n, k) of the components for contacts (n, channels), from some of the channels."""
         found = np.empty((len(contacts), len(self.share)))
         for number, (centre, covariance) in enumerate(zip(self.centres(constants), self.covariances, strict=True)):
             away = contacts[:, channels] - centre[channels]
@@ -60,7 +60,7 @@ class ContactMixture:
     def hidden_z(
         self, contacts: NDArray[np.floating], constants: NDArray[np.floating], taxel: int
     ) -> NDArray[np.float64]:
-        """Expected z of one taxel (n,) from the readings of the others; its own are not looked at."""
+        """Return the expected z of one taxel (n,) from the other taxels; its own readings are ignored."""
         of_taxel = np.arange(taxel, CHANNELS, USPA44.taxel_count)
         others = np.setdiff1d(np.arange(CHANNELS), of_taxel)
         weights = self.responsibilities(contacts, constants, others)
@@ -72,12 +72,12 @@ class ContactMixture:
         return (weights * expected).sum(axis=1)
 
     def save(self, path: Path) -> None:
-        """Write as one npz."""
+        """Write the mixture as one npz."""
         np.savez(path, allow_pickle=False, **{part.name: getattr(self, part.name) for part in fields(self)})
 
 
 def load_mixture(path: Path) -> ContactMixture:
-    """Read what `ContactMixture.save` has written.
+    """Load a mixture that `ContactMixture.save` has written.
 
     Raises:
         DatasetError: absent, damaged, or of other constants.
@@ -93,7 +93,10 @@ def load_mixture(path: Path) -> ContactMixture:
 
 
 def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Scans (n, 3, rows, cols) as contacts (n, channels) over the RMS of z; and which are strong and not clipped."""
+    """Return scans (n, 3, rows, cols) as contacts (n, channels) over the RMS of z, and a mask of the usable ones.
+
+    Usable contacts are strong enough and not clipped.
+    """
     flat = counts.reshape(len(counts), -1).astype(np.float64)
     peaks = np.abs(counts).max(axis=(2, 3))
     usable = (counts[:, AXES.index("z")].max(axis=(1, 2)) > LEAST_COUNTS) & (peaks < LARGEST_COUNTS).all(axis=1)
@@ -104,13 +107,13 @@ def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
 def fit_mixture(
     presses: PressSet, seed: int = 0, components: int = _COMPONENTS, rounds: int = _ROUNDS
 ) -> ContactMixture:
-    """Fit by expectation-maximisation to presses, as sensors of even gains read them.
+    """Fit the mixture by expectation-maximisation to presses read by sensors with even gains.
 
     Args:
-        presses: of many pads; of each sequence the newest press is used.
-        seed: of the nuisances and of where components begin.
-        components: at most this many; one for twice as many presses as there are channels.
-        rounds: of expectation-maximisation.
+        presses: of many pads; the newest press of each sequence is used.
+        seed: of the nuisances and of the components' initial centres.
+        components: largest number; one is used for every two presses per channel.
+        rounds: number of expectation-maximisation rounds.
 
     Raises:
         DatasetError: too few presses for one component.
@@ -131,7 +134,7 @@ def fit_mixture(
 def _nearest(
     contacts: NDArray[np.float64], rng: np.random.Generator, components: int, rounds: int
 ) -> NDArray[np.float64]:
-    """Weights (n, k), each 0 or 1, of k means."""
+    """Return weights (n, k), each 0 or 1, of k means."""
     weights = np.zeros((len(contacts), components))
     centres = contacts[rng.choice(len(contacts), components, replace=False)]
     for _ in range(rounds):
@@ -142,7 +145,7 @@ def _nearest(
 
 
 def _fitted(contacts: NDArray[np.float64], design: NDArray[np.float64], weights: NDArray[np.float64]) -> ContactMixture:
-    """Components by weighted least squares; those of few presses lean on the covariance of all."""
+    """Fit components by weighted least squares; those of few presses are regularised by the covariance of all."""
     pooled = np.cov(contacts.T)
     means, covariances = [], []
     for weight in weights.T:
@@ -168,7 +171,7 @@ def _given_constants(
 
 
 def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Log density (n,) of deviations (n, d), but for a constant."""
+    """Return the log density (n,) of deviations (n, d), up to a constant."""
     lower = np.linalg.cholesky(covariance)
     white = np.linalg.solve(lower, away.T)
     return -0.5 * (white**2).sum(axis=0) - np.log(np.diag(lower)).sum()

@@ -1,4 +1,4 @@
-"""What a network's deviations tell of its error (edge.inference.expected_error), found on taps not trained on."""
+"""Table from a network's deviations to its error (edge.inference.expected_error), fitted on taps not trained on."""
 
 from collections.abc import Collection
 from typing import Final
@@ -17,18 +17,18 @@ from train.physics.sensor_noise import Nuisances
 
 BINS: Final = 10
 _SET_FORCES_N: Final = (5.0, 2.0, 1.0)
-"""Of the taps: as on the frozen test set, and lighter ones, which say less."""
+"""Set forces of the taps, in [N]: as on the frozen test set, and lighter ones, which carry less information."""
 
 
 def confidence_sets(validation: Sequences, scale: int) -> list[FrozenSet]:
-    """The sets that confidence is found on, at a network's scale, of flat sequences that it was not trained on."""
+    """Return the sets to fit confidence on, at a network's scale, from flat sequences that it was not trained on."""
     return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in _SET_FORCES_N]
 
 
 def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
-    """The table of edge.inference.expected_error for a model with deviations.
+    """Fit the table of edge.inference.expected_error for a model with deviations.
 
-    Frames are sorted by their doubt into bins of equally many; a bin's gain is that of its frames together.
+    Frames are sorted by their uncertainty into bins of equally many; a bin's gain is that of its frames together.
 
     Raises:
         ValueError: the model gives no deviation.
@@ -40,11 +40,11 @@ def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[
     ]
     found = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
     rows = {str(given): _row(found[given - 1 : given + 1]) for given in range(1, taps + 1)}
-    return {given: row for given, row in rows.items() if row["doubt"]}  # none where no pattern is more than zero
+    return {given: row for given, row in rows.items() if row["doubt"]}  # empty if no pattern exceeds zero
 
 
 def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np.float64]:
-    """Doubt, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
+    """Return uncertainty, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
 
     Raises:
         ValueError: the model gives no deviation.
@@ -60,7 +60,7 @@ def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np
 
 
 def _rising(bins: list[NDArray[np.intp]], about: NDArray[np.float64]) -> list[NDArray[np.intp]]:
-    """Bins of which each lies above the one before, as far as four digits tell; others are joined."""
+    """Join bins until each lies above the one before in its first four digits."""
     joined: list[NDArray[np.intp]] = []
     for part in bins:
         if joined and float(f"{about[part].mean():.4g}") <= float(f"{about[joined[-1]].mean():.4g}"):
@@ -72,7 +72,7 @@ def _rising(bins: list[NDArray[np.intp]], about: NDArray[np.float64]) -> list[ND
 
 def _row(found: list[NDArray[np.float64]]) -> dict[str, list[float]]:
     about, error, size = found[0]
-    seen = size > 0  # a pattern of nothing has no doubt of its own size
+    seen = size > 0  # a pattern of zeros has no uncertainty relative to its size
     about, share = about[seen], error[seen] / size[seen]
     bins = _rising([part for part in np.array_split(np.argsort(about), BINS) if part.size], about)
     row = {

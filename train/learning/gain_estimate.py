@@ -1,9 +1,9 @@
-"""A sensor's gains and its pad's constants from its own contacts: the most likely ones, with intervals.
+"""Most likely gains of a sensor and constants of its pad from its own contacts, with intervals.
 
-Readings are gains times what a contact of the simulated world reads (`contact_mixture`). A place's strength is its
-chip's gain on each axis times what its magnet's seat and moment do to all three. Contacts of one pad share more than
-the mixture knows (its unevenness, its pitch), so what n of them say counts as n / (1 + n / INDEPENDENT) of them.
-The maximum is found by Fisher scoring within expectation-maximisation; the information there gives the intervals.
+Readings are gains times the readings of the simulated world (`contact_mixture`). A place's strength is its chip's gain
+on each axis times the common effect of its magnet's seat and moment on all three. Contacts of one pad share more than
+the mixture models (its unevenness, its pitch), so the information of n of them counts as n / (1 + n / INDEPENDENT).
+The maximum is computed by Fisher scoring within expectation-maximisation; the information there gives the intervals.
 """
 
 from dataclasses import dataclass
@@ -19,35 +19,35 @@ from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
 PLACE_SPREAD: Final = 0.08
-"""Standard deviation of a place's log-strength by its magnet's seat and moment: .06 to .11 on drawn pads."""
+"""Standard deviation of a place's log-strength from its magnet's seat and moment: .06 to .11 on drawn pads."""
 CONSTANT_SPREAD: Final = 1 / np.sqrt(3)
-"""Standard deviation of a constant over its spread before any contact: uniform within its range."""
+"""Prior deviation of a constant over its spread: uniform within its range."""
 INDEPENDENT: Final = 50.0
-"""How many contacts' worth of information endless contacts of one pad have: set on simulated pads, where 10 and 250
-leave larger errors of gains."""
+"""Information of endless contacts of one pad, in contacts. Set on simulated pads; 10 and 250 are less accurate."""
 _FREEDOM: Final = 5.0
 """Degrees of freedom of Student's t, which weighs down contacts that no component explains."""
 _WIDENING: Final = np.repeat([2.3, 1.85], [CHANNELS, len(INPUTS)])
-"""Factors on deviations, so that 90 % intervals hold nine in ten true gains, and values of each constant that is
-told, on 20 simulated pads of 200 contacts."""
+"""Factors by which 90 % intervals hold nine in ten true values, on 20 simulated pads of 200 contacts each."""
 _LEVEL_90: Final = 1.645
 """Half width of a normal 90 % interval, in deviations."""
 _TOLD: Final = 0.7
-"""Largest deviation of a constant that is told, over that of its prior."""
+"""Largest deviation of a constant that counts as determined, over that of its prior."""
 _ROUNDS: Final = 20
 _STEP: Final = 0.2
 _DONE: Final = 1e-3
 _EVEN: Final = 1e-3
-"""Standard deviation to which each axis' mean log-gain is held: z's is the part of counts_per_newton, and what x and y
-have more than z cannot be told from the in-plane share."""
+"""Standard deviation to which each axis' mean log-gain is held.
+
+The mean of z is part of counts_per_newton, and the excess of x and y cannot be separated from the in-plane share.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What contacts tell of a sensor.
+    """Gains and constants of a sensor, estimated from contacts.
 
     Attributes:
-        contacts: how many were strong enough to be used.
+        contacts: number of contacts that were strong enough to be used.
         log_gains: (channels,); the mean of each axis is 0.
         constants: (p,) over their spread, in the order of train.physics.pad_draws.INPUTS.
         deviations: (channels + p,), standard deviations of both.
@@ -65,7 +65,7 @@ class Estimate:
 
     @property
     def told(self) -> NDArray[np.bool_]:
-        """Which constants (p,) contacts tell: well within the prior, and not driven to an end of the range."""
+        """True for constants (p,) that contacts determine: well within the prior, and not at an end of the range."""
         return (self.deviations[CHANNELS:] < _TOLD * CONSTANT_SPREAD) & (np.abs(self.constants) < 1)
 
 
@@ -74,7 +74,7 @@ def estimate(counts: NDArray[np.floating], mixture: ContactMixture) -> Estimate:
 
     Args:
         counts: (n, 3, rows, cols), zeroed, of contacts that differ; weak and clipped ones are left out.
-        mixture: of what contacts read.
+        mixture: distribution of the readings of contacts.
 
     Raises:
         DatasetError: no contact is strong enough.
@@ -103,7 +103,7 @@ def estimate(counts: NDArray[np.floating], mixture: ContactMixture) -> Estimate:
 
 
 def _prior_precision() -> NDArray[np.float64]:
-    """Of log-gains and constants, (channels + p, channels + p)."""
+    """Return the prior precision of log-gains and constants, (channels + p, channels + p)."""
     own = Nuisances().gain_spread ** 2 * np.eye(CHANNELS)
     shared = PLACE_SPREAD**2 * np.kron(np.ones((len(AXES), len(AXES))), np.eye(USPA44.taxel_count))
     prior = CONSTANT_SPREAD**-2 * np.eye(CHANNELS + len(INPUTS))
@@ -119,7 +119,7 @@ def _likelihood(
     mixture: ContactMixture,
     precisions: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slope of the log-likelihood by log-gains and constants, and its information."""
+    """Return the gradient of the log-likelihood by log-gains and constants, and its information."""
     read = contacts / np.exp(found[:CHANNELS])
     constants = found[CHANNELS:]
     shares = mixture.responsibilities(read, constants, np.arange(CHANNELS))

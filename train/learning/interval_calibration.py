@@ -1,9 +1,9 @@
-"""How true the deviations are: intervals, how many pixels they cover, and the factor that sets them right.
+"""Calibration of deviations: intervals, the share of pixels that they cover, and the factor that corrects it.
 
 A deviation becomes an interval as that of a Laplace density, which the networks are trained with: errors of patterns
-are mostly small and now and then large. At 90 % that is 1.63 deviations; a Gaussian's 1.64 is nearly the same. The
-factor is an empirical quantile, so that level is right on the data it was found on whatever the errors' density is; the
-other levels are as right as the Laplace density is, which `coverages` shows.
+are mostly small and occasionally large. At 90 % that is 1.63 deviations; a Gaussian's 1.64 is nearly the same. The
+factor is an empirical quantile, so that level is correct on the data of the calibration for any density of the errors;
+the other levels are as accurate as the Laplace density, which `coverages` shows.
 """
 
 from math import log, sqrt
@@ -17,7 +17,7 @@ LEVEL = 0.9
 
 
 def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.floating]:
-    """Half of the interval that holds a share `level` of a Laplace density of that standard deviation, in [mm].
+    """Return half the width of the interval that holds a share `level` of a Laplace density, in [mm].
 
     Raises:
         ValueError: the level is not between 0 and 1.
@@ -28,7 +28,7 @@ def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.f
 
 
 def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
-    """Share of pixels whose truth lies within their interval; arrays of one shape, in [mm].
+    """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm].
 
     Raises:
         ValueError: shapes differ, there are no pixels, or the level is not between 0 and 1.
@@ -38,12 +38,12 @@ def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike
 
 
 def coverages(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, levels: ArrayLike) -> NDArray[np.float64]:
-    """Reliability: share of pixels covered at each of the levels, (m,); a straight line is right."""
+    """Return the share of pixels covered at each of the levels, (m,); equal shares and levels are perfect."""
     return np.array([interval_coverage(truth, pattern, deviation, float(level)) for level in np.ravel(levels)])
 
 
 def calibrate(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
-    """Factor on the deviations with which their intervals cover a share `level` of these pixels.
+    """Return the factor on the deviations with which their intervals cover a share `level` of these pixels.
 
     Raises:
         ValueError: shapes differ, there are no pixels, a deviation is not above zero, or the level is not between 0

@@ -1,4 +1,4 @@
-"""The next batch, drawn while a network learns from this one."""
+"""Prefetching of the next batch while a network trains on the current one."""
 
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +8,7 @@ Batch = TypeVar("Batch")
 
 
 def drawn_ahead(batches: Callable[[int], Batch], first: int, end: int) -> Generator[Batch, None, None]:
-    """The batches of the numbers from `first` to before `end`, each drawn in a thread while the one before is used."""
+    """Yield the batches from number `first` to before `end`, each drawn in a thread while the one before is used."""
     with ThreadPoolExecutor(1, "batches") as thread:
         coming = thread.submit(batches, first)
         for number in range(first, end):

@@ -1,9 +1,9 @@
-"""One training loop for every network: mixed precision, several devices, resumed after a kill, the same for one seed.
+"""Training loop for every network: mixed precision, several devices, resumable, and reproducible for one seed.
 
-On a GPU one seed gives the same but for the order in which is added.
+On a GPU a seed reproduces the weights up to the order of additions.
 
 Under torchrun every process takes its share of each batch, and gradients are averaged: the weights are those of one
-process but for the order in which is added, and but for batch normalisation, which sees the share alone.
+process up to the order of additions, except for batch normalisation, which sees the share alone.
 
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/train.npz
 """
@@ -34,9 +34,9 @@ from train.learning.prefetch import drawn_ahead
 from train.networks.blocks import PatternNet
 
 Batches = Callable[[int], Batch]
-"""The batch of a number; one number is always one batch."""
+"""Function from a number to its batch; the same number always gives the same batch."""
 Course = list[dict[str, float]]
-"""Figures of a network at some steps of its training."""
+"""Validation figures at some steps of a training."""
 
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
@@ -46,36 +46,36 @@ _LOG_EVERY: Final = 50
 
 
 class NotResumableError(TrainError, ValueError):
-    """A run that was cut short had another configuration."""
+    """State of an interrupted run that had another configuration."""
 
 
 class DivergedError(TrainError, ArithmeticError):
-    """The loss is no number any more."""
+    """Loss or gradient that is not finite."""
 
 
 class Objective(Protocol):
-    """What is made small. One with networks of its own, such as a discriminator, trains and keeps them itself."""
+    """Loss function of a training. One with its own networks, such as a discriminator, trains and keeps them itself."""
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
-        """The scalar to descend."""
+        """Return the scalar loss of a batch."""
         ...
 
     def after_step(self) -> None:
-        """Called when the network has taken its step."""
+        """Update the objective after the network has taken its step."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """All that it has learnt."""
+        """Return all learned state."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore learned state."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a network is trained.
+    """Hyperparameters of a training.
 
     Attributes:
         steps: optimizer steps.
@@ -83,9 +83,9 @@ class Recipe:
         learning_rate: highest of the one cycle.
         weight_decay: of AdamW.
         clip_norm: largest norm of a gradient.
-        given: share of windows with 1, 2, ... K taps given, older ones dropped.
-        bf16: multiply in bfloat16 and add in float32, on a device that is faster so.
-        minutes: end the cycle by the clock where that comes first, or None. The weights then depend on the machine.
+        given: share of windows with 1, 2, ... K taps; older taps are dropped.
+        bf16: multiply in bfloat16 and add in float32, on a device where that is faster.
+        minutes: time after which the cycle ends if that comes first, or None. The weights then depend on the machine.
     """
 
     steps: int
@@ -106,13 +106,13 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """What a run came to.
+    """Result of a run.
 
     Attributes:
-        steps: taken.
+        steps: steps taken.
         elapsed_s: seconds of training over all its parts.
         loss: of the last batch.
-        course: figures on the way, each with its step.
+        course: validation figures, each with its step.
     """
 
     steps: int
@@ -122,31 +122,31 @@ class Trained:
 
 
 def rank_and_world() -> tuple[int, int]:
-    """Number of this process, and how many there are; joins torchrun's group the first time."""
+    """Return the rank of this process and the number of processes; joins torchrun's group on the first call."""
     if "WORLD_SIZE" not in os.environ:
         return 0, 1
     if not distributed.is_initialized():
         distributed.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        _keep_apart(int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"]))  # of this machine
+        _keep_apart(int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"]))  # ranks on this machine
     return distributed.get_rank(), distributed.get_world_size()
 
 
 def _keep_apart(rank: int, world: int) -> None:
-    """Pin one of several processes of a machine without a GPU to its share of the cores that it may run on.
+    """Pin one of several processes of a machine without a GPU to its share of the available cores.
 
-    Left to itself the kernel was seen to keep two on one core for minutes, each with half of it, while the other core
-    idled: they wait for each other at every step, so neither is ever busy for long enough to be moved.
+    Without it the kernel kept two processes on one core for minutes, each at half speed, while the other core was
+    idle: they wait for each other at every step, so neither is busy for long enough to be moved.
     """
     if world == 1 or torch.cuda.is_available() or not hasattr(os, "sched_setaffinity"):
         return
     cores = sorted(os.sched_getaffinity(0))
     share = cores[rank * len(cores) // world : (rank + 1) * len(cores) // world]
-    if share:  # more processes than cores share them as the kernel likes
+    if share:  # with more processes than cores, the kernel schedules them
         os.sched_setaffinity(0, share)
 
 
 def gains_by_bf16(device: torch.device) -> bool:
-    """Whether a device multiplies in bfloat16 by itself; others imitate it, slowly."""
+    """Return True if a device multiplies in bfloat16 natively; others emulate it slowly."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     able = torch.cpu.get_capabilities()
@@ -154,30 +154,30 @@ def gains_by_bf16(device: torch.device) -> bool:
 
 
 def leave_group() -> None:
-    """End what torchrun began, all processes together: one that goes first takes the others' connections with it."""
+    """End torchrun's group with all processes at once: one that leaves first would close the others' connections."""
     if distributed.is_initialized():
         distributed.barrier()
         distributed.destroy_process_group()
 
 
 def wait_for_all() -> None:
-    """Let no process go on before all have come here."""
+    """Wait until all processes have reached this point."""
     if distributed.is_initialized():
         distributed.barrier()
 
 
 def device_of_rank(rank: int) -> torch.device:
-    """Where a process computes."""
+    """Return the device on which a process computes."""
     return torch.device("cuda", rank % torch.cuda.device_count()) if torch.cuda.is_available() else torch.device("cpu")
 
 
 def device_name(device: torch.device) -> str:
-    """What a report calls it."""
+    """Return the name of a device in reports."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} processor"
 
 
 def learning_rate_share(progress: float) -> float:
-    """Share of the highest learning rate at a share of the run: up by a cosine, then down (Smith 2018, one cycle)."""
+    """Return the share of the highest learning rate at a share of the run (Smith 2018, one cycle of two cosines)."""
     if progress < _WARM_UP:
         return _FIRST_SHARE + (1 - _FIRST_SHARE) * (1 - cos(pi * progress / _WARM_UP)) / 2
     return _LAST_SHARE + (1 - _LAST_SHARE) * (1 + cos(pi * (progress - _WARM_UP) / (1 - _WARM_UP))) / 2
@@ -195,24 +195,24 @@ def train(
     validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
     validations: int = 5,
 ) -> Trained:
-    """Train a network in place; cut short, it goes on where it was when called again.
+    """Train a network in place; an interrupted run resumes when this is called again.
 
     Args:
         net: on any device; left in evaluation mode.
-        objective: what is made small.
-        batches: gives the batch of a number.
-        recipe: how.
-        resume_path: where the state is kept while the run lasts.
-        identity: of what is trained on what; a run that was cut short goes on with the same alone.
+        objective: loss function.
+        batches: function from a number to its batch.
+        recipe: hyperparameters.
+        resume_path: file that keeps the state while the run lasts.
+        identity: of network and data; an interrupted run resumes only with the same identity.
         log_folder: for TensorBoard, or None.
-        validate: gives figures to log and to keep, of the network in evaluation mode.
-        validations: how often, over the run.
+        validate: returns figures to log and to keep, of the network in evaluation mode.
+        validations: number of validations over the run.
 
     The state at `resume_path` is left there: the caller deletes it when the result is safe.
 
     Raises:
         ValueError: a batch cannot be shared evenly by the processes.
-        NotResumableError: what lies at `resume_path` is of another recipe or identity.
+        NotResumableError: the state at `resume_path` is of another recipe or identity.
         DivergedError: the loss is not finite; the network is as it was before that step.
     """
     rank, world = rank_and_world()
@@ -224,7 +224,7 @@ def train(
     parallel = DistributedDataParallel(net) if world > 1 else net
     keeper = _Keeper(resume_path, recipe, identity, net, optimizer, objective, rank)
     step, spent_s, course = keeper.restore(device)
-    wait_for_all()  # what lies there may be deleted when the first is done
+    wait_for_all()  # the first process to finish may delete the state
     clock = _Clock(recipe, spent_s)
     logged = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None)
     check_at = {round(recipe.steps * (i + 1) / validations) for i in range(validations)} if validate else set()
@@ -259,7 +259,7 @@ def train(
 
 
 def _place(net: PatternNet, device: torch.device) -> PatternNet:
-    """On a GPU with channels last and the fastest convolutions tried for: 28 ms for a step that took 34 (H100)."""
+    """Move a network to a device; on a GPU with channels last and cudnn's benchmark: 28 ms a step, not 34 (H100)."""
     if device.type != "cuda":
         return net.to(device)
     torch.backends.cudnn.benchmark = True
@@ -267,7 +267,7 @@ def _place(net: PatternNet, device: torch.device) -> PatternNet:
 
 
 class _Log:
-    """A bar on a terminal, and TensorBoard."""
+    """Progress bar on a terminal, and TensorBoard."""
 
     def __init__(self, name: str, done: int, steps: int, folder: Path | None) -> None:
         self._bar = Progress(name, steps, "step", done=done)
@@ -291,7 +291,7 @@ class _Log:
 
 
 class _Clock:
-    """How far a run is, by its steps or by its time; all processes agree."""
+    """Progress of a run by its steps or by its time, the same in all processes."""
 
     def __init__(self, recipe: Recipe, spent_s: float) -> None:
         self._recipe = recipe
@@ -311,7 +311,7 @@ class _Clock:
 
 
 class _Keeper:
-    """The state of a run on disk, so that a kill costs a minute."""
+    """State of a run on disk, saved every minute, so that an interruption costs at most that."""
 
     def __init__(
         self,
@@ -330,7 +330,7 @@ class _Keeper:
         self._kept_s = time.monotonic()
 
     def restore(self, device: torch.device) -> tuple[int, float, Course]:
-        """Steps, seconds and figures that lie behind; none for a new run."""
+        """Return the steps, seconds and figures of an interrupted run; zeros for a new run."""
         if not self._path.exists():
             return 0, 0.0, []
         try:

@@ -1,4 +1,4 @@
-"""What the finite elements say of a press, worked out once and kept beside the reports: minutes of work a surface."""
+"""Finite-element results of a press, computed once and kept with the reports, because each surface takes minutes."""
 
 import hashlib
 import json
@@ -18,9 +18,9 @@ from train.surfaces.named_surfaces import surface_mesh
 SCALE: Final = 10
 """Patterns are compared at 40 x 40, as in the paper."""
 CENTRE: Final = Pose(0.0, 0.0, 0.0)
-"""The paper's p5 r0."""
+"""Position 5, rotation 0 of the paper."""
 _EDITION: Final = 1
-"""Raise it when train.physics.fem_reference changes what it finds: kept results of another edition are not read."""
+"""Edition of kept results; raise it when the results of train.physics.fem_reference change."""
 
 
 class Mesh(NamedTuple):
@@ -35,8 +35,8 @@ class Mesh(NamedTuple):
 
 FINEST: Final = Mesh(10, 8)
 REFEREE_POISSON: Final = 0.495
-"""Of rubber. The layer's own, lower one stands for sides that the finite elements have."""
-"""Its nodes are the pixels of the 40 x 40 pattern."""
+"""Poisson's ratio of rubber. The layer's own value is lower to account for free sides, which the elements have."""
+"""The nodes of FINEST are the pixels of the 40 x 40 pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Verdict:
         force_n: (s,), in [N].
         newton_steps: (s,), linear systems solved.
         residual: (s,), force out of balance as a share of the reactions.
-        run_s: (s,), in [s], when it was worked out.
+        run_s: (s,), computation time, in [s].
     """
 
     patterns_mm: NDArray[np.float32]
@@ -61,7 +61,7 @@ class Verdict:
 def press_or_recall(
     surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path, pose: Pose = CENTRE
 ) -> Verdict:
-    """Press a surface into the finite elements, or recall what came of it.
+    """Press a surface into the finite elements, or load the kept result.
 
     Args:
         surface: its name.
@@ -94,12 +94,12 @@ def press_or_recall(
 
 
 def relief(surface: str) -> Relief:
-    """A surface by name, to be looked down on."""
+    """Return a named surface as a relief."""
     return Relief(surface, surface_mesh(surface))
 
 
 LAYER: Final = replace(Layer(), poisson=REFEREE_POISSON)
-"""The pad as the finite elements have it."""
+"""Layer of the pad as it is modelled by the finite elements."""
 _FIGURES: Final = ("force_n", "newton_steps", "residual", "run_s")
 
 
@@ -118,7 +118,7 @@ def _work_out(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], po
 
 
 def _keep(path: Path, verdict: Verdict) -> None:
-    """Half precision: 0.05 % of a displacement, a tenth of what the mesh leaves open."""
+    """Save a result in half precision: 0.05 % of a displacement, a tenth of the mesh's own error."""
     figures = {name: getattr(verdict, name) for name in _FIGURES}
     unfinished = path.with_suffix(".part.npz")  # a run that is stopped leaves no half result under the name
     np.savez_compressed(unfinished, patterns_mm=verdict.patterns_mm.astype(np.float16), **figures)

@@ -1,1 +1,1 @@
-"""Surfaces to tap, and where they are tapped."""
+"""Surfaces to tap, and the poses of the taps."""

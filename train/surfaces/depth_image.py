@@ -1,6 +1,6 @@
-"""Depth images: how far below what it touches first a surface lies under the pad.
+"""Depth images: depth of a surface under the pad below the point that the pad touches first.
 
-A pose turns the surface's triangles into the pad's axes, and they are drawn straight onto the grid asked for: every
+A pose turns the surface's triangles into the pad's axes, and they are drawn straight onto the requested grid: every
 pixel's depth is that of the surface at the pixel's centre, on flats, slopes and edges alike. Only triangles whose
 bounding box meets the footprint are drawn.
 """
@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 NOTHING_MM: Final = 1e3
 """Depth where there is no surface at all: out of any press's reach."""
 _UNFELT_MM: Final = 0.05
-"""What stands out further than this from between the cells of the pad is a feature finer than they are."""
+"""Height above the cells' centres from which a point between them counts as finer than a cell, in [mm]."""
 SAMPLES: Final = 4
-"""Along a cell's side, by which is told how much of it is covered."""
+"""Samples along a cell's side from which its covered share is computed."""
 _TRIANGLES_AT_ONCE: Final = 2**17
 _ROUNDING_PX: Final = 1e-9
-"""Neighbours' common edge must hide no pixel that lies on it."""
+"""Tolerance in [px], so that no pixel on the common edge of two triangles is missed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the sensor taps: its centre over the surface in [mm] and its turn about z in [deg]."""
+    """Pose of a tap: its centre over the surface in [mm] and its turn about z in [deg]."""
 
     x_mm: float
     y_mm: float
@@ -36,24 +36,24 @@ class Pose:
 
 
 class Relief:
-    """A surface to be looked down on.
+    """Surface to be drawn from above.
 
     Args:
-        name: what errors call it.
+        name: used in error messages.
         mesh: the surface, in [mm], z up.
     """
 
     def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
         self.name = name
         triangles_mm = np.asarray(mesh.triangles, dtype=np.float64)
-        # In order of their left ends, those near a place are a slice, however large the mesh is.
+        # Sorted by their left ends, the triangles near a place are one slice, however large the mesh is.
         self.triangles_mm = triangles_mm[np.argsort(triangles_mm[:, :, 0].min(axis=1), kind="stable")]
         self._low_mm = self.triangles_mm[:, :, :2].min(axis=1)
         self._high_mm = self.triangles_mm[:, :, :2].max(axis=1)
         self._widest_mm = (self._high_mm - self._low_mm)[:, 0].max(initial=0.0)
 
     def near(self, pose: Pose, reach_mm: float) -> NDArray[np.float64]:
-        """Triangles (t, 3, 3) whose bounding box comes within `reach_mm` of a pose's centre, in x and in y."""
+        """Return triangles (t, 3, 3) whose bounding box comes within `reach_mm` of a pose's centre, in x and in y."""
         place = np.array([pose.x_mm, pose.y_mm])
         left, right = place[0] - reach_mm - self._widest_mm, place[0] + reach_mm
         first, last = np.searchsorted(self._low_mm[:, 0], left), np.searchsorted(self._low_mm[:, 0], right, "right")
@@ -64,7 +64,7 @@ class Relief:
 
 @dataclass(frozen=True, slots=True)
 class Footprints:
-    """What lies under the pad at n poses.
+    """Part of the surface under the pad at each of n poses.
 
     The sensor's y points down its rows, the surface's y up: the pad faces the surface.
 
@@ -80,13 +80,13 @@ class Footprints:
     depth_mm: NDArray[np.float32]
 
     def depth_on(self, size: int, pixel_mm: float, poses: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Depth at the given poses on another grid, `size` x `size` pixels centred on the pad, in [mm]."""
+        """Return the depth at the given poses on another grid, `size` x `size` pixels centred on the pad, in [mm]."""
         height_mm = _draw([self.triangles_mm[i] for i in poses], size, pixel_mm)
         return _below(self.top_mm[poses], height_mm)
 
     def cover_on(self, size: int, cell_mm: float, poses: NDArray[np.integer], level_mm: float) -> NDArray[np.float32]:
-        """Share of each cell that lies within `level_mm` of the top at the given poses, (k, size, size), 0 to 1."""
-        # Nothing further down is drawn: it hides nothing of the top.
+        """Return the share of each cell within `level_mm` of the top at these poses, (k, size, size), 0 to 1."""
+        # Deeper triangles are left out: they hide nothing of the top.
         tops = [
             self.triangles_mm[i][self.triangles_mm[i][:, :, 2].min(axis=1) >= self.top_mm[i] - level_mm] for i in poses
         ]
@@ -95,11 +95,11 @@ class Footprints:
 
 
 def footprints(reliefs: Sequence[Relief], poses: Sequence[Pose], size: int, cell_mm: float) -> Footprints:
-    """Look at surfaces from poses, one pose each, by a pad of `size` x `size` cells.
+    """Draw the part of each surface that lies under a pad of `size` x `size` cells, one pose per surface.
 
     Depth counts from the highest point under the footprint, not under the mesh: indentation is measured from first
-    contact. Between the cells' centres that point is found on the triangles' edges; what stands out there by more
-    than _UNFELT_MM is finer than a cell and is not felt.
+    contact. Between the cells' centres that point is searched on the triangles' edges; a point there that stands out by
+    more than _UNFELT_MM is finer than a cell and is left out.
 
     Raises:
         ValueError: nothing lies under the pad at a pose.
@@ -119,7 +119,7 @@ def footprints(reliefs: Sequence[Relief], poses: Sequence[Pose], size: int, cell
 
 
 def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArray[np.float32]:
-    """Depth under one footprint of `size` x `size` cells, (size, size) in [mm]; see Footprints.
+    """Return the depth under one footprint of `size` x `size` cells, (size, size) in [mm]; see Footprints.
 
     Raises:
         ValueError: nothing lies under the pad.
@@ -133,7 +133,7 @@ def _below(top_mm: NDArray[np.float64], height_mm: NDArray[np.float64]) -> NDArr
 
 
 def _under(relief: Relief, pose: Pose, width_mm: float) -> NDArray[np.float64]:
-    """Triangles (t, 3, 3) in the pad's axes, those whose bounding box there meets the footprint."""
+    """Return triangles (t, 3, 3) in the pad's axes, limited to those whose bounding box there meets the footprint."""
     triangles_mm = relief.near(pose, width_mm / np.sqrt(2))
     cosine, sine = cos(radians(pose.angle_deg)), sin(radians(pose.angle_deg))
     x_mm, y_mm = triangles_mm[:, :, 0] - pose.x_mm, triangles_mm[:, :, 1] - pose.y_mm
@@ -143,13 +143,13 @@ def _under(relief: Relief, pose: Pose, width_mm: float) -> NDArray[np.float64]:
 
 
 def _highest(triangles_mm: NDArray[np.float64], width_mm: float) -> float:
-    """Height of the highest point of the triangles' edges inside the footprint, in [mm]; -inf if there is none."""
+    """Return the highest point of the triangles' edges inside the footprint, in [mm]; -inf if there is none."""
     start = triangles_mm
     step = np.roll(triangles_mm, -1, axis=1) - start
     with np.errstate(divide="ignore", invalid="ignore"):
         at_low = (-width_mm / 2 - start[:, :, :2]) / step[:, :, :2]
         at_high = (width_mm / 2 - start[:, :, :2]) / step[:, :, :2]
-    # fmin and fmax pass over 0/0: an edge that runs along a side of the footprint.
+    # fmin and fmax ignore 0/0, the case of an edge along a side of the footprint.
     enters = np.maximum(np.fmin(at_low, at_high).max(axis=2), 0)
     leaves = np.minimum(np.fmax(at_low, at_high).min(axis=2), 1)
     inside = enters <= leaves
@@ -159,7 +159,7 @@ def _highest(triangles_mm: NDArray[np.float64], width_mm: float) -> float:
 
 
 def _draw(seen: list[NDArray[np.float64]], size: int, cell_mm: float) -> NDArray[np.float64]:
-    """Height of the topmost triangle at each pixel's centre, (n, size, size) in [mm]; -inf where there is none."""
+    """Return the topmost triangle's height at each pixel's centre, (n, size, size) in [mm]; -inf without one."""
     height_mm = np.full((len(seen), size, size), -np.inf)
     counts = np.array([len(triangles) for triangles in seen], dtype=np.int64)
     block = (np.cumsum(counts) - counts) // _TRIANGLES_AT_ONCE
@@ -172,7 +172,7 @@ def _draw(seen: list[NDArray[np.float64]], size: int, cell_mm: float) -> NDArray
 
 
 def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], image: NDArray[np.integer]) -> None:
-    """Z-buffer triangles into images, row by row of each: corners (t, 3, 3) with x and y in pixels, image (t,)."""
+    """Z-buffer triangles into images, row by row: corners (t, 3, 3) with x and y in pixels, image (t,)."""
     size = height_mm.shape[1]
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = edge1[:, 0] * edge2[:, 1] - edge2[:, 0] * edge1[:, 1]
@@ -188,7 +188,7 @@ def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], imag
         x0, y0 = corners[triangle, start, 0], corners[triangle, start, 1]
         x1, y1 = corners[triangle, stop, 0], corners[triangle, stop, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = (row - y0) / (y1 - y0)  # not finite on a level edge, whose ends the two others have
+            share = (row - y0) / (y1 - y0)  # not finite on a level edge, whose ends belong to the other two edges
         crosses = (share >= -_ROUNDING_PX) & (share <= 1 + _ROUNDING_PX)
         x = x0 + np.clip(share, 0, 1) * (x1 - x0)
         left = np.where(crosses, np.minimum(left, x), left)
@@ -196,7 +196,7 @@ def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], imag
     strip, column = _spans(left, right, size)
     x0, y0, z0 = corners[triangle, 0].T
     z_mm = (z0 - slope_x[triangle] * x0 + slope_y[triangle] * (row - y0))[strip] + slope_x[triangle][strip] * column
-    # A nearly vertical wall's slope is too steep to be trusted beyond its own corners.
+    # The slope of a nearly vertical wall is too steep to be extrapolated beyond its corners.
     z_mm = np.clip(z_mm, bottom_mm[triangle][strip], top_mm[triangle][strip])
     np.maximum.at(height_mm.reshape(-1), ((image[triangle] * size + row) * size)[strip] + column, z_mm)
 
@@ -204,7 +204,7 @@ def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], imag
 def _spans(
     low_px: NDArray[np.float64], high_px: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All whole numbers between bounds (t,), both within and 0 up to below size: (owner, number) of each."""
+    """Return all integers between bounds (t,), both included, and from 0 to below size: (owner, number) of each."""
     first = np.ceil(np.clip(low_px - _ROUNDING_PX, 0, size)).astype(np.int64)
     last = np.floor(np.clip(high_px + _ROUNDING_PX, -1, size - 1)).astype(np.int64)
     counts = np.maximum(last - first + 1, 0)

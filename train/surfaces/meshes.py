@@ -14,14 +14,14 @@ from train.errors import MeshError
 SUFFIXES: Final = (".stl", ".obj", ".ply")
 MAX_TRIANGLES: Final = 2_000_000
 MAX_FILE_BYTES: Final = 400_000_000
-"""Two million triangles in the wordiest of OBJ files; a longer file would fill the memory before it is refused."""
+"""Largest file read: two million triangles in the most verbose OBJ. A longer one would fill the memory first."""
 EXTENT_MM: Final = (1.0, 500.0)
-"""Smallest and largest longest side: outside, the unit is wrong more likely than the part."""
+"""Smallest and largest longest side; outside this range the unit is more likely wrong than the part."""
 _MERGED_DIGITS: Final = 4
-"""Corners that agree to this many digits of a millimetre are one: no press tells a tenth of a micrometre."""
+"""Decimals of a millimetre to which corners are merged: no press resolves a tenth of a micrometre."""
 _TO_ASCII: Final = bytes(range(128)) + b"?" * 128
 _FLAT: Final = 1e-5
-"""Thickness over length below which a body is a sheet: a hundred times the rounding of single precision."""
+"""Ratio of thickness to length below which a body is a sheet: a hundred times the rounding of single precision."""
 
 
 def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
@@ -59,7 +59,7 @@ def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
 
 
 def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Corners (n, 3), finite, in the file's unit, and the triangles (m, 3) between them, at least one."""
+    """Return finite corners (n, 3) in the file's unit, and at least one triangle (m, 3) between them."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise MeshError(f"{path}: unknown mesh format {suffix!r}; save it as one of {', '.join(SUFFIXES)}")
@@ -86,9 +86,9 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _parse(path: Path, content: bytes, suffix: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """All bodies of a file side by side. Corners alone, of a point cloud, come without triangles."""
+    """Return all bodies of a file side by side; a point cloud has corners without triangles."""
     try:
-        # From bytes and without materials: a mesh file must not make us open others.
+        # Parsed from bytes and without materials, so that a mesh file cannot make the program open other files.
         scene = trimesh.load_scene(
             BytesIO(_legible(content, suffix)), file_type=suffix[1:], process=False, skip_materials=True
         )
@@ -97,13 +97,13 @@ def _parse(path: Path, content: bytes, suffix: str) -> tuple[NDArray[np.float64]
             corners.append(np.asarray(body.vertices, dtype=np.float64).reshape(-1, 3))
             faces.append(np.asarray(getattr(body, "faces", faces[0]), dtype=np.int64).reshape(-1, 3) + count)
             count += len(corners[-1])
-    except Exception as error:  # on a broken file a parser raises whatever it trips over, and all of it means that
+    except Exception as error:  # a parser raises any exception on a broken file, and each means that the file is broken
         raise MeshError(f"{path}: no {suffix[1:].upper()} file, or one cut short or broken; save it anew") from error
     return np.concatenate(corners), np.concatenate(faces)
 
 
 def _legible(content: bytes, suffix: str) -> bytes:
-    """The file with all its text in ASCII: a name in an old encoding is no reason to refuse a mesh."""
+    """Return the file with all its text in ASCII, so that a name in an old encoding does not make it unreadable."""
     if suffix == ".ply":
         header, end, body = content.partition(b"end_header")
         return header.translate(_TO_ASCII) + end + body
@@ -131,7 +131,7 @@ def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> Non
 
 
 def _open_edges(faces: NDArray[np.int64]) -> int:
-    """Edges with an odd number of triangles: a closed body has none, nor have bodies that touch along an edge."""
+    """Count edges with an odd number of triangles: 0 for closed bodies, even if they touch along an edge."""
     ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, counts = np.unique(ends[:, 0] * (faces.max() + 1) + ends[:, 1], return_counts=True)
     return int((counts % 2).sum())

@@ -24,7 +24,7 @@ from train.surfaces.random_figures import glyph, polygon
 PLATE_MM: Final = 20.0
 FIGURE_HEIGHT_MM: Final = 2.0
 REACH_MM: Final = 0.5
-"""What lies deeper than this below the top, no press touches."""
+"""Depth below the top beyond which no press reaches, in [mm]."""
 _PLATE_THICKNESS_MM: Final = 1.0
 
 PLATES: Final = (LETTERS, SHAPES)
@@ -33,21 +33,21 @@ SURFACES: Final = LETTERS + SHAPES
 """Names of the 18 surfaces."""
 
 _FLAT_TOLERANCE: Final = 1e-3
-"""[mm] off the plane, and slope off the vertical: a micrometre within reach, lost beside a press of 0.5 mm."""
+"""Tolerance in [mm] off the plane, and in slope off the vertical: negligible against a press of 0.5 mm."""
 _RADII_MM: Final = (1.0, 1000.0)
-"""Sharper, and the pressed cap spans fewer than four cells of the contact grid; blunter, and it is a plane."""
+"""Radii of domes and cylinders. Smaller caps span under four cells of the contact grid; larger ones are planes."""
 _ROUND_MM: Final = 1.5
-"""Height of a dome's or cylinder's round part: three times a press's reach, for the pad that heaps up beside it."""
+"""Height of a dome's or cylinder's round part: three times a press's reach, because the pad heaps up around it."""
 _FACETS: Final = 32
-"""From the top to the edge of the round part. Sagitta R (step angle)^2 / 8, at most .5 um for every radius."""
+"""Facets from the top to the edge of the round part. Sagitta R (step angle)^2 / 8, at most .5 um for every radius."""
 _SECTORS: Final = 128
-"""Round a dome. At depth d the chord lies d (pi / sectors)^2 below the sphere: .3 um at a press's reach."""
+"""Sectors of a dome. At depth d the chord lies d (pi / sectors)^2 below the sphere: .3 um at a press's reach."""
 
 _RANDOM: Final[dict[str, Callable[[int], BaseGeometry]]] = {"glyph": glyph, "polygon": polygon}
 
 
 def surface_mesh(name: str) -> trimesh.Trimesh:
-    """The mesh of one surface, figure and base plate as closed bodies side by side, centred on x = y = 0.
+    """Return the mesh of one surface, figure and base plate as closed bodies side by side, centred on x = y = 0.
 
     Args:
         name: one of SURFACES; `glyph:SEED` or `polygon:SEED`, random figures; `sphere:RADIUS_MM`, a dome;
@@ -75,12 +75,12 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
 
 
 def is_random_figure(name: str) -> bool:
-    """Whether a surface's name is that of a figure drawn from a seed."""
+    """Return True if a surface's name is that of a figure drawn from a seed."""
     return name.partition(":")[0] in _RANDOM
 
 
 def is_flat(mesh: trimesh.Trimesh) -> bool:
-    """Whether all that a press can reach lies in the plane of the mesh's top; walls may fall away from it.
+    """Return True if all that a press can reach lies in the plane of the mesh's top; walls may be vertical.
 
     A flat surface's contact is linear in the indentation and solved once, a curved one's at every depth.
     """
@@ -123,7 +123,7 @@ def _radius_mm(name: str, detail: str) -> float:
 
 
 def _round_profile(radius_mm: float) -> list[tuple[float, float]]:
-    """(distance from the axis, z) from the top down to the round part's edge, in [mm]."""
+    """Return (distance from the axis, z) from the top down to the edge of the round part, in [mm]."""
     steepest = acos(max(1 - _ROUND_MM / radius_mm, 0.0))
     widest = asin(min(PLATE_MM / radius_mm, 1.0))  # a blunt body ends where no pad on the plate reaches
     angles = [min(steepest, widest) * i / _FACETS for i in range(_FACETS + 1)]

@@ -1,6 +1,6 @@
 """Outlines of the 18 figures of the paper: nine letters, and three shapes in three forms. Lengths in [mm].
 
-Source: Wu and Liu 2024, Fig. 1c; the figures' exact sizes are not given there and are ours.
+Source: Wu and Liu 2024, Fig. 1c; the paper does not state the figures' exact sizes, and those here are our choice.
 """
 
 from math import cos, pi, radians, sin
@@ -14,15 +14,15 @@ _WALL_MM: Final = 2.5
 _LARGE_RADIUS_MM: Final = 7.0
 _SMALL_RADIUS_MM: Final = 3.5
 _W: Final = 4.0
-"""Half the width of a letter's strokes, centre to centre."""
+"""Half the width of a letter, between stroke centres."""
 _H: Final = 6.0
-"""Half their height."""
+"""Half the height of a letter, between stroke centres."""
 
 Points = list[tuple[float, float]]
 
 
 def arc(centre: tuple[float, float], radii: tuple[float, float], start_deg: float, stop_deg: float) -> Points:
-    """Points along an ellipse's arc, both ends included; counterclockwise when `stop_deg` is the larger."""
+    """Return points along an ellipse's arc, both ends included; counterclockwise when `stop_deg` is the larger."""
     steps = 24
     angles = [radians(start_deg + (stop_deg - start_deg) * i / steps) for i in range(steps + 1)]
     return [(centre[0] + radii[0] * cos(a), centre[1] + radii[1] * sin(a)) for a in angles]
@@ -46,7 +46,7 @@ SHAPES: Final = tuple(f"{form} {shape}" for shape in _CORNERS for form in ("holl
 
 
 def figure(name: str) -> BaseGeometry:
-    """The outline of one of LETTERS or SHAPES, centred on the origin, in [mm].
+    """Return the outline of one of LETTERS or SHAPES, centred on the origin, in [mm].
 
     Raises:
         KeyError: neither a letter nor a shape.
@@ -67,7 +67,7 @@ def _shape(form: str, shape: str) -> BaseGeometry:
 
 
 def _regular(corners: int, radius_mm: float) -> Polygon:
-    """A regular polygon standing on a side, its corners at `radius_mm`."""
+    """Return a regular polygon standing on a side, its corners at `radius_mm`."""
     first = -pi / 2 + pi / corners
     angles = [first + 2 * pi * i / corners for i in range(corners)]
     return Polygon([(radius_mm * cos(a), radius_mm * sin(a)) for a in angles])

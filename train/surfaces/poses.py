@@ -1,7 +1,7 @@
-"""Where and how often a surface is tapped: the paper's schedule, and poses drawn at random.
+"""Poses of the taps on a surface: the paper's schedule, and poses drawn at random.
 
-The paper taps each surface at nine positions, turned nine ways: record = position * 9 + rotation. A target is a
-tap whose pattern is asked for; the taps before it were made at the same place, each turned back one more angle
+The paper taps each surface at nine positions, turned nine ways: record = position * 9 + rotation. A target is a tap
+whose pattern is reconstructed; the taps before it are made at the same place, each turned back by one more angle
 step. Targets are split by position, and every K has the same ones: 504 to train on, 72 to validate, 72 to test.
 """
 
@@ -24,20 +24,20 @@ POSITION_STEP_MM: Final = 2.5
 TEST_POSITION: Final = 0
 VALIDATION_POSITION: Final = 1
 HELD_OUT_RADIUS_MM: Final = 1.0
-"""Poses drawn at random keep this far from the two positions that nothing is trained on.
+"""Distance that random poses keep from the two held-out positions, in [mm].
 
 Only C, F, L, P, T and U are new there in every sense: the other surfaces are symmetric, and look as they do at another
-position to a pad turned by 90, 120 or 180 degrees. It makes no difference that shows, see docs/log.md.
+position to a pad turned by 90, 120 or 180 degrees. No effect of this was measured, see docs/log.md.
 """
 REACH_MM: Final = 3.5
-"""Poses drawn at random lie this far from the surface's centre at most, along x and along y."""
+"""Largest distance of random poses from the surface's centre along x and along y, in [mm]."""
 
 Split = Literal["train", "validation", "test"]
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """Taps whose patterns are asked for.
+    """Taps whose patterns are reconstructed.
 
     Attributes:
         surfaces: n names.
@@ -52,7 +52,7 @@ class Targets:
 
 
 def position_mm(index: int) -> tuple[float, float]:
-    """One of the nine positions, a 3 x 3 grid, x and y in [mm].
+    """Return x and y in [mm] of one of the nine positions of the 3 x 3 grid.
 
     Raises:
         ValueError: not one of the nine.
@@ -63,7 +63,7 @@ def position_mm(index: int) -> tuple[float, float]:
 
 
 def position_and_angle(record: int) -> tuple[int, float]:
-    """Position and angle in [deg] of one of the paper's 81 records of a surface.
+    """Return position and angle in [deg] of one of the paper's 81 records of a surface.
 
     Raises:
         ValueError: not one of the 81.
@@ -77,7 +77,7 @@ def position_and_angle(record: int) -> tuple[int, float]:
 
 
 def positions_of(split: Split) -> tuple[int, ...]:
-    """The positions of a split: 0 to test, 1 to validate, the other seven to train on."""
+    """Return the positions of a split: 0 to test, 1 to validate, the other seven to train on."""
     held_out = {"test": TEST_POSITION, "validation": VALIDATION_POSITION}
     if split in held_out:
         return (held_out[split],)
@@ -85,7 +85,7 @@ def positions_of(split: Split) -> tuple[int, ...]:
 
 
 def paper_targets(positions: Sequence[int], surfaces: Sequence[str] = SURFACES) -> Targets:
-    """Every surface at the four target angles of each position; surfaces change slowest, angles fastest."""
+    """Return every surface at the four target angles of each position; surfaces change slowest, angles fastest."""
     taps = [
         (name, Pose(*position_mm(position), angle_deg))
         for name in surfaces
@@ -96,7 +96,7 @@ def paper_targets(positions: Sequence[int], surfaces: Sequence[str] = SURFACES) 
 
 
 def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str] = SURFACES, first: int = 0) -> Targets:
-    """Surfaces in turn from the `first` on, places and angles at random, none near the held-out positions."""
+    """Draw places and angles away from the held-out positions, with surfaces in turn starting at index `first`."""
     held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
     poses: list[Pose] = []
     while len(poses) < count:
@@ -108,7 +108,7 @@ def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str]
 
 
 def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_DEG) -> NDArray[np.float64]:
-    """Poses (n, taps, 3) of the taps that end in each target, newest first: x, y in [mm], angle in [deg].
+    """Return poses (n, taps, 3) of the taps that end in each target, newest first: x, y in [mm], angle in [deg].
 
     Raises:
         ValueError: taps or angle_step_deg out of bounds.
@@ -124,5 +124,5 @@ def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_
 
 
 def as_poses(array: NDArray[np.floating]) -> list[Pose]:
-    """The poses of an array (..., 3), in order."""
+    """Return the poses of an array (..., 3), in order."""
     return [Pose(*(float(value) for value in row)) for row in array.reshape(-1, 3)]

@@ -1,7 +1,7 @@
-"""Random figures to train on, so that a network meets shapes nobody has drawn. Lengths in [mm].
+"""Random figures to train on, so that a network meets shapes that nobody has designed. Lengths in [mm].
 
-A seed gives one figure: coordinates are rounded to whole micrometres, so that the last digits in which machines
-differ are lost. Detail that no tap could show, slits and slivers finer than half a millimetre, is left out.
+A seed defines one figure: coordinates are rounded to whole micrometres, which removes the last digits in which machines
+differ. Detail that no tap could resolve, slits and slivers finer than half a millimetre, is left out.
 """
 
 from math import cos, pi, sin
@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from train.surfaces.paper_figures import Points, arc
 
 GLYPH_REACH_MM: Final = 8.0
-"""Glyphs stay within this of the plate's centre along x and y."""
+"""Largest distance of a glyph's points from the plate's centre along x and y."""
 POLYGON_REACH_MM: Final = 9.5
 AREA_MM2: Final = (8.0, 250.0)
 """Smallest and largest contact area."""
@@ -25,7 +25,7 @@ _JOINS: Final[tuple[Literal["round", "mitre", "bevel"], ...]] = ("round", "mitre
 
 
 def glyph(seed: int) -> BaseGeometry:
-    """One to four random strokes of one width, like a letter of an unknown script.
+    """Draw one to four random strokes of one width, like a letter of an unknown script.
 
     Args:
         seed: 0 or more.
@@ -41,7 +41,7 @@ def glyph(seed: int) -> BaseGeometry:
 
 
 def polygon(seed: int) -> BaseGeometry:
-    """One or two random polygons or ellipses, full or hollow.
+    """Draw one or two random polygons or ellipses, full or hollow.
 
     Args:
         seed: 0 or more.
@@ -79,7 +79,7 @@ def _strokes(rng: np.random.Generator) -> BaseGeometry:
 
 
 def _stroke(rng: np.random.Generator, half: tuple[float, float], lattice: int) -> LineString:
-    """A polyline, an arc or a closed loop, its corners within +-`half`."""
+    """Draw a polyline, an arc or a closed loop with its corners within +-`half`."""
     kind = rng.random()
     if kind < 0.55:
         return LineString(_corners(rng, half, lattice, int(rng.integers(2, 5))))
@@ -94,7 +94,7 @@ def _stroke(rng: np.random.Generator, half: tuple[float, float], lattice: int) -
 
 
 def _corners(rng: np.random.Generator, half: tuple[float, float], lattice: int, count: int) -> Points:
-    """Random corners; on the lattice, no two in a row are the same."""
+    """Draw random corners; on the lattice, no two in a row are the same."""
     shares = rng.uniform(-1, 1, (count, 2))
     if lattice:
         places = [int(rng.integers((lattice + 1) ** 2))]
@@ -106,7 +106,7 @@ def _corners(rng: np.random.Generator, half: tuple[float, float], lattice: int, 
 
 
 def _blob(rng: np.random.Generator, largest_mm: float) -> BaseGeometry:
-    """A polygon of 3 to 8 corners or an ellipse round the origin, regular or not, full or hollow."""
+    """Draw a polygon of 3 to 8 corners or an ellipse round the origin, regular or not, full or hollow."""
     radius_mm, squeeze, turn_deg = rng.uniform(2.5, largest_mm), rng.uniform(0.4, 1), rng.uniform(0, 360)
     count = int(rng.integers(3, 10))
     if count == 9:
@@ -126,7 +126,7 @@ def _blob(rng: np.random.Generator, largest_mm: float) -> BaseGeometry:
 
 
 def _placed(rng: np.random.Generator, drawn: BaseGeometry, reach_mm: float) -> BaseGeometry | None:
-    """The drawing without its finest detail, moved somewhere within reach; None if it does not do."""
+    """Return the drawing without its finest detail, moved to a random place; None if too large, small or invalid."""
     fine = _FINEST_MM / 2
     shut = drawn.buffer(fine, join_style="mitre").buffer(-2 * fine, join_style="mitre")
     cleaned = shut.buffer(fine, join_style="mitre").simplify(0.02)

@@ -1,1 +1,1 @@
-"""The paper's tables and figures, and what follows from them."""
+"""The paper's tables and figures, and experiments derived from them."""

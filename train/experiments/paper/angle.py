@@ -16,7 +16,7 @@ ANGLES_DEG: Final = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Train an MTSR-2 for each angle, judge it on taps turned by that angle, write table and plot."""
+    """Train an MTSR-2 for each angle, evaluate it on taps turned by that angle, and write table and plot."""
     data = mixed(bench)
     validation, test = bench.frozen("validation"), bench.frozen("test")
     stsr, stsr_told = trained(bench, compact("stsr"), data, validation)

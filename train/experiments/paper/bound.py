@@ -1,9 +1,9 @@
-"""What K taps can tell of a surface that is known, at best, and what the networks make of them.
+"""Lower bound on the error from K taps of a surface that is given, compared with the networks' error.
 
-The Cramer-Rao bound with priors (van Trees): readings are linearised about each test tap in all that is not known, the
-surface's place, every tap's own pose error and force, and what the nuisances do. Its inverse information, carried over
-to the pattern, is the least mean squared error. A network may stay above it for two reasons, taps that tell no more or
-a network that does not hear it; the bound tells which.
+The Cramer-Rao bound with priors (van Trees): readings are linearised about each test tap in all unknowns, the surface's
+place, every tap's own pose error and force, and the nuisances. Its inverse information, carried over to the pattern, is
+the least mean squared error. A network may stay above the bound's gain from more taps for two reasons, taps without
+more information or a network that does not use it; the bound separates the two.
 """
 
 from collections.abc import Iterator
@@ -31,20 +31,20 @@ from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, as_poses, paper_
 TAPS: Final = (1, 2, 4, 7)
 ANGLES_DEG: Final = (ANGLE_STEP_DEG, 30.0)
 _NUDGE: Final = (0.15, 0.15, 1.5)
-"""Steps of the differences in x, y and angle, in [mm, mm, deg]."""
+"""Steps of the finite differences in x, y and angle, in [mm, mm, deg]."""
 _PLACE_SD: Final = (2.0, 2.0, 100.0)
-"""Of the surface under the pad: nearly nothing is known, in [mm, mm, deg]."""
+"""Prior deviation of the surface's place, wide enough to be nearly uninformative, in [mm, mm, deg]."""
 _FORCE_SD: Final = (0.5, 0.1)
-"""Share of the newest tap's force, which is on its way, and of the others', which ended at about the set force."""
+"""Prior deviation as a share of the force: of the newest tap, still rising, and of the others, at their ends."""
 _RAGGED: Final = 0.0025
-"""How far simulated readings lie off a smooth function of the place, as a share of their RMS: cells of the contact."""
+"""Deviation of simulated readings from a smooth function of the place, as a share of their RMS, from contact cells."""
 _CUT_NORMAL_SD: Final = 0.96
-"""Of a normal draw cut at two standard deviations, as nuisances are drawn."""
+"""Standard deviation of a normal draw cut at two standard deviations, as nuisances are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nudged:
-    """Clean readings of n targets' K taps, and the newest taps' patterns, as they are and nudged.
+    """Clean readings of n targets' K taps, and the newest taps' patterns, at their place and shifted about it.
 
     Attributes:
         counts: (n, K, 7, 48): as it is, x up and down, y up and down, angle up and down.
@@ -55,12 +55,12 @@ class Nudged:
     patterns: NDArray[np.float64]
 
     def slopes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Change with x, y [1/mm] and angle [1/deg]: (..., 7, m) to (..., 3, m)."""
+        """Return the derivatives by x, y [1/mm] and angle [1/deg]: (..., 7, m) to (..., 3, m)."""
         return (values[..., 1::2, :] - values[..., 2::2, :]) / (2 * np.array(_NUDGE)[:, None])
 
 
 def nudged(surfaces: tuple[str, ...], taps: int, angle_step_deg: float) -> Nudged:
-    """Tap the test targets of some surfaces, and all about them."""
+    """Tap the test targets of some surfaces, and shifted by one step to each side in x, y and angle."""
     offsets = np.zeros((7, 3))
     for axis, step in enumerate(_NUDGE):
         offsets[2 * axis + 1, axis], offsets[2 * axis + 2, axis] = step, -step
@@ -77,7 +77,7 @@ def nudged(surfaces: tuple[str, ...], taps: int, angle_step_deg: float) -> Nudge
 
 
 def least_mse(taps: Nudged, given: int, nuisances: Nuisances) -> NDArray[np.float64]:
-    """Least mean squared error of each target's pattern, (n,) in [mm^2], from its newest `given` taps."""
+    """Return the least mean squared error of each target's pattern, (n,) in [mm^2], from its newest `given` taps."""
     errors = []
     for counts, patterns in zip(taps.counts[:, :given], taps.patterns, strict=True):
         parts = list(_unknowns(counts, taps.slopes(counts), nuisances))
@@ -85,10 +85,10 @@ def least_mse(taps: Nudged, given: int, nuisances: Nuisances) -> NDArray[np.floa
         prior_sd = np.concatenate([np.full(len(part), sd) for part, sd in parts])
         ragged_var = _RAGGED**2 * np.square(counts[:, 0]).mean()
         noise_var = nuisances.noise_counts**2 + ragged_var + 1 / 12  # readings are whole counts
-        # In units of the prior, so that the unknowns' very different sizes do not spoil the inverse.
+        # Scaled by the prior deviations, so that the unknowns' very different sizes do not spoil the inverse.
         scaled = change * prior_sd[:, None]
         information = scaled @ scaled.T / noise_var + np.eye(len(scaled))
-        # Place, the newest tap's pose error, and its force are what the pattern depends on: they come first.
+        # The pattern depends on the place, the newest tap's pose error and its force alone, which come first.
         slopes = taps.slopes(patterns)
         carried = np.concatenate([slopes, slopes, patterns[:1]]) * prior_sd[:7, None]
         covariance = np.linalg.inv(information)[:7, :7]
@@ -99,7 +99,7 @@ def least_mse(taps: Nudged, given: int, nuisances: Nuisances) -> NDArray[np.floa
 def _unknowns(
     counts: NDArray[np.float64], slopes: NDArray[np.float64], nuisances: Nuisances
 ) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """What is not known: by how much each unknown changes the readings, (m, K, 48), and its standard deviation."""
+    """Yield the change of the readings by each unknown, (m, K, 48), with the unknown's standard deviation."""
     taps = len(counts)
     clean = counts[:, 0]
     turned = np.moveaxis(slopes, 1, 0)
@@ -124,12 +124,12 @@ def _unknowns(
     for axis, share in enumerate((1 / 8, 1 / 8, 1.0)):
         yield axes[axis : axis + 1], nuisances.thermal_drift_counts * share * _CUT_NORMAL_SD
     yield np.repeat(every[-taxels:], taps, axis=1), nuisances.thermal_drift_counts * 0.25
-    # As if it turned with the pad: true for taps a few degrees apart, and a bound a little too high for others.
+    # Taken to turn with the pad: true for taps a few degrees apart, and slightly too high a bound for others.
     yield axes, nuisances.earth_field_counts * np.sqrt(2 / 3)
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Work out the bound, put the networks beside it, write table and plot."""
+    """Compute the bound, add the networks, and write table and plot."""
     given = TAPS[:2] if bench.quick else TAPS
     surfaces = SURFACES[:2] if bench.quick else SURFACES
     rows: list[Row] = []

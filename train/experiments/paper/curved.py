@@ -1,4 +1,4 @@
-"""Curved surfaces: several PSFs by height against one, both against finite elements and the layer.
+"""Curved surfaces: several PSFs by height compared with one PSF, finite elements and the layer.
 
 Source: Wu and Liu 2024, Section VII, as future work.
 """
@@ -34,12 +34,12 @@ _PAD_PX: Final = 42
 _TIMED_RUNS: Final = 5
 
 Maps = NDArray[np.float32]
-"""(steps, 40, 40) in [mm]."""
+"""Maps (steps, 40, 40) in [mm]."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Press:
-    """One surface pressed in step by step, as the layer has it."""
+    """One surface pressed in step by step, as computed by the layer."""
 
     indentation_mm: NDArray[np.float32]
     depth_mm: Maps
@@ -51,7 +51,7 @@ class _Press:
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `curved`; finite elements are kept in the data folder.
 
-    The full run takes about ten minutes, nearly all of it the finite elements'.
+    The full run takes about ten minutes, nearly all of it for the finite elements.
     """
     meshes = _QUICK_MESHES if bench.quick else MESHES
     steps = 2 if bench.quick else STEPS
@@ -122,7 +122,7 @@ def _press(surface: str, indentation_mm: NDArray[np.float32]) -> _Press:
 
 
 def _patterns(press: _Press) -> dict[str, tuple[Maps, float]]:
-    """Patterns by one PSF and by several, and the seconds that all steps took together."""
+    """Return patterns by one PSF and by several, each with the time of all steps together in [s]."""
 
     def by_one() -> Maps:
         return tpsf_pattern(press.touching, press.indentation_mm, _PIXEL_MM)

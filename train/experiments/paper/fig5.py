@@ -1,8 +1,9 @@
 """Fig. 5: alpha and beta of the tactile PSF against the contact force, for two surfaces.
 
-One network learns from simulated taps of both surfaces, and is asked about taps at other poses. Scans are clean:
-the question is what the method sees, not how it bears noise. Beside the network's beta stands the one that explains
-each scan best, found by search: on a pad whose pressure is in proportion to the indentation it has no reason to grow.
+One network is trained on simulated taps of both surfaces, and evaluated on taps at other poses. Scans are clean,
+because
+the question is the method's behaviour without noise. The network's beta is compared with the beta that explains each
+scan best, by search: on a pad whose pressure is proportional to the indentation it has no reason to grow.
 
 Source: Wu and Liu 2024, Fig. 5.
 """
@@ -24,7 +25,7 @@ from train.report import Report, Row
 from train.surfaces.poses import random_targets
 
 SURFACES: Final = ("large circle", "small circle")
-"""The first has four times the area of the second."""
+"""Surfaces of the experiment; the first has four times the area of the second."""
 _FORCE_N: Final = 5.0
 _SCALE: Final = 10
 _BINS: Final = 8
@@ -95,20 +96,23 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def _tap(poses: int) -> tuple[list[str], Taps]:
-    """Tap both surfaces at random poses, in turns."""
+    """Tap both surfaces at random poses, alternating."""
     targets = random_targets(np.random.default_rng(5), poses * len(SURFACES), SURFACES)
     return targets.surfaces, SimulatedSensor().tap(targets.surfaces, targets.poses, _FORCE_N)
 
 
 def _scans(taps: Taps, which: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """All frames of some taps: counts (n, 3, rows, cols), and depth images (n, H, W) in 0..1."""
+    """Return all frames of some taps: counts (n, 3, rows, cols), and depth images (n, H, W) in 0..1."""
     counts = taps.counts[which]
     depth = resample(taps.touching[which, 0], FINE_SCALE, _SCALE)
     return counts.reshape(-1, *USPA44.scan_shape), np.repeat(depth, counts.shape[1], axis=0)
 
 
 def _search(net: PsfNet, read: PsfParameters, scans: Tensor, images: Tensor) -> Tensor:
-    """The beta (n,) in [mm] with which the best alpha leaves least of each scan unexplained, at the network's gamma."""
+    """Return the beta (n,) in [mm] that, with its best alpha, leaves the least of each scan unexplained.
+
+    Gamma is the network's.
+    """
     betas_mm = torch.linspace(0.1, 2.0, 39)
     wanted = pressed(scans).flatten(1)
     left: list[Tensor] = []

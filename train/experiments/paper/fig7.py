@@ -1,7 +1,7 @@
 """Fig. 7: HR patterns by tPSF, PSF and Depth against finite elements and against the layer, error and run time.
 
-The nine letters, tapped at their middle, at ten indentations. Every method knows where the surface touches and how
-deep it is; how each comes to millimetres is said in the report.
+The nine letters, tapped at their middle, at ten indentations. Every method is given the contact area and the
+indentation; the report states the conversion of each to millimetres.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ from train.surfaces.named_surfaces import PLATES
 STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)
 MESHES: Final = (FINEST, Mesh(10, 4), Mesh(7, 6), Mesh(5, 4))
-"""The finest is the truth. The second has its nodes on the same pixels; the others' lie beside them."""
+"""Meshes, the finest as the truth. The second has nodes on the same pixels; the others' lie between pixels."""
 _QUICK_MESHES: Final = (Mesh(4, 2), Mesh(3, 2))
 _PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
 _PAD_PX: Final = 42
@@ -48,19 +48,19 @@ _ON_TOP_MM: Final = 1e-3
 _TIMED_RUNS: Final = 5
 
 Maps = NDArray[np.float32]
-"""(surfaces, steps, 40, 40) in [mm]."""
+"""Maps (surfaces, steps, 40, 40) in [mm]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One way to make patterns.
+    """Method that computes patterns.
 
     Attributes:
-        name: in tables.
-        maps: of all surfaces and steps, in a unit of its own if `scaled`.
-        time_s: of one surface's steps together, the fastest of a few runs.
-        scaled: brought to [mm] by one factor for all maps, by least squares against the truth.
-        note: what else was chosen.
+        name: as shown in tables.
+        maps: of all surfaces and steps, in the method's own unit if `scaled`.
+        time_s: of one surface's steps together, the fastest of a few runs, in [s].
+        scaled: True where one factor for all maps brings them to [mm], by least squares against the truth.
+        note: parameters that were selected for it.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Method:
     note: str = ""
 
     def against(self, truth: Maps) -> Maps:
-        """The maps in [mm], scaled to a truth where they have no scale of their own."""
+        """Return the maps in [mm], scaled to a truth where they have no scale of their own."""
         if not self.scaled:
             return self.maps
         return self.maps * np.float32((self.maps * truth).sum() / (self.maps**2).sum())
@@ -79,7 +79,7 @@ class Method:
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `fig7`; finite elements are kept in the data folder.
 
-    The full run takes about half an hour on one core, nearly all of it the finite elements'.
+    The full run takes about half an hour on one core, nearly all of it for the finite elements.
     """
     surfaces = PLATES[0][:2] if bench.quick else PLATES[0]
     meshes = _QUICK_MESHES if bench.quick else MESHES
@@ -133,7 +133,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 def _methods(
     surfaces: tuple[str, ...], indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating]
 ) -> list[Method]:
-    """What is quicker than finite elements, on all surfaces."""
+    """Return the methods that are faster than finite elements, applied to all surfaces."""
     margin = (_PAD_PX - 4 * SCALE) // 2
     depth_mm = np.stack([depth_image(relief(name), CENTRE, _PAD_PX, _PIXEL_MM) for name in surfaces])
     window = slice(margin, _PAD_PX - margin)
@@ -171,7 +171,7 @@ def _methods(
 
 
 def _with_best_psf(methods: list[Method], truth: Maps) -> list[Method]:
-    """Of the PSFs only the one nearest to a truth, called PSF."""
+    """Keep only the PSF nearest to the truth, under the name PSF."""
     psfs = [method for method in methods if method.name.startswith("PSF")]
     best = min(psfs, key=lambda method: float(_rms_mm(method, truth).mean()))
     named = replace(best, name="PSF", note=best.name.removeprefix("PSF, "))
@@ -193,7 +193,7 @@ def _time_s(found: list[Verdict]) -> float:
 
 
 def _rms_mm(method: Method, truth: Maps, heaps: bool = False) -> NDArray[np.float64]:
-    """Error of each map, (surfaces, steps) in [mm]; with `heaps`, also of what rises beside the contact."""
+    """Return the error of each map, (surfaces, steps) in [mm]; `heaps` includes heights around the contact."""
     if heaps:
         return rmse_percent(method.against(truth), truth, 100.0)
     pressed = np.maximum(truth, 0)
@@ -276,7 +276,7 @@ def _how(surfaces: int, steps: int, psf: str) -> str:
 
 
 def _verdict(methods: list[Method], truth: Maps, indentation_mm: NDArray[np.floating]) -> str:
-    """Fig. 7's claims, held against the figures."""
+    """Compare Fig. 7's claims with the figures."""
     lines = []
     for heaps in (False, True):
         errors = {method.name: _percent(method, truth, indentation_mm, heaps) for method in methods}

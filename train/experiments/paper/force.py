@@ -1,7 +1,7 @@
 """Error by contact force, small forces included.
 
-PSNR is taken against one full scale for all, so it is highest where there is least to be wrong about. What the force
-does to shapes shows in the error relative to the truth's own RMS, and in SSIM with the truth's own peak as full scale.
+PSNR is taken against one full scale for all, so it is highest for the shallowest patterns. The effect of the force on
+shapes shows in the error relative to the truth's own RMS, and in SSIM with the truth's own peak as full scale.
 
 Source: Wu and Liu 2024, Fig. 14.
 """
@@ -35,7 +35,7 @@ _QUICK_DRAWS: Final = 1
 _NETWORKS: Final = ("stsr", "mtsr2", "mtsr4")
 _CLASSICAL: Final = ("linear map", "bilinear")
 _REACHED: Final = 0.99
-"""Share of the force asked for that a press must come to: some are as deep as they may before."""
+"""Share of the requested force that a press must reach: some presses reach their largest indentation before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class Bin:
     """Scans of one range of forces.
 
     Attributes:
-        force_n: its bounds, in [N].
-        windows: (n, K, 3, rows, cols) in zeroed counts: the newest tap on its way, the earlier ones at their ends.
+        force_n: bounds of the range, in [N].
+        windows: (n, K, 3, rows, cols) in zeroed counts: the newest tap while pressing, the earlier ones at their ends.
         patterns: (n, H, W), truth, in [mm].
         touching: (n, H, W) bool.
         tap: (n,) index of the sequence.
@@ -91,7 +91,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def scans_between(sequences: Sequences, force_n: tuple[float, float], draws: int, seed: Sequence[int]) -> Bin | None:
-    """Scans of every sequence whose press comes that far, at forces drawn evenly over their logarithm; None if none."""
+    """Return scans of sequences that reach such forces, drawn log-uniformly; None if no sequence does."""
     rng = np.random.default_rng([*seed, 0])
     index = np.repeat(np.arange(len(sequences)), draws)
     wanted_n = np.exp(rng.uniform(log(force_n[0]), log(force_n[1]), len(index)))
@@ -108,7 +108,7 @@ def scans_between(sequences: Sequences, force_n: tuple[float, float], draws: int
 
 
 def errors(method: Method, scans: Bin) -> Figures:
-    """Every figure of every scan, (n,) each."""
+    """Return every metric of every scan, (n,) each."""
     patterns, truth = method.patterns(scans.windows), scans.patterns
     peak = truth.max(axis=(1, 2), keepdims=True)
     return {
@@ -121,7 +121,7 @@ def errors(method: Method, scans: Bin) -> Figures:
 
 
 def relative_error_percent(patterns: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.float64]:
-    """RMS error in [% of the truth's RMS], (n,) of maps (n, H, W)."""
+    """Return the RMS error in [% of the truth's RMS], (n,) of maps (n, H, W)."""
     error = np.mean((np.asarray(patterns, dtype=np.float64) - truth) ** 2, axis=(-2, -1))
     return 100 * np.sqrt(error / np.mean(truth.astype(np.float64) ** 2, axis=(-2, -1)))
 
@@ -142,7 +142,7 @@ def _row(method: Method, scans: Bin, found: Figures) -> Row:
 
 
 def _finding(bins: list[Bin], figures: dict[str, list[Figures]]) -> str:
-    """Whether more taps help more where the force is small, as the paper has it."""
+    """Compare the gain from more taps at small and large forces; in the paper it is larger at small ones."""
     lines: list[str] = []
     for place, scans in ((0, bins[0]), (-1, bins[-1])):
         relative = {name: found[place]["relative_percent"] for name, found in figures.items()}
@@ -160,7 +160,7 @@ def _finding(bins: list[Bin], figures: dict[str, list[Figures]]) -> str:
 
 
 def _draw(figure: Figure, bins: list[Bin], figures: dict[str, list[Figures]]) -> None:
-    """Three figures against the force; bands are the intervals."""
+    """Plot three metrics against the force, with bands for the intervals."""
     middle_n = [float(np.sqrt(scans.force_n[0] * scans.force_n[1])) for scans in bins]
     shown = {"psnr_db": "PSNR [dB]", "ssim_own": "SSIM at own scale", "relative_percent": "relative error [%]"}
     axes = figure.subplots(1, len(shown))

@@ -1,7 +1,7 @@
-"""Force through press, hold and release, from what patterns sum up to.
+"""Force through press, hold and release, from the volume of the patterns.
 
 A pattern's deformation summed over its area becomes newtons by one factor, fitted on training presses. There are no
-offsets, and no curve is shifted: what drifts, lags or stays behind shows.
+offsets, and no curve is shifted, so that drift, lag and residual loads remain visible.
 
 Source: Wu and Liu 2024, Fig. 15.
 """
@@ -46,7 +46,7 @@ _RATE_HZ: Final = 100.0
 _QUICK_RATE_HZ: Final = 20.0
 _TAPS: Final = 4
 _ANGLE: Final = 1
-"""Of the four test angles the one each surface is pressed at: 30 degrees, the paper's target."""
+"""Index of the test angle at which each surface is pressed: 30 degrees, the paper's target."""
 _FIT_PRESSES: Final = 600
 _FIT_FORCE_N: Final = (0.3, 8.0)
 _ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
@@ -55,7 +55,7 @@ CONDITIONS: Final = {"just zeroed": _ZEROED, "drifted": Nuisances()}
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """Something that goes with the force, and its factor to newtons."""
+    """Quantity that rises with the force, and its factor to newtons."""
 
     name: str
     measure: Callable[[Scans], NDArray[np.floating]]
@@ -63,11 +63,11 @@ class Gauge:
     newtons_per_unit: float = 1.0
 
     def fitted(self, scans: Scans) -> "Gauge":
-        """The same with the factor that brings it nearest to these scans' forces, least squares."""
+        """Return the gauge with the least-squares factor to these scans' forces."""
         return Gauge(self.name, self.measure, self.cost, fit_gain(self.measure(scans), scans.force_n))
 
     def force_n(self, scans: Scans) -> NDArray[np.floating]:
-        """Forces (n,) in [N]."""
+        """Return forces (n,) in [N]."""
         return self.newtons_per_unit * self.measure(scans)
 
 
@@ -123,7 +123,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def training_presses(data: Sequences, presses: int) -> Scans:
-    """Ends of training presses at forces drawn evenly, read by sensors just zeroed."""
+    """Return the ends of training presses at evenly drawn forces, read by sensors that were just zeroed."""
     data = data.newest(_TAPS)
     rng = np.random.default_rng([SEED, 1])
     index = rng.integers(len(data), size=presses)
@@ -168,7 +168,7 @@ def _row(condition: str, gauge: Gauge, presses: list[dict[str, float]]) -> Row:
 
 
 def _finding(condition: str, rows: list[Row]) -> str:
-    """The best way to the force, and what keeps it from being better."""
+    """Name the method with the least force error, and list the remaining errors."""
 
     def mean(row: Row, column: str) -> float:
         return float(str(row[column]).split()[0])
@@ -196,7 +196,7 @@ def _draw(
     gauges: list[Gauge],
     surface: str,
 ) -> None:
-    """Force against time, and found against true force, of one press under each condition."""
+    """Plot force against time, and estimated against true force, of one press under each condition."""
     axes = figure.subplots(len(shown), 2, width_ratios=(3, 2), squeeze=False)
     for (over_time, loop), (condition, (scans, found_n)) in zip(axes, shown.items(), strict=True):
         over_time.plot(course.time_s, scans.force_n, "k", label="true")

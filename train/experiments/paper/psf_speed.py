@@ -1,4 +1,4 @@
-"""How many HR patterns a second: batched convolutions against one 99 x 99 convolution per scan."""
+"""Speed in HR patterns a second: batched convolutions against one 99 x 99 convolution per scan."""
 
 import time
 from collections.abc import Callable
@@ -17,16 +17,16 @@ from train.report import Report, Row
 _SCALE = 10
 LEAST_TIMES = 100
 _SIDE = 99
-"""Of the direct kernel, as in the authors' code; 79 would already reach from any pixel of 40 x 40 to any other."""
+"""Side of the direct kernel in [px], as in the authors' code; 79 reaches between any two pixels of 40 x 40."""
 _BATCH = 64
-"""Small enough for the intermediate maps to stay in a core's cache."""
+"""Batch size, small enough for the intermediate maps to stay in a core's cache."""
 _DIRECT = "direct, 99 x 99 per scan"
 
 Route = Callable[[Tensor, Tensor, float, Kernel], Tensor]
 
 
 def direct(depth: Tensor, beta_mm: Tensor, pixel_mm: float, kernel: Kernel) -> Tensor:
-    """Convolve one map after the other with its own 99 x 99 kernel; (n, H, W), the maps' unit times [mm^2]."""
+    """Convolve each map with its own 99 x 99 kernel, one after the other; (n, H, W), the maps' unit times [mm^2]."""
     along_mm = (torch.arange(_SIDE) - _SIDE // 2) * pixel_mm
     radius_mm = torch.hypot(along_mm[:, None], along_mm[None, :])
     responses: list[Tensor] = []
@@ -38,7 +38,7 @@ def direct(depth: Tensor, beta_mm: Tensor, pixel_mm: float, kernel: Kernel) -> T
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Time the routes on the same maps in one run, in turns, and write the table.
+    """Time the routes on the same maps in one run, alternating, and write the table.
 
     Args:
         bench: if quick, fewer maps and rounds.
@@ -71,7 +71,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 def _compare(
     kernel: Kernel, routes: dict[str, Route], depth: Tensor, beta_mm: Tensor, maps: int, rounds: int
 ) -> list[Row]:
-    """Rates of the direct route, on the first `maps` alone, and of the others; and how far those are off."""
+    """Return the rates of the direct route, on the first `maps` alone, and of the others, with their differences."""
     pixel_mm = USPA44.pixel_pitch_mm(_SCALE)
     few, few_mm = depth[:maps], beta_mm[:maps]
     batches = list(zip(depth.split(_BATCH), beta_mm.split(_BATCH), strict=True))
@@ -101,7 +101,7 @@ def _compare(
 
 
 def _contacts(count: int) -> tuple[Tensor, Tensor]:
-    """Rectangles at random and a beta for each, of 0.3 to 3 mm."""
+    """Draw random rectangles and a beta for each, of 0.3 to 3 mm."""
     rng = np.random.default_rng(0)
     size = USPA44.rows * _SCALE
     depth = np.zeros((count, size, size), dtype=np.float32)
@@ -113,7 +113,7 @@ def _contacts(count: int) -> tuple[Tensor, Tensor]:
 
 
 def _best_of(rounds: int, timed: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Shortest time of each, in [s]; in turns, so that a busy machine meets all of them."""
+    """Return the shortest time of each in [s]; they alternate, so that load on the machine affects all of them."""
     best = dict.fromkeys(timed, float("inf"))
     for _ in tracked(range(rounds), "routes", "round"):
         for name, work in timed.items():

@@ -1,4 +1,4 @@
-"""Table III: all methods at x10, on the same targets, next to the paper's figures."""
+"""Table III: all methods at x10, on the same targets, compared with the paper's figures."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -35,13 +35,13 @@ SEED_NETWORKS: Final = ("srcnn", "srgan", "stsr", "mtsr2", "mtsr3", "mtsr4", "mt
 CLASSICAL: Final = ("bilinear", "bicubic", "linear map")
 COMPACT_NETWORKS: Final = ("stsr", "mtsr2", "mtsr4", "mtsr7")
 ONE_IN: Final = 8
-"""Of a tap's frames one in so many is judged."""
+"""Step between evaluated frames of a tap."""
 
 Sets = Mapping[str, FrozenSet]
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Train what lacks, judge everything, write table and plot."""
+    """Train absent networks, evaluate all methods, and write table and plot."""
     data = mixed(bench)
     sets = {split: bench.frozen(split) for split in ("validation", "test")}
     judged = {split: thinned(frozen, ONE_IN) for split, frozen in sets.items()}
@@ -104,7 +104,7 @@ def _row(
 
 
 def _epochs(rows: list[Row], sequences: int) -> str:
-    """How often each network of the paper has seen the data."""
+    """State the number of passes over the data in each training of the paper's networks."""
     of = {
         str(row["method"]): float(str(row["steps"])) * SEED_BATCH / sequences
         for row in rows

@@ -15,13 +15,13 @@ PAPER: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: 
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Train what lacks, judge each scale against the truth at that scale, write table and plot."""
+    """Train absent networks, evaluate each scale against the truth at that scale, and write table and plot."""
     data = mixed(bench)
     rows: list[Row] = []
     means = []
     for scale, (paper_db, paper_ssim) in tracked(PAPER.items(), "scales", "scale"):
         validation, test = (bench.frozen(split, scale=scale) for split in ("validation", "test"))
-        if scale != 10:  # the base is judged at its own scale
+        if scale != 10:  # the base is evaluated at its own scale
             trained(bench, at_scale(10), data, bench.frozen("validation"))
         net, told = bench.network(at_scale(scale), data, validation)
         row: Row = {"scale": f"x{scale}", "pattern": "{} x {}".format(*test.unit_patterns.shape[1:])}

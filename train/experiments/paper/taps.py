@@ -1,4 +1,4 @@
-"""Fig. 13: one to seven taps, by a network for each number, and by one of seven taps that is given fewer."""
+"""Fig. 13: one to seven taps, by a network for each number, and by one network of seven taps with fewer as input."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from train.surfaces.poses import MAX_TAPS
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Train what lacks, judge all on the same targets, write table and plot."""
+    """Train absent networks, evaluate all on the same targets, and write table and plot."""
     data = mixed(bench)
     validation, test = bench.frozen("validation"), bench.frozen("test")
     names = ["stsr", *(f"mtsr{taps}" for taps in range(2, MAX_TAPS + 1))]
@@ -57,7 +57,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 def _gain(
     found: dict[str, NDArray[np.float64]], stsr: dict[str, NDArray[np.float64]], tap: NDArray[np.integer]
 ) -> tuple[float, float, float]:
-    """PSNR over STSR's and its interval, in [dB]."""
+    """Return the PSNR over STSR's and its interval, in [dB]."""
     gain_db = found["psnr_db"] - stsr["psnr_db"]
     return (float(gain_db.mean()), *bootstrap_interval(gain_db, tap))
 

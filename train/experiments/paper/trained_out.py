@@ -1,4 +1,4 @@
-"""The paper's networks and compact ones, trained alike by the epoch: what is left of the distance between them."""
+"""Comparison of the paper's networks with compact ones after equal training by epochs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from train.networks.blocks import PatternNet
 from train.report import Report, Row, bootstrap_interval, with_interval
 
 Psnr = dict[str, NDArray[np.float64]]
-"""Of every frame of the test set, (n,) in [dB], by network."""
+"""PSNR of every frame of the test set, (n,) in [dB], by network."""
 
 _SHORT: Final = f"{OUT_EPOCHS // 4}"
 _WHOLE: Final = f"{OUT_EPOCHS}"
@@ -25,7 +25,7 @@ _ONE_TAP: Final = ", one tap given"
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Train what lacks, or take what is there; judge it, write table and plot."""
+    """Train absent networks, or load those that exist; evaluate them, and write table and plot."""
     sets = {split: bench.frozen(split) for split in ("validation", "test")}
     test = sets["test"]
     rows: list[Row] = []
@@ -70,7 +70,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def _plot(report: Report, rows: Sequence[Row]) -> None:
-    """Error against run time, and against passes."""
+    """Plot error against run time, and against passes."""
     with report.figure(size=(11, 5)) as figure:
         costs, passes = figure.subplots(1, 2, sharey=True)
         for row in rows:
@@ -111,7 +111,7 @@ def _course(name: str, told: Mapping[str, Any]) -> Row:
 
 
 def _verdicts(psnr: Psnr, taps: NDArray[np.integer]) -> str:
-    """Differences of what is there, tap by tap."""
+    """State the differences between the networks that exist, tap by tap."""
     asked = [(f"compact {name}", name) for name in psnr if not name.startswith("compact")]
     for kind in ("", "compact "):
         asked += [

@@ -1,9 +1,10 @@
-"""Fig. 16: surfaces that were not trained on. What do random figures in the training add, and what do they cost?
+"""Fig. 16: surfaces that were not trained on, and the gain and cost of random figures in the training.
 
-Three of the 18 surfaces are held out; of glyphs and polygons the tested ones are of another seed than the trained
-ones. All networks are one and the same; the training set differs. All figures make as many windows as all
-surfaces do: what is trained on surfaces alone is trained once as long and once on as many windows of the surfaces.
-Figures cost seen surfaces something, so there are networks that see fewer of them: few figures, or all of them rarely.
+Three of the 18 surfaces are held out; tested glyphs and polygons are of another seed than the trained ones. All
+networks
+are identical; the training set differs. All figures make as many windows as all surfaces do, so training on surfaces
+alone runs once for as long and once for as many windows of the surfaces. Figures reduce the accuracy on seen surfaces,
+so some networks see fewer of them: few figures, or all of them rarely.
 
 Source: Wu and Liu 2024, Fig. 16 and Sec. VI-C.
 """
@@ -37,17 +38,17 @@ TEST_SEED: Final = 999
 TEST_FIGURES: Final = 24
 GIVEN: Final = (1, 4)
 LEAST_LIFT_DB: Final = 1.5
-"""What random figures are to add on surfaces that were not trained on."""
+"""Least PSNR gain expected of random figures on surfaces that were not trained on, in [dB]."""
 MOST_LOSS_DB: Final = 0.3
-"""What they may cost on the others."""
+"""Largest PSNR loss accepted on the other surfaces, in [dB]."""
 
 _ALONE, _ALONE_HALF, _ALL_BOTH = "15", "15, half as long", "18 + figures"
 _FEW, _RARE, _BOTH = "15 + 833 figures", "15 + figures, 1 in 25", "15 + figures"
 _FEW_FIGURES: Final = 833
-"""A tenth of the windows."""
+"""Number of figures that make a tenth of the windows."""
 _RARE_SHARE: Final = 0.04
 _PAIRS: Final = ((_RARE, _ALONE), (_FEW, _ALONE), (_BOTH, _ALONE), (_BOTH, _ALONE_HALF))
-"""Training sets that are compared."""
+"""Pairs of training sets that are compared."""
 _OLD, _NEW, _GLYPHS, _POLYGONS = "15 seen", "3 held out", "glyphs", "polygons"
 _UNSEEN: Final = (_NEW, _GLYPHS, _POLYGONS)
 _ALL_UNSEEN: Final = "all unseen"
@@ -60,13 +61,13 @@ TRAININGS: Final[Mapping[str, Training]] = {
     _BOTH: replace(BASE, name="unseen-both"),
     _ALL_BOTH: BASE,
 }
-"""By training set."""
+"""Trainings by training set."""
 _SHOWN_OF: Final = {_NEW: 3, _GLYPHS: 2, _POLYGONS: 1}
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How one network did on one frozen set: (n,) PSNR in [dB], tap of each frame, mean width in [%]."""
+    """Score of one network on one frozen set: (n,) PSNR in [dB], tap of each frame, mean width in [%]."""
 
     psnr_db: NDArray[np.float64]
     tap: NDArray[np.integer]
@@ -74,11 +75,11 @@ class Score:
 
 
 _Scores = dict[tuple[str, str, int], Score]
-"""By training set, test set and taps given."""
+"""Scores by training set, test set and number of taps."""
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Train what lacks, judge, and write the report `unseen`."""
+    """Train absent networks, evaluate them, and write the report `unseen`."""
     tests = test_sets(bench)
     nets = _networks(bench)
     rows: list[Row] = []
@@ -114,14 +115,14 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def test_sets(bench: Workbench) -> dict[str, FrozenSet]:
-    """What is tested on, by name."""
+    """Return the test sets, by name."""
     figures = random_figures(TEST_FIGURES, TEST_FIGURES, TEST_SEED)
     surfaces = {_OLD: KNOWN, _NEW: HELD_OUT, _GLYPHS: figures[:TEST_FIGURES], _POLYGONS: figures[TEST_FIGURES:]}
     return {name: bench.frozen("test", these) for name, these in surfaces.items()}
 
 
 def training_sets(bench: Workbench) -> dict[str, Sequences]:
-    """What is trained on, by name; none but the last has ever met a held-out surface."""
+    """Return the training sets, by name; all but the last are without the held-out surfaces."""
     every, figures = bench.data("seen", SEEN), bench.data("figures", FIGURES)
     known = every.pick(~np.isin(every.surfaces, HELD_OUT))
     return {
@@ -135,7 +136,7 @@ def training_sets(bench: Workbench) -> dict[str, Sequences]:
 
 
 def verdict_rows(scores: Mapping[tuple[str, str, int], Score], given: int, mixed: str, alone: str) -> list[Row]:
-    """What random figures change on each test set against surfaces alone, and whether that is within the bound."""
+    """Return the PSNR change by random figures on each test set, against surfaces alone, with its bound."""
     rows: list[Row] = []
     for tested in (*_UNSEEN, _ALL_UNSEEN, _OLD):
         lift_db, tap = _lift_db(scores, tested, given, mixed, alone)
@@ -157,7 +158,7 @@ def verdict_rows(scores: Mapping[tuple[str, str, int], Score], given: int, mixed
 def _lift_db(
     scores: Mapping[tuple[str, str, int], Score], tested: str, given: int, mixed: str, alone: str
 ) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
-    """Change of the PSNR of every frame, and each one's tap; of all unseen surfaces, each tap once."""
+    """Return the PSNR change of every frame, and each frame's tap; taps of all unseen surfaces are numbered apart."""
     if tested != _ALL_UNSEEN:
         return scores[mixed, tested, given].psnr_db - scores[alone, tested, given].psnr_db, scores[
             alone, tested, given
@@ -172,7 +173,7 @@ def _lift_db(
 
 
 def _evenly(figures: Sequences, count: int) -> Sequences:
-    """So many of the figures, glyphs and polygons alike."""
+    """Return `count` of the figures, glyphs and polygons in equal shares."""
     return figures.pick(np.unique(np.linspace(0, len(figures) - 1, min(count, len(figures))).round().astype(int)))
 
 
@@ -229,7 +230,7 @@ def _plot_errors(report: Report, scores: _Scores) -> None:
 def _plot_shapes(
     report: Report, nets: Mapping[str, tuple[PatternNet, dict[str, Any]]], tests: Mapping[str, FrozenSet]
 ) -> None:
-    """Some surfaces that were not trained on, each at the end of its first tap."""
+    """Plot some surfaces that were not trained on, each at the end of its first tap."""
     columns: list[tuple[str, list[NDArray[np.float32]]]] = []
     for tested, most in _SHOWN_OF.items():
         frozen = tests[tested]

@@ -1,1 +1,1 @@
-"""The shipped models and the simulated sensor, held against other pads and real recordings."""
+"""The shipped models and the simulated sensor, evaluated on other pads and real recordings."""

@@ -1,8 +1,8 @@
-"""How true the deviations of the bundled networks are, and whether they are wide where the pad tells nothing.
+"""Calibration of the predicted deviations, in total and for features that the pad cannot resolve.
 
-A tap is a low pass twice over: the layer damps what is finer than its thickness, and taxels a pitch apart tell nothing
-for sure of waves shorter than two pitches. What lies beyond is a guess from the surfaces trained on, and the deviation
-should say so. Gratings of stripes, which no network has been trained on, ask that wave by wave.
+A tap is a low pass twice over: the layer damps features finer than its thickness, and taxels a pitch apart do not
+determine waves shorter than two pitches. Finer detail is a guess from the surfaces trained on, and the deviation should
+be wide there. Gratings of stripes, which no network has been trained on, test that wave by wave.
 """
 
 from collections.abc import Mapping
@@ -29,18 +29,18 @@ from train.report import Cell, Report, Row, with_interval
 NAMES: Final = ("stsr", "mtsr2", "mtsr4")
 LEVELS: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 BOUNDS_PERCENT: Final = (88.0, 92.0)
-"""What the 90 % interval is to cover of held-out taps."""
+"""Bounds of the share of held-out pixels that the 90 % interval is to cover, in [%]."""
 EDGES_MM: Final = (-np.inf, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0, np.inf)
-"""Bins of the distance to the contact's edge; inside it is negative."""
+"""Bins of the distance to the contact's edge, negative inside, in [mm]."""
 
 _TEST, _GLYPHS = "test", "unseen glyphs"
 
 _Found = dict[tuple[str, str], Intervals]
-"""By network and frozen set."""
+"""Intervals by network and frozen set."""
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Judge the bundled networks' deviations, and write the report `calibration`."""
+    """Evaluate the deviations of the networks, and write the report `calibration`."""
     data, validation = mixed(bench), bench.frozen("validation")
     nets = {name: trained(bench, compact(name), data, validation) for name in NAMES}
     sets = {_TEST: bench.frozen("test"), _GLYPHS: bench.frozen("test", random_figures(TEST_FIGURES, 0, TEST_SEED))}
@@ -88,7 +88,7 @@ _CORRELATION_CAPTION: Final = (
 
 
 def grating_rows(found: Intervals) -> list[Row]:
-    """Errors and deviations on gratings, by wavelength."""
+    """Return errors and deviations on gratings, by wavelength."""
     wavelength_mm = np.array([float(Path(name).stem.rpartition("-")[2]) for name in found.frozen.surface])
     spread = found.truth.std(axis=(1, 2))
     error = _rms(found.pattern - found.truth) / spread
@@ -113,7 +113,7 @@ def grating_rows(found: Intervals) -> list[Row]:
 
 
 def correlation(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Pearson's correlation along the last axis; 0 where one of them does not vary."""
+    """Return Pearson's correlation along the last axis; 0 where one of the two does not vary."""
     a = a - a.mean(axis=-1, keepdims=True, dtype=np.float64)
     b = b - b.mean(axis=-1, keepdims=True, dtype=np.float64)
     size = np.sqrt((a * a).sum(axis=-1) * (b * b).sum(axis=-1))
@@ -177,7 +177,7 @@ def _correlation_rows(found: _Found, distance_mm: Mapping[str, NDArray[np.float6
     rows: list[Row] = []
     for (name, tested), seen in found.items():
         count, tap = len(seen.frozen), seen.frozen.tap
-        # A pad that is touched all over has no edge: no pixel of it is nearer than another.
+        # A pad with contact all over has no edge, so no pixel is nearer to one than another.
         near = -np.nan_to_num(np.abs(distance_mm[tested]), posinf=0.0)[tap]
         back = np.abs(kept_back(seen.frozen.unit_patterns, seen.frozen.scale))[tap]
         followed = {"error": np.abs(seen.truth - seen.pattern), "kept back": back, "nearness to the edge": near}
@@ -236,7 +236,7 @@ def _surface_rows(found: _Found) -> list[Row]:
 
 
 def _mean(cell: Cell) -> float:
-    """Of what with_interval has written."""
+    """Return the mean from a cell that with_interval has written."""
     return float(str(cell).split()[0])
 
 

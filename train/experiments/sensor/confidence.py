@@ -1,7 +1,7 @@
-"""What the records say of a pattern's error, and of another tap's worth, against what came out.
+"""Expected error and expected gain of another tap, as in the records, compared with the errors that occurred.
 
-The tables in the bundled models' contracts were found at the validation position; here they are judged at the test
-position, and beyond what they were found on: lighter taps, new shapes, a noisy sensor, a dead taxel.
+The tables in the bundled models' contracts were fitted at the validation position; here they are evaluated at the test
+position, and outside the conditions of the fit: lighter taps, new shapes, a noisy sensor, a dead taxel.
 """
 
 from collections.abc import Mapping
@@ -29,13 +29,13 @@ from train.physics.sensor_noise import Nuisances
 from train.report import Report, Row, with_interval
 
 PARTS: Final = 8
-"""Bins of equally many frames, by what is expected of them."""
+"""Number of bins with equally many frames, ordered by the expectation."""
 _TEST: Final = "test"
 
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """Frames of a set with so many taps given, (n,) each: expected and true RMS error in [mm], and expected gain."""
+    """Frames of a set for one number of taps, (n,) each: expected and true RMS error in [mm], and expected gain."""
 
     tap: NDArray[np.integer]
     expected_mm: NDArray[np.float64]
@@ -44,7 +44,7 @@ class _Judged:
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Judge what the bundled models' records say of their error, and write the report `confidence`."""
+    """Evaluate the expected errors of the bundled models, and write the report `confidence`."""
     models = [ModelSession(path) for path in (bundled_models()[:2] if bench.quick else bundled_models())]
     sets = _sets(bench)
     found = {
@@ -93,7 +93,7 @@ def _sets(bench: Workbench) -> dict[str, FrozenSet]:
 
 
 def judged(model: Model, given: int, frozen: FrozenSet) -> _Judged:
-    """Expectations and errors of every frame, with the newest `given` taps."""
+    """Return expectations and errors of every frame, with the newest `given` taps."""
     about, error_mm, size_mm = doubts_and_errors(model, given, frozen)
     found = [
         expect_of(model.contract.confidence, given, *of) for of in zip(about.tolist(), size_mm.tolist(), strict=True)
@@ -107,7 +107,7 @@ def judged(model: Model, given: int, frozen: FrozenSet) -> _Judged:
 
 
 _Found = Mapping[tuple[str, str, int], _Judged]
-"""By model, set and taps given."""
+"""Results by model, set and number of taps."""
 
 
 def _reliability_rows(found: _Found) -> list[Row]:
@@ -150,7 +150,10 @@ def _stop_rows(model: Model, sets: Mapping[str, FrozenSet], found: _Found) -> li
 
 
 def taps_until_stop(gains: list[NDArray[np.float64] | None]) -> NDArray[np.int64]:
-    """Taps used in each frame, (n,), of the gains (n,) expected of another after 1, 2, ... taps; None for the last."""
+    """Return the taps used in each frame, (n,), from the gains (n,) expected of another after 1, 2, ... taps.
+
+    The gain after the last tap is None.
+    """
     first = gains[0]
     if first is None:
         raise ValueError("a network of one tap has nothing to stop")

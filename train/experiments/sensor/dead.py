@@ -1,11 +1,11 @@
-"""Dead taxels through the runtime's own road: what they cost found and unfound, how soon they are found, false alarms.
+"""Dead taxels in the runtime: errors with and without detection, delay of the detection, and false alarms.
 
-Taxels of a free pad fail; then the taps of a frozen frame come, and its scan goes through `edge.perception.runtime`
-with the bundled models: the pattern is the one that a robot would get. Unfound, faults are a few scans old, and what
-taxels send is fed in, as it was before there was a watch. On real recordings, which have no truth, a pattern with
-taxels hidden is compared with that of all.
+Taxels of a free pad fail; then the taps of a frozen frame follow, and its scan goes through `edge.perception.runtime`
+with the bundled models, so that the pattern is the one a robot would get. Without detection, faults are a few scans
+old, and the taxels' readings are used as they are. On real recordings, which have no truth, a pattern with taxels
+hidden is compared with the pattern from all taxels.
 
-Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no scan of theirs goes into a report.
+Recordings are read from TACTILE_RECORDINGS, or from next to the repository; none of their scans goes into a report.
 """
 
 import time
@@ -45,7 +45,7 @@ _BASELINE: Final = Baseline.of("4", _REST.astype(np.float32), created_unix_s=0.0
 _SCAN_NS: Final = 10_000_000
 _TAXELS: Final = USPA44.taxel_count
 _FREE_COUNTS: Final = np.array([0, 0, -100])[:, None, None]
-"""A free pad between taps, drifted below its zero, so that the lightest frames are contacts, and it is none."""
+"""Free pad between taps, drifted below its zero, so that the lightest frames are contacts and the free pad is not."""
 _FRAMES_APART: Final = 4
 _SCANS_APART: Final = 12
 _MASKS: Final = 8
@@ -53,13 +53,13 @@ _MASKS: Final = 8
 
 @dataclass
 class Told:
-    """What the runtime said of every frame.
+    """Output of the runtime for every frame.
 
     Attributes:
         patterns: (n, H, W) in [mm].
-        half_width_mm: (n, H, W) of 90 % intervals.
-        delays_scans: scans until every dead taxel was known, where they were.
-        run_time_us: of the frame's scan, inference and all.
+        half_width_mm: (n, H, W) of 90 % intervals, in [mm].
+        delays_scans: scans until every dead taxel was detected, for frames where it was.
+        run_time_us: of the frame's scan including inference, in [us].
     """
 
     patterns: list[NDArray[np.float32]] = field(default_factory=list)
@@ -108,13 +108,13 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | None, dead: int, fault: str) -> Told:
-    """Every frame, at the end of its taps, by a sensor with so many taxels dead.
+    """Run every frame, at the end of its taps, through a runtime whose sensor has `dead` taxels.
 
     Args:
-        model: of the runtime.
-        frozen: whose readings.
-        estimator: None: the taps come before the fault is found.
-        dead: taxels.
+        model: model of the runtime.
+        frozen: set whose readings are used.
+        estimator: fills in dead taxels; None: the taps come before the fault is detected.
+        dead: number of dead taxels.
         fault: one of FAULTS.
     """
     told = Told()
@@ -126,7 +126,7 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
         stuck = _REST.reshape(3, -1)
         if fault == "stuck at random":
             stuck = stuck + np.random.default_rng([SEED, 3, tap]).uniform(high * [[-1], [-1], [0]], high, (3, _TAXELS))
-        # Unlike readings that taxels are to believe, these may lie on one another: thresholds are told as they are.
+        # Readings may lie above one another's range here, so the contact thresholds are set explicitly.
         runtime = Runtime(
             model, source="replay", baselines={"4": _BASELINE}, estimator=estimator, on_counts=1.0, off_counts=0.5
         )
@@ -154,7 +154,7 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
 
 
 def _course(frozen: FrozenSet, frame: int, taps: int, free: int) -> Iterator[NDArray[np.integer]]:
-    """Zeroed scans (3, rows, cols): a free pad, the taps before with a free pad after each, and the frame."""
+    """Yield zeroed scans (3, rows, cols): a free pad, the taps before with a free pad after each, and the frame."""
     yield from [_FREE_COUNTS] * free
     for before in reversed(range(taps - 1)):
         yield from [frozen.earlier[frozen.tap[frame], before].astype(np.int32)] * 2
@@ -165,7 +165,7 @@ def _course(frozen: FrozenSet, frame: int, taps: int, free: int) -> Iterator[NDA
 def _fail(
     raw: NDArray[np.int32], failing: NDArray[np.bool_], fault: str, stuck: NDArray[np.floating | np.integer]
 ) -> None:
-    """Put into raw counts (3, taxels) what failing ones send."""
+    """Overwrite the failing taxels of raw counts (3, taxels) with the readings of the fault."""
     if fault == "silent":
         raw[:, failing] = ABSENT
     elif fault == "saturated":
@@ -194,7 +194,7 @@ def _row(model: ModelSession, frozen: FrozenSet, told: Told, dead: int, fault: s
 
 
 def _real_rows(folder: Path, estimator: TaxelEstimator, quick: bool) -> list[Row]:
-    """How far patterns of single scans move when taxels are hidden, left at rest or filled in as shipped."""
+    """Return the change of single scans' patterns when taxels are hidden, left at rest or filled in as shipped."""
     model = ModelSession(find_model("stsr"))
     sets = recorded_sets(folder)
     scans = np.concatenate([one.counts[:: _SCANS_APART * (20 if quick else 1)] for one in sets])

@@ -1,7 +1,7 @@
-"""The shipped model on every family of shapes on pads it has not met, beside baselines and what is possible.
+"""Evaluation of the shipped model on every family of shapes on unseen pads, with baselines and the oracle.
 
-Nothing here was chosen by these presses: networks, baselines, contact levels and the baseline that is called the best
-were all settled on training and validation presses, on other pads.
+No choice depended on these presses: networks, baselines, contact levels and the baseline that is called the best were
+settled on training and validation presses, on other pads.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ from train.report import Report, Row, with_interval
 
 TRAINING: Final = World(count=100_000, seed=1)
 VALIDATION: Final = World(count=1260, taps=4, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)
-"""As the Makefile makes data/gripped.npz and data/validation.npz."""
+"""Settings of data/gripped.npz and data/validation.npz in the Makefile."""
 _MODEL: Final = (NOTHING, ALL)
 
 
@@ -43,7 +43,7 @@ class Found:
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Judge, and write the report `families`."""
+    """Evaluate all methods, and write the report `families`."""
     wide = bench.wide_test()
     model = load_shipped(bench.models)
     validation = freeze_presses(bench.presses("validation", VALIDATION), SEED)
@@ -110,7 +110,7 @@ def _judged(model: ModelSession, baselines: list[Baseline], wide: FrozenPresses)
 
 
 def family_rows(found: Mapping[str, Found], best: str, wide: FrozenPresses) -> list[Row]:
-    """PSNR of every method on every family and on all, and how far the model is over the best baseline."""
+    """Return the PSNR of every method by family and in total, and the model's margin over the best baseline."""
     rows: list[Row] = []
     for family, which in _families(wide):
         psnr_db = {name: one.figures["psnr_db"][which] for name, one in found.items()}
@@ -139,7 +139,7 @@ def _detail_rows(found: Mapping[str, Found], best: str, wide: FrozenPresses) -> 
 
 
 def _families(wide: FrozenPresses) -> list[tuple[str, NDArray[np.bool_]]]:
-    """Names, in the catalogue's order, and which presses are of each; all at last."""
+    """Return names in the catalogue's order with a mask of each family's presses; `all` comes last."""
     family = wide.presses.family
     some = [(name, family == name) for name in SHARES if (family == name).any()]
     return [*some, ("all", np.ones(len(wide), dtype=bool))]

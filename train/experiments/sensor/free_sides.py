@@ -1,6 +1,6 @@
 """Free sides of the pad: finite elements of the whole pad against the infinite layer, bare and corrected.
 
-Also what grips of a box read, where recordings are there: which of them rise towards the sides as those do.
+Where recordings exist, readings of grips of a box are compared with the rise towards the sides in these models.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ _DIRECTIONS: Final = {"down": MOVEMENT.index("down_mm"), "out": MOVEMENT.index("
 
 
 def _contacts() -> dict[str, NDArray[np.bool_]]:
-    """Rigid flat faces by the patches that they press, each (196,)."""
+    """Return rigid flat faces as masks of the patches that they press, each (196,)."""
     x_mm, y_mm = (along.ravel() for along in np.meshgrid(_MEANS @ _CELLS_MM, _MEANS @ _CELLS_MM))
 
     def punch(at_x_mm: float, at_y_mm: float) -> NDArray[np.bool_]:
@@ -56,7 +56,7 @@ _CONTACTS: Final = _contacts()
 
 
 class _Pads(NamedTuple):
-    """One Poisson ratio: compliances (196, 196) in [mm/MPa] and movement (16, 5, 196) per patch."""
+    """Operators for one Poisson's ratio: compliances (196, 196) in [mm/MPa] and movement (16, 5, 196) per patch."""
 
     layer: Layer
     elements: NDArray[np.float64]
@@ -66,7 +66,7 @@ class _Pads(NamedTuple):
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Fit anew, compare, and write the report."""
+    """Repeat the fit, compare, and write the report."""
     from train.physics.whole_pad import WholePad  # here, because it needs FElupe
 
     report = Report("free_sides", folder, quick=bench.quick)
@@ -165,7 +165,7 @@ def _flat_row(
 
 
 def _quarter_to_all(movement: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(16, 5) of a quarter's (4, 5), even about both middle planes."""
+    """Return (16, 5) from a quarter's (4, 5), mirrored about both middle planes."""
     whole = np.empty((4, 4, 5))
     for sign_y, sign_x in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         rows, columns = (slice(2, 4) if sign > 0 else slice(1, None, -1) for sign in (sign_y, sign_x))
@@ -174,7 +174,7 @@ def _quarter_to_all(movement: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _operators(layer: Layer, elements: NDArray[np.float64], movement: NDArray[np.float64]) -> _Pads:
-    """The elements' with what their mesh lacks in the middle, where no side is felt, put in everywhere."""
+    """Return the operators; the elements' mesh error, taken in the middle where no side acts, is corrected."""
     patches = np.zeros((len(elements), _SIZE, _SIZE))
     for patch, load in enumerate(patches):
         row, column = np.divmod(patch, len(_MEANS))
@@ -189,7 +189,7 @@ def _operators(layer: Layer, elements: NDArray[np.float64], movement: NDArray[np
 
 
 def _compliance(sides: FreeSides, layer: Layer) -> NDArray[np.float64]:
-    """What the sides add, by patches, (196, 196) in [mm/MPa]."""
+    """Return the compliance that the sides add, by patches, (196, 196) in [mm/MPa]."""
     across, along = sides.profiles(layer, _CELLS_MM)
     falls, bells = across @ _MEANS.T, _MEANS @ along @ _MEANS.T
     pairs = np.einsum("ksx,ksu->kxu", falls, falls) * (_PATCH * _CELL_MM) ** 2
@@ -211,13 +211,13 @@ def _judge(pad: _Pads, added: NDArray[np.float64] | float, contact: str) -> tupl
 
 
 def _loads(pad: _Pads) -> NDArray[np.float64]:
-    """The contacts' pressures of force one, and half of each patch alone, (196, loads)."""
+    """Return the contacts' pressures of force one, and half of each patch alone, (196, loads)."""
     pressed = np.stack([_pressed(pad.elements, name) for name in _CONTACTS], axis=1)
     return np.concatenate([pressed / pressed.sum(axis=0), 0.5 * np.eye(len(pressed))], axis=1)
 
 
 def _left(pad: _Pads, sides: FreeSides | None, direction: str) -> NDArray[np.float64]:
-    """Movement left unexplained over the RMS of all, (taxels, loads)."""
+    """Return the unexplained movement over the RMS of all movement, (taxels, loads)."""
     axis, loads = _DIRECTIONS[direction], _loads(pad)
     missing = pad.elements_movement[:, axis] - pad.bare_movement[:, axis]
     if sides is not None:
@@ -234,7 +234,7 @@ def _movement_row(pad: _Pads, sides: FreeSides) -> Row:
 
 
 def _fitted(pads: list[_Pads], start: FreeSides, most: int) -> FreeSides:
-    """Constants that explain the elements of all pads best, from the kept ones on."""
+    """Return the constants that explain the elements of all pads best, starting from the kept ones."""
 
     def fit(values: NDArray[np.float64], left: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> list[float]:
         return least_squares(left, values, x_scale=np.abs(values), max_nfev=most).x.tolist()

@@ -1,8 +1,8 @@
-"""Identify sensors from their own contacts: simulated ones with known constants, then real recordings.
+"""Identification of sensors from their own contacts: simulated ones with given constants, then real recordings.
 
-Simulated sensors have a pad of their own and gains of their own, and every other nuisance of Nuisances; their presses
-are of no pad that the mixture was fitted to. Of real sensors nobody knows the gains: those of three trials predict a
-hidden taxel of the fourth.
+Simulated sensors each have a pad, gains and all other nuisances of Nuisances; the mixture was fitted to presses of
+other
+pads. The gains of real sensors are not available; those from three trials predict a hidden taxel of the fourth.
 """
 
 from dataclasses import replace
@@ -37,7 +37,7 @@ from train.physics.sensor_noise import Nuisances, read_windows
 from train.report import Report, Row
 
 SENSORS: Final = World(count=4800, per_pad=200, seed=9015)
-"""Other pads than those of seed 9014, on which what the estimate holds for sure was set."""
+"""Sensors on other pads than those of seed 9014, by which the estimate's confidence was set."""
 _FLAT_GRIPS: Final = 3
 _EVEN_MPA: Final = 0.02
 
@@ -74,7 +74,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 def read_by_sensor(
     presses: PressSet, world: World, number: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]:
-    """One sensor's readings (n, 3, rows, cols), true log-gains (channels,) and constants over their spread (p,)."""
+    """Return one sensor's readings (n, 3, rows, cols), true log-gains (channels,) and scaled constants (p,)."""
     pad = draw_pad(np.random.default_rng([world.seed, number]))
     chip = Nuisances().gain_spread * np.random.default_rng([world.seed, 1, number]).standard_normal(USPA44.scan_shape)
     gains = 1 + chip.clip(-2 * Nuisances().gain_spread, 2 * Nuisances().gain_spread)
@@ -138,7 +138,7 @@ def _simulated(
 
 
 def hidden_z_error(scans: ScanSet, found: Estimate, mixture: ContactMixture) -> NDArray[np.floating]:
-    """Error (n, taxels) in counts of each taxel's z from the other fifteen taxels, their readings over the gains."""
+    """Return the error (n, taxels), in counts, of each taxel's z predicted from the other fifteen and the gains."""
     gains = np.exp(found.log_gains)
     even = scans.counts.reshape(len(scans.counts), -1) / gains
     guess = neighbours_mean(even[:, Z])

@@ -1,4 +1,4 @@
-"""What it costs where the pad is not the nominal one: each constant off by so much, the same presses on every pad.
+"""Loss on pads other than the nominal one: each constant changed alone, with the same presses on every pad.
 
 Shapes, poses, depths, drags, friction and every draw of the nuisances are the same on all pads, so that losses are
 press by press. Half of the shapes are the paper's, half random figures.
@@ -39,21 +39,21 @@ _BEFORE: Final = "model before"
 
 @dataclass(frozen=True, slots=True)
 class OffPad:
-    """A pad with one constant off: by percent of its nominal value, or of the whole free sides."""
+    """Pad with one constant changed by percent of its nominal value, or of the whole free sides."""
 
     constant: str
     percent: int
 
     @property
     def pad(self) -> Pad:
-        """The pad."""
+        """Constants of the changed pad."""
         nominal = getattr(NOMINAL, self.constant)
         off = self.percent / 100 * (nominal if self.constant != "free_sides" else 1.0)
         return replace(NOMINAL, **{self.constant: nominal + off})
 
     @property
     def can_be(self) -> bool:
-        """Whether there are such pads: rubber does not swell when pressed, and sides do not push back."""
+        """True where such a pad is possible: rubber does not swell when pressed, and sides do not push back."""
         pad = self.pad
         return pad.poisson <= _MOST_POISSON and pad.free_sides >= 0
 
@@ -62,7 +62,7 @@ NONE_OFF: Final = OffPad("thickness_mm", 0)
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Press, judge, and write the report `pads`."""
+    """Make the presses, evaluate the models, and write the report `pads`."""
     percent, count = (PERCENT[-1:], 4) if bench.quick else (PERCENT, SHAPES)
     names = CONSTANTS[:2] if bench.quick else CONSTANTS
     off = [OffPad(name, sign * part) for name in names for part in percent for sign in (-1, 1)]
@@ -103,7 +103,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def loss_rows(scores: dict[str, dict[OffPad, NDArray[np.float64]]], off: list[OffPad]) -> list[Row]:
-    """What each method loses on each pad, down and up side by side."""
+    """Return the loss of each method on each pad, down and up side by side."""
     rows: list[Row] = []
     for constant, percent in dict.fromkeys((one.constant, abs(one.percent)) for one in off if one.percent):
         row: Row = {"constant": constant, "off by %": percent}
@@ -118,7 +118,7 @@ def loss_rows(scores: dict[str, dict[OffPad, NDArray[np.float64]]], off: list[Of
 
 
 def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
-    """Shapes under the pad with their families; cells are the same on every pad, and so heights are."""
+    """Draw shapes under the pad with their families; all pads have the same cells, and so the same heights."""
     rng = np.random.default_rng(SHAPES_SEED)
     gripped, error = GrippedPad(NOMINAL), Nuisances()
     families = [("paper", "glyph", "paper", "polygon")[number % 4] for number in range(count)]
@@ -128,7 +128,7 @@ def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
 
 @one_thread()
 def pressed(pad: Pad, shapes: list[tuple[str, Tapped]]) -> PressSet:
-    """All shapes pressed onto one pad."""
+    """Press all shapes onto one pad."""
     rng = np.random.default_rng(SHAPES_SEED + 1)
     families = np.array([family for family, _ in shapes])
     return press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes], 0)

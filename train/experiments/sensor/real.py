@@ -1,11 +1,12 @@
-"""Real grips along the shipped way: is a face over the whole pad drawn as one, and does a pattern explain the readings?
+"""Real grips through the shipped runtime: coverage of a face over the whole pad, and consistency with the readings.
 
-Recordings go through edge.perception.runtime with the default model and the baseline of a free pad. Nobody knows their
-true patterns, but both fingers hold a flat face that covers the pad: a pattern should cover it, evenly and without a
-hole. And it should read as the sensor did: it is degraded back to z by one linear operator, fitted on simulated
-presses, with no taxel hidden and with each in turn, which is silent then, as a broken one.
+Recordings go through edge.perception.runtime with the default model and the baseline of a free pad. Their true patterns
+are unknown, but both fingers hold a flat face that covers the pad: a pattern should cover it, evenly and without a
+hole.
+It should also explain the readings: it is degraded back to z by one linear operator, fitted on simulated presses, with
+no taxel hidden and with each in turn, which is then silent like a broken one.
 
-Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no reading of theirs goes into a report,
+Recordings are read from TACTILE_RECORDINGS, or from next to the repository; no reading of theirs goes into a report,
 patterns do.
 
 Source: Wu and Liu 2024, Eq. 7-8 (degradation).
@@ -53,18 +54,18 @@ _TAXELS: Final = USPA44.taxel_count
 _FITTED_ON: Final = 8000
 _QUICK_FITTED_ON: Final = 100
 _RIDGE: Final = 0.1
-"""Of the operator: it leaves least of z on validation presses."""
+"""Ridge of the operator that leaves the least of z on validation presses."""
 _TIMED_RUNS: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What the runtime made of the scans of one grip that are under load.
+    """Output of the runtime for the scans of one grip that are under load.
 
     Attributes:
-        zeroed: (n, 3, rows, cols) counts over the baseline, whole.
-        patterns: (n, H, W) in [mm]; NaN where there was none.
-        run_time_us: (n,) of the inference.
+        zeroed: (n, 3, rows, cols) counts over the baseline, without a hidden taxel.
+        patterns: (n, H, W) in [mm]; NaN where there was no pattern.
+        run_time_us: (n,) of the inference, in [us].
     """
 
     zeroed: NDArray[np.float32]
@@ -73,12 +74,12 @@ class Played:
 
 
 def play(grip: Grip, model: ModelSession, hidden: int | None = None) -> Played:
-    """All of a recording through a runtime as it is shipped, but that every scan is inferred.
+    """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred.
 
     Args:
         grip: the recording.
-        model: of the runtime.
-        hidden: a taxel that is silent from the first scan on.
+        model: model of the runtime.
+        hidden: taxel that is silent from the first scan on.
     """
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
@@ -98,19 +99,19 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None) -> Played:
 
 
 def share_touched(patterns: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Share of the pad that is above half of the pattern's 95th percentile, (n,) of patterns (n, H, W)."""
+    """Return the share of the pad above half of the pattern's 95th percentile, (n,) of patterns (n, H, W)."""
     return _above_half(patterns).mean(axis=(1, 2))
 
 
 def unevenness(patterns: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Standard deviation over mean in the inner 80 % of the pad, (n,) of patterns (n, H, W)."""
+    """Return standard deviation over mean in the inner 80 % of the pad, (n,) of patterns (n, H, W)."""
     rim = patterns.shape[1] // 10
     inner = patterns[:, rim:-rim, rim:-rim]
     return inner.std(axis=(1, 2)) / inner.mean(axis=(1, 2))
 
 
 def has_hole(patterns: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether pixels below that level lie within others above it, (n,) of patterns (n, H, W)."""
+    """Return True where pixels below half of the 95th percentile are enclosed, (n,) of patterns (n, H, W)."""
     return np.array([(binary_fill_holes(above) & ~above).any() for above in _above_half(patterns)], dtype=bool)
 
 
@@ -188,7 +189,7 @@ def _presses(bench: Workbench, name: str) -> PressSet:
 
 
 def _degraded(patterns: NDArray[np.floating], operator: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Readings of z (n, taxels) in counts."""
+    """Return z readings (n, taxels) in counts."""
     return patterns.reshape(len(patterns), -1) @ operator
 
 
@@ -230,7 +231,7 @@ def _cells(
 def _rms(
     said: Sequence[NDArray[np.floating]], z: Sequence[NDArray[np.floating]], *, interval: bool = True
 ) -> str | float:
-    """RMS error in counts, where anything was said; its interval by trial and sensor."""
+    """Return the RMS error in counts where predictions exist, with its interval by trial and sensor."""
     squares = [((one - true) ** 2).mean(axis=1) for one, true in zip(said, z, strict=True)]
     groups = np.repeat(np.arange(len(squares)), [len(part) for part in squares])
     joined = np.concatenate(squares)
@@ -271,7 +272,7 @@ def _unexplained(presses: PressSet, operator: NDArray[np.floating]) -> str:
 def _with_gains(
     grips: Sequence[Grip], degraded: Sequence[NDArray[np.floating]], z: Sequence[NDArray[np.floating]]
 ) -> list[NDArray[np.floating]]:
-    """Readings degraded back, with a gain for each taxel that suits the sensor's other trials."""
+    """Return the degraded readings with gains for each taxel, fitted on the sensor's other trials."""
     mended = []
     for grip, back in zip(grips, degraded, strict=True):
         mine = [other.free.sensor == grip.free.sensor and other.trial != grip.trial for other in grips]

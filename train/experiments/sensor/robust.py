@@ -1,4 +1,4 @@
-"""Error against severity: one nuisance at a time is made weaker and stronger, on the same clean test sequences."""
+"""Error against severity: one nuisance at a time is weakened and strengthened, on the same clean test sequences."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -82,15 +82,15 @@ def run(bench: Workbench, folder: Path) -> Path:
 def severity_of_loss(
     severities: Sequence[float], psnr_db: Sequence[float], default: int, loss_db: float
 ) -> float | None:
-    """Severity from which on more than a loss against that of index `default` is suffered; None if never.
+    """Return the severity from which the loss against index `default` exceeds `loss_db`; None if it never does.
 
-    Between severities PSNR goes along straight lines.
+    PSNR is interpolated linearly between severities.
 
     Args:
-        severities: the strongest last.
-        psnr_db: at each of them, in [dB].
-        default: index to start from.
-        loss_db: in [dB].
+        severities: from the weakest to the strongest nuisance.
+        psnr_db: PSNR at each of them, in [dB].
+        default: index of the reference, where the search starts.
+        loss_db: loss, in [dB].
     """
     level_db = psnr_db[default] - loss_db
     for i in range(default, len(severities) - 1):
@@ -134,7 +134,7 @@ def _bound(sweep: Sweep, model: str, psnr_db: list[float]) -> Row:
 
 
 def _finding(model: str, psnr_db: float, bounds: list[Row]) -> str:
-    """What costs a model most and least."""
+    """List the nuisances that cost a model most and least."""
     losses = sorted(
         (float(row["loss dB"] or 0), f"{row['nuisance']} {row['strongest']}") for row in bounds if row["model"] == model
     )
@@ -146,7 +146,7 @@ def _finding(model: str, psnr_db: float, bounds: list[Row]) -> str:
 
 
 def _against_one_tap(gains: Mapping[str, NDArray[np.float64]], tap: NDArray[np.integer]) -> str:
-    """Where four taps are better or worse than one beyond chance."""
+    """List the conditions where four taps are significantly better or worse than one."""
     one, four = _NETWORKS
     better, worse = [], []
     for place, gain_db in gains.items():
@@ -160,7 +160,7 @@ def _against_one_tap(gains: Mapping[str, NDArray[np.float64]], tap: NDArray[np.i
 
 
 def _draw(figure: Figure, sweeps: list[Sweep], curves: Curves) -> None:
-    """A plot for each nuisance, all to one scale; severities evenly spaced, as they about double."""
+    """Plot each nuisance on a common scale; severities are evenly spaced, because each is about twice the last."""
     axes = figure.subplots(ceil(len(sweeps) / _COLUMNS), _COLUMNS, sharey=True, squeeze=False).ravel()
     for place, sweep in zip(axes, sweeps, strict=False):
         at = range(len(sweep.severities))

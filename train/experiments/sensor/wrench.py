@@ -1,4 +1,4 @@
-"""The shipped model's force, twist and centre of pressure, on pads it has not met."""
+"""Force, twist and centre of pressure from the shipped model, evaluated on unseen pads."""
 
 from pathlib import Path
 from typing import Final
@@ -24,11 +24,11 @@ OFFSET_N: Final = 0.05
 _RIDGE: Final = 1e-4
 
 Loads = NDArray[np.float64]
-"""(n, 6): force x, y, z in [N], twist in [N mm], centre of pressure x, y in [mm], nan where nothing presses."""
+"""Loads (n, 6): force x, y, z in [N], twist in [N mm], centre of pressure x, y in [mm], nan without a press."""
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Sum up tractions, compare, and write the report `wrench`."""
+    """Integrate tractions, compare the methods, and write the report `wrench`."""
     wide = bench.wide_test()
     model = load_shipped(bench.models)
     truth = true_loads(wide)
@@ -69,12 +69,12 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def loads(traction_kpa: NDArray[np.floating], scale: int) -> Loads:
-    """What tractions (n, 3, h, w) of so many pixels a taxel pitch sum up to."""
+    """Return the loads of tractions (n, 3, h, w) with `scale` pixels a taxel pitch."""
     return np.array([_row(wrench_of(one, USPA44.pixel_pitch_mm(scale))) for one in traction_kpa.astype(np.float64)])
 
 
 def true_loads(frozen: FrozenPresses) -> Loads:
-    """The truth; centres of pressure are those of the true tractions."""
+    """Return the true loads, with centres of pressure from the true tractions."""
     presses = frozen.presses
     truth = loads(presses.traction_kpa, TRACTION_SCALE)
     truth[:, :3], truth[:, 3] = presses.force_n, presses.twist_nmm
@@ -86,7 +86,7 @@ def _row(wrench: Wrench) -> tuple[float, ...]:
 
 
 def error_cells(found: Loads, truth: Loads) -> Row:
-    """Errors as cells of a row; None for what a method does not give."""
+    """Return errors as cells of a row; quantities that a method does not estimate are left out."""
     off = found - truth
     z, tangential = off[:, 2], np.hypot(off[:, 0], off[:, 1])
     cells: Row = {
@@ -112,7 +112,7 @@ def _rms(error: NDArray[np.floating]) -> float:
 
 
 def _linear(bench: Workbench, wide: FrozenPresses) -> dict[str, Loads]:
-    """Force and twist by least squares from readings, and z force from summed z; no centres of pressure."""
+    """Return force and twist by least squares from readings, and z force from summed z, without centres of pressure."""
     training = bench.presses("gripped", TRAINING)
     readings = read_newest(training).reshape(len(training), -1).astype(np.float64)
     target = np.column_stack([training.force_n, training.twist_nmm])

@@ -1,10 +1,10 @@
-"""Drift of a free pad through the runtime's own road: what is left of it, and what of a hold is eaten.
+"""Drift of a free pad in the runtime: the remaining error at rest, and the share of a hold that is removed.
 
 Scans of 100 Hz are played as fast as they are computed, through `edge.perception.runtime` with a bundled model: an
-hour's hold takes less than half a minute. Beside it a baseline that stays as it was taken, and a high-pass of 0.01 Hz,
-which users of such sensors put over their readings. On real recordings the true drift is what is added to them.
+hour's hold takes less than half a minute. It is compared with a fixed baseline, and with a high-pass of 0.01 Hz, which
+users of such sensors apply to their readings. On real recordings the true drift is the drift that is added to them.
 
-Recordings are read where TACTILE_RECORDINGS says, else beside the repository; no scan of theirs goes into a report.
+Recordings are read from TACTILE_RECORDINGS, or from next to the repository; none of their scans goes into a report.
 """
 
 import math
@@ -37,7 +37,7 @@ MODEL: Final = "stsr-small-int8"
 RATE_HZ: Final = 100
 HIGH_PASS_HZ: Final = 0.01
 WARMING_COUNTS: Final = 120.0
-"""Of z, over 3.5 K, in the first minutes after power-up."""
+"""Drift of z over 3.5 K, in the first minutes after power-up, in [counts]."""
 WARMING_S: Final = 120.0
 FAST_COUNTS_PER_S: Final = 1000 / 60
 EARTH_COUNTS: Final = 36.0
@@ -46,7 +46,7 @@ _AXES: Final = np.array([1 / 8, 1 / 8, 1.0])[:, None, None]
 _REST: Final = np.broadcast_to(np.array([16_000, 16_400, 38_600])[:, None, None], USPA44.scan_shape)
 _BASELINE: Final = Baseline.of("4", _REST.astype(np.float32), 0.0, 100, "file")
 _LEAD_S: Final = 10.0
-"""Of rest before anything happens."""
+"""Rest before each scene, in [s]."""
 _CHUNK: Final = 5000
 _QUICK: Final = 20
 _COST_SCANS: Final = 20_000
@@ -56,14 +56,14 @@ Counts = NDArray[np.floating]
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What happens to a pad.
+    """Loads and drifts on a pad over time.
 
     Attributes:
-        name: of the row.
-        seconds: how long, after the lead.
-        drift: counts (n, 3, rows, cols) by which the rest level is off, at times (n,) in [s].
-        press: counts that a contact adds at such times.
-        noise: what a reading of a free, cold pad is off by, given a generator and n.
+        name: name of the row.
+        seconds: duration after the lead, in [s].
+        drift: function from times (n,) in [s] to the drift of the rest level, (n, 3, rows, cols) in counts.
+        press: function from the same times to the counts that a contact adds.
+        noise: function from a generator and n to the noise of a free, cold pad's readings.
     """
 
     name: str
@@ -75,19 +75,19 @@ class Scene:
 
 @dataclass
 class Tally:
-    """What came of a scene by one method.
+    """Result of a scene with one method.
 
     Attributes:
         square: sum of squared errors of rest readings.
-        free: scans in which nothing touches.
-        false: of these, in contact.
-        worst_counts: largest error of summed z among them.
-        eaten_counts: what the correction of z, summed, gained while presses lasted.
+        free: scans without contact.
+        false: scans among these that the method reports as contact.
+        worst_counts: largest error of summed z among the free scans.
+        eaten_counts: increase of the summed z correction during presses.
         press_counts: summed z of the presses when they ended.
-        steps: events.
-        run_s: of the runtime; 0 for the others.
-        scans: all.
-        trace: error of mean z at rest, a value a second.
+        steps: number of events.
+        run_s: run time of the runtime; 0 for the other methods.
+        scans: number of all scans.
+        trace: error of mean z at rest, one value a second.
     """
 
     square: float = 0.0
@@ -103,10 +103,10 @@ class Tally:
     def __post_init__(self) -> None:
         self.trace: list[float] = []
         self._last = (0.0, 0.0)
-        """Summed z of the last scan's press and correction."""
+        """Summed z of the last scan's press and of its correction."""
 
     def add(self, drift: Counts, press: Counts, correction: Counts, contact: NDArray[np.bool_]) -> None:
-        """Count scans (n, 3, rows, cols), in contact (n,) by what this method made of them."""
+        """Add scans (n, 3, rows, cols) to the tally, with the method's correction and contact state (n,)."""
         self.scans += len(drift)
         touched = press.any(axis=(1, 2, 3))
         error = drift - correction
@@ -127,7 +127,7 @@ class Tally:
         self.trace += np.where(touched, np.nan, error[:, 2].mean(axis=(1, 2)))[::RATE_HZ].tolist()
 
     def row(self, scene: str, method: str) -> Row:
-        """Of the table."""
+        """Return a row of the table."""
         pressed = self.press_counts + max(self._last[0], 0.0)
         eaten = round(100 * self.eaten_counts / pressed, 1) if pressed else None
         rms = math.sqrt(self.square / (48 * self.free)) if self.free else None
@@ -175,7 +175,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 
 def scenes() -> list[Scene]:
-    """Of simulated pads."""
+    """Return the scenes of simulated pads."""
     rng = np.random.default_rng([SEED, 41])
     taxels = _AXES * np.clip(rng.normal(1, 0.25, USPA44.scan_shape), 0.5, 1.5)
     frames = load_frozen_set(BUNDLE_DIR / "frozen.npz").newest.astype(np.float64)
@@ -199,7 +199,7 @@ def scenes() -> list[Scene]:
         return _times(4000.0 * ((t > 0) & (t % 8 > 6)), grasp)
 
     def hold(counts: float) -> Callable[[Counts], Counts]:
-        # With a creep of 1 % a decade of time, as pads have.
+        # With a creep of 1 % a decade of time, typical of pads.
         return lambda t: _times(counts * (t > 0) * (1 + 0.01 * np.log10(1 + np.maximum(t, 0))), grasp)
 
     def slow(t: Counts) -> Counts:
@@ -219,9 +219,9 @@ def scenes() -> list[Scene]:
 
 
 def recorded_scenes(paths: Sequence[Path]) -> list[Scene]:
-    """Of real recordings: a rest that is warmed up, and grips that last.
+    """Return the scenes of real recordings: a rest with warming, and grips that last.
 
-    Rows are drawn, so that there are enough: what sends a pad's noise is kept, in which order is not.
+    Rows of the recorded noise are resampled to get enough of them: their distribution is kept, their order is not.
     """
     rng = np.random.default_rng([SEED, 42])
     taxels = _AXES * np.clip(rng.normal(1, 0.25, USPA44.scan_shape), 0.5, 1.5)
@@ -231,7 +231,7 @@ def recorded_scenes(paths: Sequence[Path]) -> list[Scene]:
         rest = np.median(counts[-REST_SCANS:], axis=0)
         noises.append(counts[-REST_SCANS:] - rest)
         grips.append(counts[: len(counts) // 2] - rest)
-    # Only where the grip has been let go at the end are its last rows a free pad's.
+    # The last rows are a free pad's only where the grip was released at the end.
     let_go = [index for index, grip in enumerate(grips) if grip[:, 2].sum(axis=(1, 2)).mean() > ON_COUNTS]
     noise = np.concatenate([noises[index] for index in let_go] or noises)
     grip = np.concatenate([grips[index] for index in let_go] or grips)
@@ -328,7 +328,7 @@ def _cost(model: ModelSession, quick: bool) -> list[Row]:
         name: Runtime(model, source="emulated", baselines={"4": _BASELINE}, follow_drift=name == "followed")
         for name in took_us
     }
-    for first in range(0, count, 500):  # in turn, so that a busy neighbour slows both
+    for first in range(0, count, 500):  # alternating, so that load on the machine slows both
         part = scans[first : first + 500]
         for name, runtime in runtimes.items():
             start_s = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What a pad lets through, and patterns to ask that with: distances to an edge, what the layer damps, gratings."""
+"""Band limit of a pad: distances to a contact's edge, damping by the layer, and gratings to measure both."""
 
 from pathlib import Path
 from typing import Final
@@ -20,20 +20,23 @@ _GRATING_HEIGHT_MM: Final = 2.0
 
 
 def edge_distance_mm(touched: NDArray[np.bool_], scale: int) -> NDArray[np.float64]:
-    """Distance of pixels (n, H, W) to the contact's edge in [mm], below 0 inside; infinite where there is none."""
+    """Return the distance of pixels (n, H, W) to the contact's edge, in [mm].
+
+    The distance is below 0 inside the contact, and infinite where there is no edge.
+    """
     pixel_mm = USPA44.pixel_pitch_mm(scale)
     distance_mm = np.full(touched.shape, np.inf)
     for tap, contact in enumerate(touched):
         if contact.any() and not contact.all():
             outside, inside = (np.asarray(ndimage.distance_transform_edt(side)) for side in (~contact, contact))
-            # From the middle of a pixel to the middle of the nearest on the other side, the edge is half a pixel less.
+            # The edge lies halfway between the centres of two neighbouring pixels, so half a pixel is subtracted.
             pixels = np.where(contact, 0.5 - inside, outside - 0.5)
             distance_mm[tap] = pixel_mm * pixels
     return distance_mm
 
 
 def let_through(wavelength_mm: ArrayLike) -> NDArray[np.float64]:
-    """Share of a surface's wave that reaches the magnets, against that of an even press; 1 for the longest waves."""
+    """Return the share of a surface's wave that reaches the magnets, relative to an even press; 1 for long waves."""
     q_per_mm = 2 * np.pi / np.append(np.ravel(np.asarray(wavelength_mm, dtype=np.float64)), np.inf)
     layer = Layer()
     share = inner_displacement(layer, q_per_mm, Magnet().height_mm)[0] / surface_compliance(layer, q_per_mm)
@@ -41,7 +44,7 @@ def let_through(wavelength_mm: ArrayLike) -> NDArray[np.float64]:
 
 
 def kept_back(patterns: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
-    """What of patterns (n, H, W) the layer keeps from the magnets; windows are mirrored at their sides."""
+    """Return the part of patterns (n, H, W) that the layer keeps from magnets; windows are mirrored at the sides."""
     pixel_mm = USPA44.pixel_pitch_mm(scale)
     down_per_mm, right_per_mm = (np.arange(length) / (2 * length * pixel_mm) for length in patterns.shape[1:])
     waves_per_mm = np.hypot(down_per_mm[:, None], right_per_mm)
@@ -52,7 +55,7 @@ def kept_back(patterns: NDArray[np.floating], scale: int) -> NDArray[np.float64]
 
 
 def save_grating(path: Path, wavelength_mm: float) -> None:
-    """A mesh of parallel bars, half a wavelength wide, wider than the pad can see."""
+    """Write a mesh of parallel bars, half a wavelength wide, that is wider than the pad."""
     count = int(_GRATING_MM // wavelength_mm)
     bars = []
     for number in range(count):
@@ -64,7 +67,7 @@ def save_grating(path: Path, wavelength_mm: float) -> None:
 
 
 def gratings(bench: Workbench) -> FrozenSet:
-    """A frozen set of gratings of every wavelength, their meshes written where they lack."""
+    """Return a frozen set of gratings of every wavelength; meshes that do not exist yet are written."""
     names: list[str] = []
     for wave_mm in WAVELENGTHS_MM:
         path = (bench.data_folder / "gratings" / f"grating-{wave_mm:g}.stl").resolve()

@@ -1,4 +1,4 @@
-"""Patterns without a network, fitted on the presses that networks are trained on: what a shipped model has to beat."""
+"""Methods without a network, fitted on the presses that networks are trained on: baselines for a shipped model."""
 
 import time
 from collections.abc import Mapping
@@ -32,13 +32,13 @@ _AT_ONCE: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """A way from the newest tap to a pattern.
+    """Method from the newest tap to a pattern.
 
     Attributes:
-        name: as tables show it.
+        name: as shown in tables.
         run: newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm].
         contact_level: share of a pattern's maximum from which a pixel counts as touched, chosen on validation.
-        validation_db: mean PSNR on validation.
+        validation_db: mean PSNR on validation, in [dB].
     """
 
     name: str
@@ -47,7 +47,7 @@ class Baseline:
     validation_db: float
 
     def run_time_us(self, newest: NDArray[np.float32]) -> float:
-        """Median time of one scan, of the first of (n, 3, rows, cols)."""
+        """Return the median run time of one scan in [us], measured on the first of (n, 3, rows, cols)."""
         times_s: list[float] = []
         for index in range(min(len(newest), _TIMED_SCANS)):
             started_s = time.perf_counter()
@@ -57,12 +57,12 @@ class Baseline:
 
 
 class NearestPresses:
-    """The mean pattern of the presses whose readings are nearest, in network units.
+    """Mean pattern of the training presses with the nearest readings, compared in network units.
 
     Args:
         newest: (m, 3, rows, cols) in zeroed counts.
         patterns: (m, H, W) in [mm].
-        count: of presses that a pattern is the mean of.
+        count: presses that are averaged for a pattern.
     """
 
     def __init__(self, newest: NDArray[np.float32], patterns: NDArray[np.float16], count: int) -> None:
@@ -72,7 +72,7 @@ class NearestPresses:
         self._count = count
 
     def __call__(self, newest: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Patterns (n, H, W) in [mm] of newest taps (n, 3, rows, cols) in zeroed counts."""
+        """Return patterns (n, H, W) in [mm] of newest taps (n, 3, rows, cols) in zeroed counts."""
         found: list[NDArray[np.float32]] = []
         for start in range(0, len(newest), _AT_ONCE):
             apart = self._squares - 2 * self._scaled(newest[start : start + _AT_ONCE]) @ self._known.T
@@ -87,15 +87,15 @@ class NearestPresses:
 
 
 def read_newest(presses: PressSet) -> NDArray[np.float32]:
-    """Newest taps (n, 3, rows, cols) of presses to fit on, each read once by a sensor of its own."""
+    """Return the newest taps (n, 3, rows, cols) of presses to fit on; a different sensor reads each press once."""
     return read_presses(presses.with_taps(1), Nuisances(), SEED)[:, 0]
 
 
 def fit_baselines(training: PressSet, validation: FrozenPresses) -> tuple[list[Baseline], str]:
-    """Fit all of them; what is chosen, is chosen on validation.
+    """Fit all baselines; whatever is selected is selected on validation.
 
     Returns:
-        The baselines, and the length and noise that kriging was left with.
+        The baselines, and a text with the length and noise selected for kriging.
     """
     newest, patterns = read_newest(training), training.patterns.astype(np.float32)
     check, truth = validation.windows(1)[:, 0], validation.patterns()
@@ -123,7 +123,7 @@ def _best_kriging(
     check: NDArray[np.float32],
     truth: NDArray[np.float32],
 ) -> tuple[tuple[float, float], NDArray[np.float32]]:
-    """Length and noise of the least error on validation, and the matrix, its factor fitted on training presses."""
+    """Return the length and noise with the least error on validation, and the matrix scaled to the training presses."""
     kriging = Kriging(GrippedPad(NOMINAL))
     scores: dict[tuple[float, float], float] = {}
     for length_mm, noise in product(LENGTHS_MM, NOISES):

@@ -1,4 +1,4 @@
-"""A press in time: its course, what a sensor reads along it, and how far a force found differs from the true one."""
+"""One press over time: its course, the readings of a sensor along it, and the error of an estimated force."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -19,17 +19,17 @@ PRESS_S, HOLD_S, RELEASE_S, REST_S = 2.0, 5.0, 1.0, 2.0
 _ENDS_S: Final = np.cumsum([PRESS_S, HOLD_S, RELEASE_S, REST_S])
 RANGE_N: Final = TEST_FORCE_N
 CLAIM_N: Final = 0.02 * RANGE_N
-"""A pattern that sums up to more than this claims a contact."""
+"""Volume force above which a pattern claims a contact, in [N]: 2 % of the range."""
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A press in time; the pad is free at 0 s.
+    """Course of one press; the pad is free at 0 s.
 
     Attributes:
-        rate_hz: of the scans.
-        time_s: of each scan, (t,), the first one a step after 0.
-        share: of the press, (t,): 1 at its set force.
+        rate_hz: scan rate, in [Hz].
+        time_s: time of each scan, (t,), in [s]; the first is one step after 0.
+        share: share of the press at each scan, (t,); 1 at its set force.
     """
 
     rate_hz: float
@@ -42,18 +42,18 @@ class Course:
         object.__setattr__(self, "share", np.interp(time_s, [0, *_ENDS_S], [0, 1, 1, 0, 0]))
 
     def phase(self, number: int) -> NDArray[np.bool_]:
-        """Scans of the press (0), the hold (1), the release (2) or the rest (3); a phase has its end, not its start."""
+        """Return the scans of the press (0), hold (1), release (2) or rest (3), each with its end but not its start."""
         return np.searchsorted(_ENDS_S, self.time_s - 0.5 / self.rate_hz) == number
 
 
 @dataclass(frozen=True, slots=True)
 class Scans:
-    """Scans with the truth that is asked for.
+    """Scans with their true force and volume.
 
     Attributes:
         windows: (n, K, 3, rows, cols) in zeroed counts.
         force_n: (n,) in [N].
-        volume_mm3: (n,) the true pattern's sum over its area, in [mm3].
+        volume_mm3: (n,) sum of the true pattern over its area, in [mm3].
     """
 
     windows: NDArray[np.float32]
@@ -62,7 +62,10 @@ class Scans:
 
 
 def pressed(sequences: Sequences, number: int, course: Course, nuisances: Nuisances) -> Scans:
-    """One sequence's newest tap along a course; one sensor reads all its taps, the earlier ones at their ends."""
+    """Return the scans of a sequence's newest tap along a course.
+
+    One sensor reads all taps of the sequence; the earlier taps are read at their ends.
+    """
     index, seed = np.array([number]), [SEED, 3, number]
     angle_deg = sequences.poses[index, :, 2]
     end = sequences.share_at_force(index, TEST_FORCE_N)
@@ -79,7 +82,7 @@ def pressed(sequences: Sequences, number: int, course: Course, nuisances: Nuisan
 
 
 def contact(scans: Scans, course: Course) -> NDArray[np.bool_]:
-    """Scans (n,) in which the runtime sees a contact."""
+    """Return the scans (n,) in which the runtime detects a contact."""
     tracker = TapTracker(taps=1)
     times_ns = np.rint(course.time_s * 1e9).astype(np.int64)
     return np.array(
@@ -90,7 +93,7 @@ def contact(scans: Scans, course: Course) -> NDArray[np.bool_]:
 def errors(
     true_n: NDArray[np.floating], found_n: NDArray[np.floating], gate: NDArray[np.bool_], course: Course
 ) -> dict[str, float]:
-    """Figures of one press, in [% of RANGE_N] or in [% of scans]."""
+    """Return the figures of one press, in [% of RANGE_N] or in [% of scans]."""
     resting, loaded = course.phase(3), ~course.phase(3)
     return {
         "error": _rms_percent(found_n - true_n),
@@ -105,9 +108,9 @@ def errors(
 
 
 def loop_percent(true_n: NDArray[np.floating], found_n: NDArray[np.floating], course: Course) -> float:
-    """Largest difference between press and release at equal true force, in [% of RANGE_N].
+    """Return the largest difference between press and release at equal true force, in [% of RANGE_N].
 
-    Both ways go along straight lines between scans; their last tenths, where they turn, do not count.
+    Both branches are interpolated linearly between scans; the tenths next to their turning points are left out.
     """
     at_n = np.linspace(0.1, 0.9, 33) * true_n.max()
     ways: list[NDArray[np.float64]] = []
@@ -119,7 +122,7 @@ def loop_percent(true_n: NDArray[np.floating], found_n: NDArray[np.floating], co
 
 
 def volume_mm3(patterns: NDArray[np.floating], scale: int) -> NDArray[np.floating]:
-    """What patterns (n, H, W) in [mm] sum up to over their area, (n,) in [mm3]."""
+    """Return the sum of patterns (n, H, W) in [mm] over their area, (n,) in [mm3]."""
     return metrics.volume_mm3(patterns, USPA44.pixel_pitch_mm(scale))
 
 

@@ -1,4 +1,4 @@
-"""What a network says of a frozen set: its patterns, and the interval in which it says each pixel lies."""
+"""Patterns that a network predicts for a frozen set, and the interval that it predicts for each pixel."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from train.report import Row, with_interval
 
 @dataclass(frozen=True, slots=True)
 class Intervals:
-    """Patterns of a frozen set's n frames with their deviations, beside the truth.
+    """Patterns and deviations predicted for the n frames of a frozen set, with the truth.
 
     Attributes:
         frozen: the frames.
@@ -30,15 +30,15 @@ class Intervals:
     deviation: NDArray[np.float32]
 
     def covered(self, level: float = LEVEL) -> NDArray[np.bool_]:
-        """Pixels whose truth lies within the interval, (n, H, W)."""
+        """Return a mask (n, H, W), true where the truth lies within the interval."""
         return np.abs(self.truth - self.pattern) <= half_width_mm(self.deviation, level)
 
     def width_percent(self, level: float = LEVEL) -> NDArray[np.floating]:
-        """How wide the intervals are, (n, H, W) in [% of the frame's indentation]: light taps count as firm ones."""
+        """Return the width of the intervals, (n, H, W), in [% of the frame's indentation]."""
         return 200 * half_width_mm(self.deviation, level) / self.frozen.indentation_mm[:, None, None]
 
     def cells(self) -> Row:
-        """Coverage and mean width of the 90 % interval, each with its interval by tap, as cells of a row."""
+        """Return coverage and mean width of the 90 % interval, each with its interval by tap, as cells of a row."""
         return {
             "covered %": with_interval(100 * self.covered().mean(axis=(1, 2)), self.frozen.tap, 1),
             "width %": with_interval(self.width_percent().mean(axis=(1, 2)), self.frozen.tap, 1),
@@ -46,10 +46,10 @@ class Intervals:
 
 
 def intervals(net: PatternNet, frozen: FrozenSet, given: int | None = None) -> Intervals:
-    """Ask a network about every frame, with the newest `given` taps or all it takes.
+    """Run a network on every frame, with the newest `given` taps or all that it takes.
 
     Raises:
-        CheckpointError: the network gives no deviations.
+        CheckpointError: the network predicts no deviations.
     """
     pattern, deviation = infer(net, frozen.windows(net.taps, given))
     if deviation is None:

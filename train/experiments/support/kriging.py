@@ -1,8 +1,8 @@
-"""Patterns by kriging: pressure and traction as Gaussian fields, seen by the taxels through the nominal pad.
+"""Patterns by kriging: pressure and traction as Gaussian fields, read by the taxels through the nominal pad.
 
-Both fields are of mean zero, with covariance exp(-d^2 / (2 length^2)); traction is weaker by a coefficient of friction.
-A pad's readings are linear in them while loads are light, and so is the deflection of its face: the pattern that is
-expected, given readings, is one matrix. Where the pressure cannot be negative, and what is touched, it does not know.
+Both fields have mean zero and covariance exp(-d^2 / (2 length^2)); traction is weaker by a coefficient of friction.
+A pad's readings are linear in the fields while loads are light, and so is the deflection of its face: the pattern
+expected from readings is one matrix. The method does not use that pressure is never negative, nor the contact area.
 
 Source: Rasmussen and Williams 2006, Eq. 2.23, with linear functionals of the field in place of its values.
 """
@@ -18,16 +18,16 @@ from train.physics.contact import ContactSolver
 from train.physics.gripped import GrippedPad
 
 FRICTION: Final = 0.4
-"""Deviation of either traction over that of the pressure."""
+"""Standard deviation of either traction component over that of the pressure."""
 _LIGHT_N: Final = 0.05
-"""On one cell: readings are in proportion to it within a per cent."""
+"""Load on one cell, in [N]; readings are proportional to it within one per cent."""
 
 
 class Kriging:
-    """The linear readings and deflections of one pad.
+    """Linear readings and deflections of one pad.
 
     Args:
-        pad: whose cells and constants; its taxels must be those of USPA44.
+        pad: its cells and constants are used; its taxels must be those of USPA44.
     """
 
     def __init__(self, pad: GrippedPad) -> None:
@@ -43,14 +43,14 @@ class Kriging:
                 for pressure, traction in fields
             ]
         )
-        # (3, 48, size, size) in counts per MPa, of pressure and tractions.
+        # (3, 48, size, size) in counts per MPa: pressure and the two tractions.
         self._readings = readings.reshape(len(fields), -1, pad.size, pad.size) / light_mpa
 
     def matrix(self, length_mm: float, noise: float) -> NDArray[np.float32]:
-        """What brings readings (n, 48) in counts to deflections (n, pixels) in [mm].
+        """Return the matrix from readings (n, 48) in counts to deflections (n, pixels) in [mm].
 
         Args:
-            length_mm: of the fields' smoothness.
+            length_mm: correlation length of the fields, in [mm].
             noise: variance of a reading's error over the mean variance of readings.
         """
         along_mm = np.arange(self._size) * self._cell_mm

@@ -1,4 +1,4 @@
-"""The methods that experiments compare, compact networks and classical ones: each a call from windows to patterns."""
+"""Methods that experiments compare, compact networks and classical ones, each a call from windows to patterns."""
 
 import time
 from collections.abc import Callable
@@ -28,11 +28,11 @@ _TIMED_RUNS: Final = 30
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A way from windows to patterns.
+    """Method from windows to patterns.
 
     Attributes:
-        name: as tables show it.
-        taps: that it looks at.
+        name: as shown in tables.
+        taps: taps of a window that the method uses.
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
         cost: parameters, multiply-accumulates and run time, as cells of a row.
         run: windows (n, taps, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm].
@@ -45,16 +45,16 @@ class Method:
     run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
 
     def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) of as many taps as it looks at, or more."""
+        """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
         return self.run(windows[:, : self.taps])
 
     def figures(self, frozen: FrozenSet) -> Figures:
-        """Every metric of every frame of a frozen set."""
+        """Return every metric of every frame of a frozen set."""
         return judge(self.patterns(frozen.windows(self.taps)), frozen, self.contact_level)
 
 
 def compact_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -> list[Method]:
-    """Compact networks by name, stsr, mtsr2, ..., trained on `data` where they are not there."""
+    """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
     validation = bench.frozen("validation")
     methods: list[Method] = []
     for name in names:
@@ -65,7 +65,7 @@ def compact_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -
 
 
 def classical_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -> list[Method]:
-    """Methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
+    """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
     if not path.exists():
         fitted = fit_classical(data, _QUICK_WINDOWS if bench.quick else CLASSICAL_WINDOWS)
@@ -92,7 +92,7 @@ def _infer(net: PatternNet, windows: NDArray[np.float32]) -> NDArray[np.floating
 
 
 def _run_time_ms(run: Callable[[NDArray[np.floating]], NDArray[np.floating]]) -> float:
-    """Median time of one scan."""
+    """Return the median run time of one scan, in [ms]."""
     scan = np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
     times_ms: list[float] = []
     for _ in range(_TIMED_RUNS):

@@ -1,4 +1,4 @@
-"""The shipped model on the nominal pad: the frozen test set, and figures that it has not met."""
+"""Evaluation of the shipped model on the nominal pad: the frozen test set, and figures that it was not trained on."""
 
 from dataclasses import replace
 from typing import Final
@@ -21,14 +21,14 @@ from train.report import Row
 
 TEST_FIGURES: Final = 24
 TEST_SEED: Final = 999
-"""Of the figures: those of reports/unseen.md."""
+"""Seed of the figures, the same as in reports/unseen.md."""
 NOMINAL_PAD: Final = Pad(**{name: getattr(NOMINAL, name) for name in INPUTS})
-"""What a sensor file of the nominal pad holds."""
+"""Constants that a sensor file of the nominal pad holds."""
 _KNOWN: Final = {NOTHING: None, PAD: NOMINAL_PAD, ALL: replace(NOMINAL_PAD, gains=(1.0,) * GAINS)}
 
 
 def nominal_rows(bench: Workbench, model: ModelSession) -> list[Row]:
-    """Errors on each set, with nothing known, the pad, and the pad and gains."""
+    """Return errors on each set with no constants, with the pad's constants, and with pad and gains."""
     even = Nuisances().without("gain_spread")
     figures = random_figures(TEST_FIGURES, TEST_FIGURES, TEST_SEED)
     kinds = {"glyphs": figures[:TEST_FIGURES], "polygons": figures[TEST_FIGURES:]}
@@ -49,7 +49,7 @@ def nominal_rows(bench: Workbench, model: ModelSession) -> list[Row]:
 
 
 def at_full_press(frozen: FrozenSet) -> FrozenSet:
-    """The last frame of every tap."""
+    """Return the last frame of every tap."""
     last = np.flatnonzero(np.diff(frozen.tap, append=-1) != 0)
     frames = ("newest", "tap", "indentation_mm", "force_n")
     return replace(frozen, **{name: getattr(frozen, name)[last] for name in frames})

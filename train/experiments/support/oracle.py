@@ -1,8 +1,8 @@
-"""What is possible where the surface is known: the simulator itself fitted to each reading, beside the shipped model.
+"""Best possible pattern where the surface is known: the simulator fitted to each reading, compared with the model.
 
-Ten numbers decide a press of a known flat surface on a known pad: x, y, turn, two slopes, depth, slide along x and y,
-twist, and friction. They have the Gaussian prior that they are drawn from; what sensors add to the physics counts as a
-Gaussian error. Gauss-Newton goes to the most probable press, whose pattern is the oracle's.
+Ten numbers define a press of a known flat surface on a known pad: x, y, turn, two slopes, depth, slide along x and y,
+twist, and friction. Their Gaussian prior is the distribution they are drawn from; errors of the sensor are taken for
+Gaussian. Gauss-Newton finds the most probable press, whose pattern is the oracle's.
 """
 
 from collections.abc import Iterator
@@ -38,14 +38,14 @@ SEED: Final = 31
 STEPS: Final = 4
 _NUDGE: Final = np.array([0.15, 0.15, 1.5, 0.002, 0.002, 0.01, 0.03, 0.03, 0.01, 0.2])
 _PRIOR_SD: Final = np.array([0.5, 0.5, 5.0, 0.005, 0.005, 0.12, 0.15, 0.15, 0.02, 0.4])
-"""Of x and y in [mm], turn in [deg], slopes, depth and slides in [mm], twist in [rad], and friction's logarithm."""
+"""Prior deviation of x and y in [mm], turn in [deg], slopes, depth and slides in [mm], twist in [rad], log friction."""
 _PRIOR_MEAN: Final = np.array([0, 0, 0, 0, 0, 0.27, 0, 0, 0, np.log(0.6)])
-"""The place's is where the surface is thought to lie."""
+"""Prior mean in the same order; the mean of the place is set to the nominal place of the surface."""
 _DEPTH: Final = 5
 _LEAST_DEPTH_MM: Final = 0.1
 _SHORTER: Final = (1.0, 0.5, 0.2)
 _MODEL_SHARE: Final = 0.03
-"""Of a reading, what hysteresis and cross-talk leave that no press explains."""
+"""Share of a reading that no press explains, from hysteresis and cross-talk."""
 
 
 _Fitted = tuple[FrozenPresses, NDArray[np.float32]]
@@ -57,7 +57,7 @@ class KnownSurface:
 
     Attributes:
         surface: its name.
-        pad: the sensor's.
+        pad: constants of the sensor's pad.
     """
 
     surface: str
@@ -72,7 +72,7 @@ class KnownSurface:
         return GrippedPad(self.pad)
 
     def press(self, numbers: NDArray[np.floating]) -> Presses:
-        """Presses of the ten numbers of each, (n, 10)."""
+        """Return the presses that the rows of (n, 10) define."""
         pad = self._gripped
         places = as_poses(numbers[:, :3])
         heights = -footprints([self._relief] * len(numbers), places, pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm
@@ -82,12 +82,12 @@ class KnownSurface:
         return pad.press(heights, depth_mm, numbers[:, 6:8], numbers[:, 8], np.exp(numbers[:, 9]))
 
     def fit(self, reading: NDArray[np.floating], start: NDArray[np.floating], steps: int) -> NDArray[np.float32]:
-        """Pattern (H, W) in [mm] of the most probable press.
+        """Return the pattern (H, W) in [mm] of the most probable press.
 
         Args:
-            reading: (48,) zeroed counts, over the gains.
-            start: the prior's mean, from which it is searched.
-            steps: of Gauss-Newton.
+            reading: (48,) zeroed counts, divided by the gains.
+            start: mean of the prior, where the search starts.
+            steps: Gauss-Newton steps.
         """
         here = start.copy()
         for _ in range(steps):
@@ -108,7 +108,7 @@ class KnownSurface:
 
 
 def error_covariance(reading: NDArray[np.floating], nuisances: Nuisances) -> NDArray[np.float64]:
-    """Covariance (48, 48) of what sensors of known gains add to a reading (48,)."""
+    """Return the covariance (48, 48) of the errors that sensors of known gains add to a reading (48,)."""
     taxels = len(reading) // 3
     drift = nuisances.thermal_drift_counts * np.repeat((1 / 8, 1 / 8, 1.0), taxels)
     axis = np.repeat(np.arange(3), taxels)
@@ -119,7 +119,7 @@ def error_covariance(reading: NDArray[np.floating], nuisances: Nuisances) -> NDA
 
 
 def oracle_rows(bench: Workbench, model: ModelSession) -> list[Row]:
-    """Errors of the oracle and of the model on the same presses."""
+    """Return the errors of the oracle and of the model on the same presses."""
     count, steps = (2, 1) if bench.quick else (PRESSES, STEPS)
     pool = joblib.Parallel(n_jobs=-1, return_as="generator")
     jobs = cast(Iterator[_Fitted], pool(joblib.delayed(_press_and_fit)(number, steps) for number in range(count)))
@@ -140,7 +140,7 @@ def oracle_rows(bench: Workbench, model: ModelSession) -> list[Row]:
 
 @one_thread()
 def _press_and_fit(number: int, steps: int) -> _Fitted:
-    """One press as its sensor reads it, and the oracle's pattern (H, W) of it."""
+    """Return one press as its sensor reads it, and the oracle's pattern (H, W) of it."""
     rng = np.random.default_rng([SEED, number])
     known = KnownSurface(str(rng.choice(SURFACES)), draw_pad(rng))
     place = turned_back(random_targets(rng, 1, [known.surface]), 1)[0, 0]

@@ -1,4 +1,4 @@
-"""How far patterns and forces are off, in the ways that reports of shipped models tell it."""
+"""Errors of patterns and forces in the forms that the reports of shipped models use."""
 
 from typing import Final
 
@@ -13,17 +13,17 @@ _HALVINGS: Final = 50
 
 
 def pooled_db(psnr_db: NDArray[np.floating]) -> float:
-    """PSNR of all frames as one, from each frame's: bad frames weigh more than in the mean."""
+    """Return the PSNR of all frames taken as one, in [dB]: bad frames weigh more than in the mean."""
     return float(-10 * np.log10(np.mean(10 ** (-psnr_db / 10))))
 
 
 def own_peak_db(psnr_db: NDArray[np.floating], truth: NDArray[np.floating], full_scale: float) -> NDArray[np.floating]:
-    """PSNR (n,) against each true pattern's own maximum, of truth (n, H, W), instead of the full scale."""
+    """Return the PSNR (n,) against the maximum of each true pattern (n, H, W) in place of the full scale, in [dB]."""
     return psnr_db + 20 * np.log10(truth.max(axis=(-2, -1)) / full_scale)
 
 
 def pattern_cells(figures: Figures, truth: NDArray[np.floating], full_scale: float, groups: NDArray[np.integer]) -> Row:
-    """Errors of patterns as cells of a row; intervals by group, of which frames are not independent."""
+    """Return errors of patterns as cells of a row, with intervals by group: frames of a group are not independent."""
     psnr_db = figures["psnr_db"]
     return {
         "PSNR dB": with_interval(psnr_db, groups),
@@ -36,9 +36,10 @@ def pattern_cells(figures: Figures, truth: NDArray[np.floating], full_scale: flo
 
 
 def share_beside(error: NDArray[np.floating], reading: NDArray[np.floating], offset: float) -> float:
-    """The p of 'p % of reading + offset' that errors (n,) keep in the root mean square; 0 where the offset is enough.
+    """Return the p for which 'p % of reading + offset' is the root mean square of errors (n,).
 
-    It is the p at which errors over (p / 100 |reading| + offset) have a root mean square of 1.
+    At this p the errors over (p / 100 |reading| + offset) have a root mean square of 1; it is 0 where the offset alone
+    suffices.
     """
     squares, size = np.square(error), np.abs(reading)
     low, high = 0.0, _MOST_SHARE

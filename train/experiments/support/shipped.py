@@ -1,4 +1,4 @@
-"""A shipped model on windows and pads, through the session that the runtime runs it with."""
+"""Shipped model applied to windows and pads through the session of the runtime."""
 
 import time
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ from firmware_bridge.scans.pad import Pad
 from train.data.frozen_presses import FrozenPresses
 
 NOTHING, FORCE, PAD, ALL = KNOWN = ("nothing", "counts per newton", "pad", "pad and gains")
-"""What may be known of a sensor: nothing, one constant of its pad, all of them, or these and its taxels' gains."""
+"""Levels of knowledge about a sensor: nothing, one constant of its pad, all constants, and these with taxel gains."""
 SHORT: Final = {NOTHING: "model", FORCE: "model, counts/N known", PAD: "model, pad known", ALL: "model, all known"}
-"""Names in tables."""
+"""Names of the levels in tables."""
 
 
 @dataclass(frozen=True, slots=True)
 class Inferred:
-    """What a model made of n windows.
+    """Output of a model for n windows.
 
     Attributes:
         patterns: (n, H, W) in [mm].
-        traction_kpa: (n, 3, h, w), or None where the model gives none.
-        run_time_us: median of a window, scaling included, on one thread.
+        traction_kpa: (n, 3, h, w), or None if the model has no traction output.
+        run_time_us: median of a window on one thread, scaling included, in [us].
     """
 
     patterns: NDArray[np.float32]
@@ -36,16 +36,16 @@ class Inferred:
 
 
 def load_shipped(folder: Path, name: str = DEFAULT_MODEL) -> ModelSession:
-    """The model of that name.
+    """Load the shipped model of that name.
 
     Raises:
-        ModelError: it is not there, or cannot be used.
+        ModelError: it does not exist, or cannot be used.
     """
     return ModelSession(folder / f"{name}.onnx")
 
 
 def known_pads(frozen: FrozenPresses, known: str) -> list[Pad | None]:
-    """What is known of each sequence's sensor, one of KNOWN."""
+    """Return the constants of each press's sensor that a level of KNOWN provides."""
     if known == NOTHING:
         return [None] * len(frozen)
     pads = [frozen.pad(index, gains=known == ALL) for index in range(len(frozen))]
@@ -57,8 +57,8 @@ def infer(model: ModelSession, windows: NDArray[np.float32], pads: Sequence[Pad 
 
     Args:
         model: the session.
-        windows: (n, taps, 3, rows, cols) in zeroed counts as they were read, of as many taps as the model takes.
-        pads: what is known of the n sensors.
+        windows: (n, taps, 3, rows, cols) in zeroed counts as read, with as many taps as the model takes.
+        pads: constants that are available for each of the n sensors.
     """
     contract = model.contract
     patterns, tractions, times_s = [], [], []
@@ -80,5 +80,5 @@ def infer(model: ModelSession, windows: NDArray[np.float32], pads: Sequence[Pad 
 
 
 def infer_presses(model: ModelSession, frozen: FrozenPresses, known: str) -> Inferred:
-    """Run a model on frozen presses, of whose sensors that much is known."""
+    """Run a model on frozen presses with the constants that a level of KNOWN provides."""
     return infer(model, frozen.windows(model.contract.taps), known_pads(frozen, known))

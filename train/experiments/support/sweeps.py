@@ -1,4 +1,4 @@
-"""Test sets by the severity of one nuisance: the others stay as they are, and so does every other draw."""
+"""Test sets by the severity of one nuisance; the other nuisances and every other draw stay the same."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,20 +17,20 @@ from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances
 from train.surfaces.poses import ANGLE_STEP_DEG, TARGET_ANGLES_DEG
 
 TAPS: Final = 4
-"""Of the longest window that is judged here."""
+"""Taps of the longest window evaluated here."""
 _DEFAULT: Final = Nuisances()
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One nuisance and how strong it is made.
+    """One nuisance and its severities.
 
     Attributes:
         name: of the nuisance.
         unit: of its severity.
-        severities: the strongest last.
-        default: the one at which all else is judged.
-        frozen: makes the frozen set of a severity.
+        severities: from the weakest to the strongest nuisance.
+        default: severity at which all other sweeps are evaluated.
+        frozen: function from a severity to its frozen set.
     """
 
     name: str
@@ -41,12 +41,12 @@ class Sweep:
 
 
 def plain_set(bench: Workbench) -> FrozenSet:
-    """The test set with every nuisance at its default."""
+    """Return the test set with every nuisance at its default."""
     return freeze(bench.held_out("test"), _DEFAULT, SEED, scale=SCALE)
 
 
 def all_sweeps(bench: Workbench, plain: FrozenSet) -> list[Sweep]:
-    """Every nuisance on the test sequences of a workbench; `plain` is their set with the defaults."""
+    """Return the sweeps over the test sequences of a workbench; `plain` is their set with the defaults."""
     clean = bench.held_out("test").at_scale(SCALE)
 
     def changed(**fields: object) -> FrozenSet:
@@ -95,7 +95,7 @@ def all_sweeps(bench: Workbench, plain: FrozenSet) -> list[Sweep]:
 
 
 def with_dead_taxels(frozen: FrozenSet, dead: float, seed: int = SEED) -> FrozenSet:
-    """The same with exactly so many taxels at rest on each tap's sensor; those of fewer are among those of more."""
+    """Return the set with exactly `dead` taxels at rest on each tap's sensor; fewer are a subset of more."""
     rows, cols = frozen.newest.shape[-2:]
     rank = np.random.default_rng([seed, 1]).random((len(frozen.surface), rows * cols)).argsort(axis=1)
     alive = (rank >= dead).reshape(-1, rows, cols)
@@ -107,7 +107,7 @@ def with_dead_taxels(frozen: FrozenSet, dead: float, seed: int = SEED) -> Frozen
 
 
 def with_lost_scans(frozen: FrozenSet, chance: float, seed: int = SEED) -> FrozenSet:
-    """The same where scans get lost, and what came before stands; the first frame of a tap always comes."""
+    """Return the set with random scans replaced by the scan before; the first frame of a tap is never lost."""
     came = np.random.default_rng([seed, 2]).random(len(frozen)) >= chance
     came |= np.diff(frozen.tap, prepend=-1) != 0
     heard = np.maximum.accumulate(np.where(came, np.arange(len(frozen)), 0))
@@ -115,10 +115,10 @@ def with_lost_scans(frozen: FrozenSet, chance: float, seed: int = SEED) -> Froze
 
 
 def mistaken(sequences: Sequences, wrong: int) -> Sequences:
-    """The same with the oldest `wrong` of TAPS taps on another surface, as when the robot has just moved on."""
+    """Return sequences whose oldest `wrong` of TAPS taps are on another surface, as after the robot has moved on."""
     counts, force_n = sequences.counts.copy(), sequences.force_n.copy()
     oldest = slice(TAPS - wrong, TAPS)
-    # Surfaces change slowest: so far on lies the next one, at the same position and angle.
+    # Surfaces change slowest, so at this distance lies the next surface, at the same position and angle.
     other = np.roll(np.arange(len(sequences)), -len(TARGET_ANGLES_DEG))
     for array in (counts, force_n):
         array[:, oldest] = array[other, oldest]
@@ -126,7 +126,7 @@ def mistaken(sequences: Sequences, wrong: int) -> Sequences:
 
 
 def in_reverse(frozen: FrozenSet) -> FrozenSet:
-    """The same with the earlier ones of TAPS taps oldest first."""
+    """Return the set with the earlier ones of TAPS taps in reverse order, oldest first."""
     earlier = frozen.earlier.copy()
     earlier[:, : TAPS - 1] = frozen.earlier[:, TAPS - 2 :: -1]
     return replace(frozen, earlier=earlier)

@@ -1,4 +1,4 @@
-"""What the experiments train, and on what: one list, so that no network is trained twice."""
+"""Networks that the experiments train, and their data, in one list so that no network is trained twice."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -14,22 +14,22 @@ from train.networks.blocks import PatternNet
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
 SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
-"""The 18 surfaces."""
+"""Sequences of the 18 surfaces."""
 FIGURES: Final = Generation(surfaces=random_figures(4500, 4500, seed=2), taps=MAX_TAPS, seed=2)
-"""Random figures, each once."""
+"""Sequences of random figures, each figure once."""
 SEQUENCES: Final = SEEN.count + FIGURES.count
-"""Of both together: a pass over the mixed data."""
+"""Sequences of both together: one pass over the mixed data."""
 
 _SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
-"""The STSR as long as the compact one from nothing; srgan on top of srcnn."""
+"""Training time of the paper's networks, in [min]: the STSR as long as the compact one; srgan on top of srcnn."""
 _SEED_MINUTES_MORE: Final = 4.0
-"""Of every MTSR-K, on top of the STSR. All together two hours of processor time, on two cores."""
+"""Training time of every MTSR-K on top of the STSR, in [min]. All networks take two hours on two cores."""
 SEED_BATCH: Final = 16
 _SEED_RATE: Final = 5e-4
 _SEED_DECAY: Final = 1e-2
 _ENDLESS: Final = 1_000_000
 BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
-"""The compact STSR on whole taps of the paper's protocol, nothing known of the pad; the bundled ones learn presses."""
+"""Compact STSR trained on whole taps of the paper's protocol without pad constants; bundled models train on presses."""
 _STAGE_STEPS: Final = 2000
 _STAGE_RATE: Final = 1e-3
 _SCALE_STEPS: Final = 2500
@@ -37,12 +37,12 @@ _ANGLE_STEPS: Final = 1500
 
 
 def mixed(bench: Workbench) -> Sequences:
-    """What the bundled models are trained on: the 18 surfaces and as many random figures."""
+    """Return the mixed data, the 18 surfaces and as many random figures."""
     return join([bench.data("seen", SEEN), bench.data("figures", FIGURES)])
 
 
 def by_angle(bench: Workbench, angle_step_deg: float) -> Sequences:
-    """The same with two taps, turned by another angle."""
+    """Return the mixed data with two taps that are turned by another angle."""
     if angle_step_deg == ANGLE_STEP_DEG:
         return mixed(bench)
     parts = {"seen": SEEN, "figures": FIGURES}
@@ -51,7 +51,7 @@ def by_angle(bench: Workbench, angle_step_deg: float) -> Sequences:
 
 
 def compact(name: str) -> Training:
-    """A compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
+    """Return the training of a compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
     if name == "stsr":
         return BASE
     taps = int(name.removeprefix("mtsr"))
@@ -60,7 +60,7 @@ def compact(name: str) -> Training:
 
 
 def at_scale(scale: int) -> Training:
-    """The compact STSR at another scale: the base's trunk, and pixels of its own."""
+    """Return the training of the compact STSR at another scale: the base's trunk with new output layers."""
     if scale == BASE.scale:
         return BASE
     recipe = Recipe(steps=_SCALE_STEPS, learning_rate=1e-3)
@@ -68,13 +68,13 @@ def at_scale(scale: int) -> Training:
 
 
 def at_angle(angle_step_deg: float) -> Training:
-    """The compact MTSR-2 for taps that are turned by an angle, from the STSR, which knows none."""
+    """Return the training of the compact MTSR-2 for taps turned by an angle, started from the STSR."""
     recipe = Recipe(steps=_ANGLE_STEPS, learning_rate=1e-3, given=given_taps(2))
     return Training(f"taps-mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start=BASE.name, seed=3)
 
 
 def alike(name: str) -> Training:
-    """A compact network trained on from the base for as long as every other of these."""
+    """Return a compact network's training from the base, equally long for every name."""
     if name != "stsr":
         return compact(name)
     recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE)
@@ -82,7 +82,7 @@ def alike(name: str) -> Training:
 
 
 def seed_size(network: str) -> Training:
-    """A network of the paper, by the clock."""
+    """Return the training of a network of the paper, limited by time."""
     starts = network.startswith("mtsr")
     recipe = Recipe(
         steps=_ENDLESS,
@@ -103,30 +103,30 @@ SEED_STSR_LONGER: Final = replace(
     recipe=replace(seed_size("stsr").recipe, minutes=_SEED_MINUTES_MORE),
     start="seed-stsr",
 )
-"""The STSR trained on for as long as MTSR-2 is from it: what is between the two is the second tap alone."""
+"""STSR trained on for as long as MTSR-2 is trained from it, so that the two differ by the second tap alone."""
 
 OUT_EPOCHS: Final = 40
-"""Passes over the mixed data of an STSR trained out from nothing."""
+"""Passes over the mixed data for an STSR trained to convergence from random weights."""
 OUT_EPOCHS_MORE: Final = 20
-"""Of each network that goes on from it."""
+"""Passes over the mixed data for each network that is trained on from it."""
 _OUT_BATCH: Final = 64
 _OUT_RATES: Final = {"paper": (1e-3, 5e-4), "compact": (2e-3, 5e-4)}
-"""Highest learning rate from nothing, and of what goes on. Of the paper's, 5e-4, 1e-3 and 2e-3 were tried."""
+"""Highest learning rate from random weights, and when trained on. For the paper's, 5e-4, 1e-3 and 2e-3 were tried."""
 
 
 def from_nothing(network: str, epochs: int) -> Training:
-    """A network of either kind, by the epoch."""
+    """Return the training of either kind of network from random weights, limited by epochs."""
     return Training(f"out-{network}-{epochs}", network, _out_recipe(network, epochs, goes_on=False))
 
 
 def gone_on(network: str, start: Training, epochs: int) -> Training:
-    """A network of the start's kind, trained on from it."""
+    """Return the training of a network of the start's kind, trained on from it."""
     name = f"out-{network}-{start.name.rpartition('-')[2]}+{epochs}"
     return Training(name, network, _out_recipe(network, epochs, goes_on=True), start=start.name)
 
 
 def epochs(training: Training) -> float:
-    """Passes over the mixed data, those included that its start has made."""
+    """Return the passes over the mixed data, including those of the training it starts from."""
     own = training.recipe.steps * training.recipe.batch / SEQUENCES
     return own + (epochs(_STARTS[training.start]) if training.start else 0.0)
 
@@ -159,13 +159,13 @@ OUT: Final = (
     ),
     from_nothing("compact-stsr", 4 * OUT_EPOCHS),
 )
-"""The paper's networks and compact ones, trained alike; the compact STSR until it gains little more."""
+"""Trainings of the paper's networks and compact ones, all alike; the compact STSR until it gains little more."""
 
 
 def trained(
     bench: Workbench, training: Training, data: Sequences, validation: FrozenSet
 ) -> tuple[PatternNet, dict[str, Any]]:
-    """A trained network and its report, and before it the one that it starts from."""
+    """Return a trained network and its report; the network that it starts from is trained first."""
     if training.start:
         trained(bench, _STARTS[training.start], data, validation)
     return bench.network(training, data, validation)

@@ -1,4 +1,4 @@
-"""What experiments share: datasets and networks made once and found again, figures of a network, and what it costs."""
+"""Workbench of the experiments: datasets and networks made once and kept, and errors and cost of networks."""
 
 import hashlib
 import json
@@ -45,13 +45,13 @@ _QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
 
 @dataclass
 class Workbench:
-    """Where experiments keep what takes long.
+    """Store of datasets and networks that take long to make.
 
     Attributes:
         data_folder: datasets, by name.
         checkpoints: trained networks, by name.
-        quick: everything tiny, to see that it runs.
-        found: networks brought from another machine are judged as they are, and those that are not there left out.
+        quick: everything tiny, to check that it runs.
+        found: True to evaluate networks brought from another machine as they are, and to leave out absent ones.
         models: folder of the shipped models.
         before: file of a model of an earlier release, to be compared with.
     """
@@ -64,25 +64,25 @@ class Workbench:
     before: Path | None = None
 
     def presses(self, name: str, world: World) -> PressSet:
-        """Presses of that world: read if they are there, else made."""
+        """Return the presses of that world, read if they exist, else made."""
         if self.quick:
             name, world = f"quick-{name}", replace(world, count=_QUICK_PRESSES, taps=1, per_pad=_QUICK_PRESSES // 2)
         self.data_folder.mkdir(parents=True, exist_ok=True)
         return make_presses(world, self.data_folder / f"{name}.npz")
 
     def wide_test(self) -> FrozenPresses:
-        """The wide frozen set."""
+        """Return the wide frozen set."""
         wide = load_frozen_presses()
         return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
 
     def data(self, name: str, config: Generation) -> Sequences:
-        """A dataset: read if it is there, else made."""
+        """Return a dataset, read if it exists, else made."""
         if self.quick:
             name, config = f"quick-{name}", replace(config, count=_QUICK_SEQUENCES, surfaces=config.surfaces[:18])
         return self._made(name, config)
 
     def network(self, training: Training, data: Sequences, validation: FrozenSet) -> tuple[PatternNet, dict[str, Any]]:
-        """A trained network and its report: read if it is there and was trained alike on these data, else trained."""
+        """Return a trained network and its report, read if the same training on these data exists, else trained."""
         if self.quick:
             training = _quick(training)
         path = self.checkpoints / f"{training.name}.pt"
@@ -94,7 +94,10 @@ class Workbench:
         return net, report
 
     def brought(self, training: Training) -> tuple[PatternNet, dict[str, Any]] | None:
-        """A network trained alike on any machine, where data differ in the last bits and so in their hash; or None."""
+        """Return a network trained by the same recipe on any machine, or None if it does not exist.
+
+        The hash of its data is not compared: data differ in the last bits between machines.
+        """
         if self.quick:
             training = _quick(training)
         path = self.checkpoints / f"{training.name}.pt"
@@ -106,7 +109,7 @@ class Workbench:
         return net, report
 
     def training_cells(self, report: Mapping[str, Any]) -> Row:
-        """How long a network was trained, those included that it started from, as cells of a row."""
+        """Return a network's training time, including that of the networks it started from, as cells of a row."""
         steps, elapsed_s = report["steps"], report["elapsed_s"]
         while (start := report["config"]["start"]) is not None:
             _, report = load_network(self.checkpoints / f"{start}.pt")
@@ -114,7 +117,7 @@ class Workbench:
         return {"steps": steps, "training min": round(elapsed_s / 60, 1)}
 
     def held_out(self, split: Split, surfaces: Sequence[str] = SURFACES, **options: Any) -> Sequences:
-        """Clean sequences at a held-out position: read if they are there, else made."""
+        """Return clean sequences at a held-out position, read if they exist, else made."""
         names = tuple(surfaces[:_QUICK_SURFACES] if self.quick else surfaces)
         config = Generation(surfaces=names, poses="paper", split=split, taps=MAX_TAPS, seed=SEED, **options)
         return self._made(f"{split}-{_short_hash(config)}", config)
@@ -127,7 +130,7 @@ class Workbench:
         scale: int = 10,
         **options: Any,
     ) -> FrozenSet:
-        """A frozen set made as the bundled one; of other surfaces, nuisances, scale or options if asked for."""
+        """Return a frozen set made like the bundled one, with other surfaces, nuisances, scale or options if passed."""
         frozen = freeze(self.held_out(split, surfaces, **options), nuisances or Nuisances(), SEED, scale=scale)
         return thinned(frozen, 8) if self.quick else frozen
 
@@ -137,11 +140,11 @@ class Workbench:
 
 
 Figures = dict[str, NDArray[np.float64]]
-"""Every metric of every frame, (n,) each, as edge.evaluation.evaluate gives them."""
+"""Every metric of every frame, (n,) each, as returned by edge.evaluation.evaluate."""
 
 
 def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
-    """Mean errors over a frozen set, PSNR with its interval by tap, as cells of a row."""
+    """Return mean errors over a frozen set as cells of a row, PSNR with its interval by tap."""
     return {
         f"{split} PSNR dB": with_interval(figures["psnr_db"], frozen.tap),
         f"{split} SSIM": round(float(figures["ssim"].mean()), 4),
@@ -153,7 +156,7 @@ def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
 
 
 def cost_cells(net: PatternNet) -> Row:
-    """Parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
+    """Return parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
     window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -172,7 +175,7 @@ def cost_cells(net: PatternNet) -> Row:
 
 
 def _quick(training: Training) -> Training:
-    """The same in miniature, under a name of its own."""
+    """Return the training in miniature, under its own name."""
     recipe = replace(training.recipe, steps=_QUICK_STEPS, batch=2, minutes=None)
     options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
@@ -180,7 +183,7 @@ def _quick(training: Training) -> Training:
 
 
 def thinned(frozen: FrozenSet, one_in: int) -> FrozenSet:
-    """A frame in so many, evenly over every tap: networks of the paper's size take long to judge."""
+    """Return one frame in `one_in`, evenly over every tap: networks of the paper's size take long to evaluate."""
     frames = ("newest", "tap", "indentation_mm", "force_n")
     return replace(frozen, **{name: getattr(frozen, name)[one_in // 2 - 1 :: one_in] for name in frames})
 
