@@ -10,7 +10,7 @@ from typing import Final, Literal, NamedTuple, get_args
 from firmware_bridge.links.base import Notice, NoticeKind
 
 EventKind = Literal[
-    NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level", "model"
+    NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level"
 ]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
@@ -35,7 +35,7 @@ class Event:
             Of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was asked for;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
             has ended without a baseline; "refused", something else that was asked for is not done; "rest_level", a
-            step in it, or its end; "model", another one makes the patterns.
+            step in it, or its end.
         sensor: name of the sensor, or None where it is about all, or none.
         detail: what the kind does not say, in a user's words.
 

@@ -168,7 +168,7 @@ FIELDS: Final = (
           out=_RECORD_NPZ, byte=76),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),
-    Field("event", _TEXT, "event", "what happened before this scan: another model and why, what came of zeroing "
+    Field("event", _TEXT, "event", "what happened before this scan: earlier taps forgotten, what came of zeroing "
           "again, a step in rest level", out=Out.RECORD),
     Field("vendor_force_n", _REAL, "scan.vendor_force_n", "force x, y, z on the pad by the vendor's server, while "
           "every taxel arrives; no such key without", decimals=4, parts=("x", "y", "z"), out=Out.RECORD,
