@@ -13,10 +13,11 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.scan_reader import POLL_S, Arrival, Source
+from edge.pipeline.scan_reader import Arrival, Source
 from edge.pipeline.silence import Silence
 from edge.validation import check_positive
 from firmware_bridge.links.base import Notice
+from firmware_bridge.silence import POLL_S
 
 
 class Stream:

@@ -13,11 +13,10 @@ from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.links.base import Link, Notice, SourceKind
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile
+from firmware_bridge.silence import POLL_S
 
 CAPACITY_SCANS: Final = 1024
 """Five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
-POLL_S: Final = 0.1
-"""How long a stop, a command or a silent link may go unnoticed."""
 
 
 class Arrival(NamedTuple):
