@@ -20,6 +20,7 @@ from edge.cli import main as cli
 from edge.errors import ModelError
 from edge.inference import bundled as bundle
 from edge.inference.onnx_session import ModelSession
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.pipeline.run_statistics import Statistics
 from edge.sinks.jsonl import JsonLinesSink
@@ -201,9 +202,9 @@ def test_a_load_changes_the_model_and_its_end_changes_it_back_and_the_records_sa
         ladder.model,
         source="device",
         baselines={"4": BASELINE},
-        on_counts=1000,  # one taxel alone is believed up to 1500 counts
+        # One taxel alone is believed up to 1500 counts.
+        options=RuntimeOptions(contact_on_counts=1000, every_scan=True),
         most_taps=ladder.most_taps,
-        reuse=False,
         clock_ns=clock,
     )
     sinks = [JsonLinesSink(str(tmp_path / "records.jsonl")), ModelSteps(ladder, runtime, clock), ListSink()]

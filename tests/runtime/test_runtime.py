@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.options import RuntimeOptions
 from edge.perception.result import mask_bits
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, TAXEL_SILENT_SCANS
@@ -227,13 +228,13 @@ def test_reset_forgets_the_taps_of_every_sensor_and_keeps_the_baseline():
 
 
 def test_thresholds_and_idle_time_are_the_callers():
-    runtime = make_runtime(on_counts=100, off_counts=50, idle_timeout_s=0.5)
+    runtime = make_runtime(options=RuntimeOptions(100, 50, idle_reset_s=0.5))
     used = []
     for number, press in ((0, 120), (1, 60), (2, 49), (3, 120), (100, 120), (101, 0), (200, 120)):
         used.append(runtime.push(make_scan(number, press_counts=press)).taps_used)
     assert used == [1, 1, 0, 2, 2, 0, 1]
     with pytest.raises(UsageError):
-        make_runtime(on_counts=10, off_counts=50)
+        make_runtime(options=RuntimeOptions(10, 50))
 
 
 def test_a_sensor_that_the_model_was_not_trained_for_is_refused():
