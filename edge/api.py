@@ -32,9 +32,9 @@ from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event
+from edge.perception.options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
-from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
 from edge.perception.wrench import Wrench
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands
@@ -245,7 +245,7 @@ def open_runtime(
     pad: Pad | Mapping[str, Pad] | None = None,
     contact_on_counts: float = ON_COUNTS,
     contact_off_counts: float = OFF_COUNTS,
-    idle_reset_s: float = IDLE_TIMEOUT_S,
+    idle_reset_s: float = IDLE_RESET_S,
     every_scan: bool = False,
     every_tap: bool = False,
     follow_drift: bool = True,
@@ -284,12 +284,9 @@ def open_runtime(
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,
-        on_counts=contact_on_counts,
-        off_counts=contact_off_counts,
-        idle_timeout_s=idle_reset_s,
-        reuse=not every_scan,
-        every_tap=every_tap,
-        follow_drift=follow_drift,
+        options=RuntimeOptions(
+            contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift
+        ),
         unix_time_s=source.unix_time_s,
     )
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet
 from edge.perception.change_gate import NOISE_COUNTS
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Model, Runtime
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import Scan, ScanSeries
@@ -57,8 +58,8 @@ class Saving:
 def savings(model: Model, frozen: FrozenSet) -> Iterator[Saving]:
     """All rows of a model: first nothing is left out, then one thing more in each."""
     scans, frames = stream(frozen, model.contract.taps)
-    yield _measured("nothing", model, frozen, scans, frames, idle=True, reuse=False, every_tap=True)
-    yield _measured("where nothing touches", model, frozen, scans, frames, reuse=False, every_tap=True)
+    yield _measured("nothing", model, frozen, scans, frames, idle=True, every_scan=True, every_tap=True)
+    yield _measured("where nothing touches", model, frozen, scans, frames, every_scan=True, every_tap=True)
     yield _measured("+ where nothing has changed", model, frozen, scans, frames, every_tap=True)
     if model.contract.taps > 1:
         yield _measured("+ taps that would not help", model, frozen, scans, frames)
@@ -124,7 +125,7 @@ def _measured(
     frames: Sequence[int],
     *,
     idle: bool = False,
-    reuse: bool = True,
+    every_scan: bool = False,
     every_tap: bool = False,
 ) -> Saving:
     """A row; `idle`: the network runs where nothing touches, too."""
@@ -134,9 +135,7 @@ def _measured(
         counted,
         source="replay",
         baselines={SENSOR: baseline},
-        idle_timeout_s=HELD_SCANS * _PERIOD_NS / 2e9,
-        reuse=reuse,
-        every_tap=every_tap,
+        options=RuntimeOptions(idle_reset_s=HELD_SCANS * _PERIOD_NS / 2e9, every_scan=every_scan, every_tap=every_tap),
     )
     nothing = np.zeros((model.contract.taps, *USPA44.scan_shape), dtype=np.float32)
     results = []

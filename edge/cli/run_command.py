@@ -10,6 +10,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TextIO
@@ -35,6 +36,7 @@ from edge.api import (
     open_sink,
     pump,
 )
+from edge.cli.run_options import runtime_options
 from edge.cli.user_commands import user_commands
 from edge.sinks.event_printer import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
@@ -97,19 +99,18 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 print(f"live page: {view.url}", file=sys.stderr, flush=True)
             if demo:
                 score = _open_score(model.contract, partial(_go_on, scores, view) if loops else lambda score: None)
+            asked = runtime_options(options)
+            if loops:
+                rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
+                asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
+            if score is not None:  # the demo is there to show what every scan takes, and what every tap gives
+                asked = replace(asked, every_scan=True, every_tap=True)
             runtime = open_runtime(
                 model,
                 source,
                 baselines=baselines,
                 counts_per_newton=options.counts_per_newton,
-                contact_on_counts=options.contact_on_counts,
-                contact_off_counts=options.contact_off_counts,
-                idle_reset_s=min(DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ), options.idle_reset_s)
-                if loops
-                else options.idle_reset_s,
-                # The demo is there to show what every scan takes, and what every tap gives.
-                every_scan=options.every_scan or score is not None,
-                every_tap=options.every_tap or score is not None,
+                **asdict(asked),
             )
             sinks: list[Sink] = [] if score is None else [score]
             fan = Fan(messages.say)

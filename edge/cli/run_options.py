@@ -5,11 +5,12 @@ Bench and doctor have options of their own: edge.bench.options, edge.doctor.opti
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL
-from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, check_thresholds
+from edge.perception.options import DEFAULTS, RuntimeOptions
 from edge.pipeline.baseline_capture import FEWEST_RECORDED
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole
@@ -179,8 +180,18 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
     for text in options.sink:
         check_sink(text)
     check_apart(options.sink)
-    check_thresholds(options.contact_on_counts, options.contact_off_counts)
+    runtime_options(options)
     return options
+
+
+def runtime_options(options: argparse.Namespace) -> RuntimeOptions:
+    """Return what of the flags is the runtime's, each by its own name; what has no flag is as by default.
+
+    Raises:
+        UsageError: thresholds or a time that cannot be.
+    """
+    given = vars(options)
+    return RuntimeOptions(**{name: given[name] for name in asdict(DEFAULTS) if name in given})
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
@@ -216,22 +227,22 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         "--contact-on-counts",
         metavar="N",
         type=positive,
-        default=ON_COUNTS,
-        help=f"summed z that begins a tap (default {ON_COUNTS:g})",
+        default=DEFAULTS.contact_on_counts,
+        help=f"summed z that begins a tap (default {DEFAULTS.contact_on_counts:g})",
     )
     add(
         "--contact-off-counts",
         metavar="N",
         type=positive,
-        default=OFF_COUNTS,
-        help=f"summed z that ends it (default {OFF_COUNTS:g})",
+        default=DEFAULTS.contact_off_counts,
+        help=f"summed z that ends it (default {DEFAULTS.contact_off_counts:g})",
     )
     add(
         "--idle-reset-s",
         metavar="T",
         type=positive,
-        default=IDLE_TIMEOUT_S,
-        help=f"forget earlier taps after so long without contact (default {IDLE_TIMEOUT_S:g})",
+        default=DEFAULTS.idle_reset_s,
+        help=f"forget earlier taps after so long without contact (default {DEFAULTS.idle_reset_s:g})",
     )
     add("--every-scan", action="store_true", help="infer also where nothing has changed since the pattern before")
     add("--every-tap", action="store_true", help="use also taps that are not expected to help")

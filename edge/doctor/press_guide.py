@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.pad_orientation import CORNERS, Press, corner_taxel
-from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
+from edge.perception.options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.geometry import USPA44, SensorGeometry
 
 HOLD_SCANS: Final = 20

@@ -10,11 +10,12 @@ from edge.doctor.examine import Examined
 from edge.doctor.findings import Finding
 from edge.doctor.press_findings import judge_press
 from edge.doctor.press_guide import GuidedPress
-from edge.doctor.watch import READ_TIMEOUT_S, SILENCE_S, Watch
+from edge.doctor.watch import Watch
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import deformation
 
 
@@ -96,11 +97,11 @@ class Visit:
         self._say(whose + guide.first)
         heard_s = self._clock_s()
         while not (guide.done or self._stop.is_set() or self._link.ended):
-            if self._clock_s() - heard_s > SILENCE_S:
-                why = f"no scan for {SILENCE_S:.0f} s: see to power and plug"
+            if self._clock_s() - heard_s > GIVEN_UP_S:
+                why = f"no scan for {GIVEN_UP_S:.0f} s: see to power and plug"
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
-            for scan in self._link.read(READ_TIMEOUT_S):
+            for scan in self._link.read(POLL_S):
                 if scan.sensor != name:
                     continue
                 heard_s = self._clock_s()

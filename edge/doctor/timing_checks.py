@@ -6,10 +6,10 @@ import numpy as np
 
 from edge.doctor.findings import Finding, Verdict
 from edge.doctor.scan_statistics import Samples
+from firmware_bridge.silence import LATEST_SCAN_S
 
 USUAL_HZ: Final = (70.0, 120.0)
 """Sensors of sixteen taxels were seen at 74 to 113 scans a second."""
-SILENT_S: Final = 2.0
 RATE_TOLERANCE: Final = 0.1
 _LOSS_LIMITS: Final = (0.001, 0.01)
 _OLD_LIMITS: Final = (0.1, 0.3)
@@ -69,7 +69,7 @@ def check_lost(samples: Samples, silent_s: float) -> Finding:
         samples: of the sensor.
         silent_s: for which nothing more came at the end, in [s].
     """
-    if silent_s > SILENT_S:
+    if silent_s > LATEST_SCAN_S:
         remedy = "the sensor fell silent: see to its power and its plug"
         return Finding("lost scans", "wrong", f"all of the last {silent_s:.0f} s", "", remedy)
     lost = samples.lost()

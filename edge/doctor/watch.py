@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
 
 from edge.doctor.can_id_monitor import HeardIds
 from edge.doctor.examine import Watched
@@ -14,10 +13,8 @@ from edge.validation import check_baselines, check_positive
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file.model import SensorFile
+from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import Baseline
-
-READ_TIMEOUT_S: Final = 0.1
-SILENCE_S: Final = 10.0
 
 
 class Watch:
@@ -83,9 +80,9 @@ class Watch:
         start_s = now_s = heard_s = self._clock_s()
         scans = 0
         while now_s - start_s < length_s and not (self._stop.is_set() or self.link.ended):
-            if now_s - heard_s > SILENCE_S:
+            if now_s - heard_s > GIVEN_UP_S:
                 break
-            for scan in self.link.read(READ_TIMEOUT_S):
+            for scan in self.link.read(POLL_S):
                 self.scans.setdefault(scan.sensor, []).append(scan)
                 heard_s = now_s
                 scans += 1

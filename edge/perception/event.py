@@ -9,9 +9,7 @@ from typing import Final, Literal, NamedTuple, get_args
 
 from firmware_bridge.links.base import Notice, NoticeKind
 
-EventKind = Literal[
-    NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level"
-]
+EventKind = Literal[NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level"]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
 NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]

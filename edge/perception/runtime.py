@@ -14,9 +14,10 @@ from edge.inference.expected_error import expect
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import TaxelEstimator, widening
 from edge.perception.event import Event, EventKind, Note, Untimed
+from edge.perception.options import DEFAULTS, RuntimeOptions
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
-from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS, TapTracker
+from edge.perception.tap_tracker import TapTracker
 from edge.perception.wrench import wrench_of
 from edge.validation import check_baselines, check_mountings, check_pads, check_positive
 from firmware_bridge.geometry import USPA44, SensorGeometry
@@ -72,20 +73,15 @@ class Runtime:
         mountings: which way a sensor's axes point, and its gains, by name; as wired without.
         pad: what is known of the pad of all sensors, or of each by name, for models that take any of it. Counts per
             newton that it lacks are those above.
-        on_counts: summed z at which a tap begins.
-        off_counts: summed z at which it ends.
-        idle_timeout_s: time without contact after which earlier taps are forgotten.
-        reuse: give the pattern before where nothing has changed beyond noise.
-        every_tap: use all taps there are, also those that are not expected to help.
-        follow_drift: let the rest level follow what a free pad reads.
+        options: where taps begin and end, and what may be left out.
         clock_ns: measures run time.
         unix_time_s: dates baselines that are taken, and tells how old a stored one is when its sensor is first heard;
             ages go on by scan time.
 
     Raises:
         ModelError: the model is for another sensor.
-        UsageError: contact thresholds, an idle time-out, counts per newton, a pad or a number of taps that cannot be,
-            or a baseline of another grid.
+        UsageError: counts per newton, a pad or a number of taps that cannot be, or a baseline or a mounting of another
+            grid.
     """
 
     def __init__(
@@ -99,12 +95,7 @@ class Runtime:
         counts_per_newton: float | Mapping[str, float] | None = None,
         mountings: Mapping[str, Mounting] | None = None,
         pad: Pad | Mapping[str, Pad] | None = None,
-        on_counts: float = ON_COUNTS,
-        off_counts: float = OFF_COUNTS,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        reuse: bool = True,
-        every_tap: bool = False,
-        follow_drift: bool = True,
+        options: RuntimeOptions = DEFAULTS,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
@@ -127,10 +118,10 @@ class Runtime:
         self._pad = pad
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
-        self._thresholds = (on_counts, off_counts, idle_timeout_s)
-        self._reuse = reuse
-        self._every_tap = every_tap
-        self._follow_drift = follow_drift
+        self._options = options
+        # Plain attributes: asked of every scan.
+        self._every_scan, self._every_tap = options.every_scan, options.every_tap
+        self._follow_drift = options.follow_drift
         self._clock_ns = clock_ns
         self._unix_time_s = unix_time_s
         self._sensors: dict[str, Sensor] = {}
@@ -268,7 +259,7 @@ class Runtime:
     def _unchanged(self, result: Result, due: "_Due") -> Result | None:
         """The result with the pattern before, where there is no need of another."""
         before = due.sensor.last
-        if not self._reuse or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
+        if self._every_scan or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
             return None
         result = replace(result, **{name: getattr(before, name) for name in MADE})
         return replace(result, reused_from=before.scan.number)
@@ -358,7 +349,7 @@ class Runtime:
 
     def _new_tracker(self) -> TapTracker:
         grid_shape = (self._geometry.rows, self._geometry.cols)
-        return TapTracker(self._model.contract.taps, *self._thresholds, grid_shape=grid_shape)
+        return TapTracker(self._model.contract.taps, self._options, grid_shape)
 
 
 def _age_notes(scan: Scan) -> tuple[Note, ...]:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Hashable
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +20,9 @@ from firmware_bridge.geometry import AXES, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import Pad
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import TAPS_FORGOTTEN_NS
 from firmware_bridge.zeroing.baseline import Baseline, BaselineEstimator, deformation
 from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
-
-LONGEST_GAP_NS: Final = 1_000_000_000
-"""Between two scans of one sensor: a tap is over within, and the slowest sensor on record gives four."""
 
 
 class Sensor:
@@ -135,7 +132,7 @@ class Sensor:
 
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
         """The newest reading of every taxel over the baseline (3, rows, cols); None without a baseline."""
-        if self._heard_ns is not None and scan.time_ns - self._heard_ns > LONGEST_GAP_NS:
+        if self._heard_ns is not None and scan.time_ns - self._heard_ns > TAPS_FORGOTTEN_NS:
             self.lose_touch()
         self._heard_ns = scan.time_ns
         before = self.watch.dead

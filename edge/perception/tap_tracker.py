@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import UsageError
+from edge.perception.options import DEFAULTS, RuntimeOptions
+from firmware_bridge.geometry import USPA44
 
-ON_COUNTS: Final = 1500.0
-"""Summed z at which a tap begins: about 1.3 N, twelve times the thermal drift of one taxel."""
-OFF_COUNTS: Final = 750.0
-IDLE_TIMEOUT_S: Final = 5.0
 MIN_TAP_SCANS: Final = 2
 """A touch seen in one scan only may be a flipped bit; it is reported, but not remembered as a tap."""
 
@@ -40,47 +38,30 @@ class TapState:
     window: NDArray[np.float32]
 
 
-def check_thresholds(on_counts: float, off_counts: float) -> None:
-    """Of contact, by summed z.
-
-    Raises:
-        UsageError: they cannot be.
-    """
-    if not 0 < off_counts <= on_counts < math.inf:
-        raise UsageError(f"contact thresholds are on {on_counts}, off {off_counts}: expected 0 < off <= on")
-
-
 class TapTracker:
     """Follows the taps of one sensor; allocates no array after construction."""
 
     def __init__(
         self,
         taps: int,
-        on_counts: float = ON_COUNTS,
-        off_counts: float = OFF_COUNTS,
-        idle_timeout_s: float = IDLE_TIMEOUT_S,
-        grid_shape: tuple[int, int] = (4, 4),
+        options: RuntimeOptions = DEFAULTS,
+        grid_shape: tuple[int, int] = (USPA44.rows, USPA44.cols),
     ) -> None:
         """Start without contact.
 
         Args:
             taps: K, the length of the window.
-            on_counts: summed z at which a tap begins.
-            off_counts: summed z below which it ends.
-            idle_timeout_s: time without contact after which earlier taps are forgotten, in [s].
+            options: where taps begin and end, and when earlier ones are forgotten.
             grid_shape: (rows, cols) of the sensor.
 
         Raises:
-            UsageError: one of these cannot be.
+            UsageError: no taps.
         """
         if taps < 1:
             raise UsageError(f"taps is {taps}, expected at least 1")
-        check_thresholds(on_counts, off_counts)
-        if not idle_timeout_s > 0:
-            raise UsageError(f"idle time-out is {idle_timeout_s} s, expected more than 0")
-        self._on_counts = on_counts
-        self._off_counts = off_counts
-        self._idle_timeout_ns = idle_timeout_s * 1e9
+        self._on_counts = options.contact_on_counts
+        self._off_counts = options.contact_off_counts
+        self._idle_reset_ns = options.idle_reset_s * 1e9
         self._window = np.zeros((taps, 3, *grid_shape), dtype=np.float32)
         self._shown = self._window.view()
         self._shown.setflags(write=False)
@@ -148,5 +129,5 @@ class TapTracker:
 
     def _forget_if_idle(self, time_ns: int) -> None:
         self._last_contact_ns = min(self._last_contact_ns, time_ns)
-        if time_ns - self._last_contact_ns > self._idle_timeout_ns:
+        if time_ns - self._last_contact_ns > self._idle_reset_ns:
             self.reset()

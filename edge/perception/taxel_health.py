@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from edge.perception.event import Note
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import TAXEL_SILENT_SCANS
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 HOLD_SCANS: Final = 5
@@ -16,8 +17,6 @@ HOLD_NS: Final = 90_000_000
 """And no longer than this from scan to scan, however few came meanwhile: what was pressed half a second ago is another
 press. A reading may have come 60 ms before the end of its scan, the longest pause in one: none is older than 150 ms.
 Held since it was taken, not since it came, which a reader who was kept from running does not know."""
-SILENT_SCANS: Final = 50
-"""A taxel not heard for so long is not lost for a moment: the user is told, and zeroing goes on without it."""
 STUCK_SCANS: Final = 20
 """A living taxel sends the same three counts twice in a quarter of the scans in which a quarter of the taxels are new:
 so torn are real grips at their source, and no run in them is longer than 3. Were scans independent, twenty in a row
@@ -98,8 +97,8 @@ class TaxelWatch:
 
     @property
     def silent_long(self) -> NDArray[np.bool_]:
-        """Taxels (rows, cols) not heard for SILENT_SCANS."""
-        return (self._age >= SILENT_SCANS) & ~self._saturated
+        """Taxels (rows, cols) not heard for TAXEL_SILENT_SCANS."""
+        return (self._age >= TAXEL_SILENT_SCANS) & ~self._saturated
 
     @property
     def may_be_estimated(self) -> bool:

@@ -10,10 +10,9 @@ from edge.terminal.progress_bar import Progress
 from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
-READ_TIMEOUT_S: Final = 0.1
-SILENCE_S: Final = 10.0
 FEWEST_RECORDED: Final = 30
 """Of a recording, for which nobody can wait: where a pad is free for half a second alone, this is what there is."""
 
@@ -51,13 +50,13 @@ def take_baselines(
         while not (baselines and baselines.keys() == skipped.keys()):
             if stop is not None and stop.is_set():
                 raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
-            taken = source.take(READ_TIMEOUT_S)
+            taken = source.take(POLL_S)
             if taken is None:
                 raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor were heard")
             if any(isinstance(heard, Scan) for heard in taken):
                 heard_s = clock_s()
-            elif clock_s() - heard_s > SILENCE_S:
-                silence = f"no scan from {source.name} for {SILENCE_S:.0f} s"
+            elif clock_s() - heard_s > GIVEN_UP_S:
+                silence = f"no scan from {source.name} for {GIVEN_UP_S:.0f} s"
                 raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor says what is wrong")
             for heard in taken:
                 if not isinstance(heard, Scan):

@@ -18,9 +18,8 @@ from typing import Final
 
 from firmware_bridge.links.base import Link, Notice
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import POLL_S
 
-POLL_S: Final = 0.1
-"""How long a stop, a command or a silent link may go unnoticed."""
 SHORTEST_POLL_S: Final = 0.001
 """The system's poll counts in milliseconds."""
 _WAKES: Final = 64

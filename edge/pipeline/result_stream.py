@@ -12,13 +12,13 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
-from edge.pipeline.link_reader import POLL_S
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.silence import Silence
 from edge.validation import check_positive
 from firmware_bridge.links.base import Notice
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import POLL_S
 
 
 class Stream:

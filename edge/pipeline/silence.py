@@ -7,9 +7,8 @@ from typing import Final
 
 from edge.perception.event import Event
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import SENSOR_SILENT_NS
 
-SILENT_NS: Final = 500_000_000
-"""Twice the period of the slowest sensor on record."""
 GAP_PERIODS: Final = 1.5
 """Between two scans; jitter, and the 16 ms for which some adapters hold scans back, make less of 10 ms."""
 
@@ -111,10 +110,10 @@ class Silence:
         newest_ns = max(scan.time_ns for scan in self._last.values())
         events: list[Event] = []
         for sensor, scan in self._last.items():
-            if newest_ns - self._heard_ns(sensor, scan.time_ns) > SILENT_NS and sensor not in self._silent:
+            if newest_ns - self._heard_ns(sensor, scan.time_ns) > SENSOR_SILENT_NS and sensor not in self._silent:
                 self._silent.add(sensor)
                 events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none for so long"))
-        if self._expected and newest_ns - self._first_ns > SILENT_NS:
+        if self._expected and newest_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
             why = "the recording has none of it, though there is a baseline or a force for it"
             events += [self._silence(sensor, newest_ns, self._first_ns, why) for sensor in missing]

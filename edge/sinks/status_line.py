@@ -9,9 +9,9 @@ from typing import Final, TextIO
 from edge.perception.result import Result
 from edge.pipeline.scan_rate import Rate
 from edge.pipeline.sink import Sink
+from firmware_bridge.silence import SHOWN_SILENT_S
 
 REFRESH_S: Final = 0.1
-SILENCE_S: Final = 1.0
 CLEAR_TO_END: Final = "\x1b[K"
 
 
@@ -75,7 +75,7 @@ class StatusSink(Sink):
         sources = {result.source for result in self._latest.values()} - {"device"}
         parts += sorted(source.upper() for source in sources)
         silence_s = self._clock_s() - self._last_scan_s
-        if silence_s >= SILENCE_S or not self._latest:
+        if silence_s >= SHOWN_SILENT_S or not self._latest:
             parts.append(f"no scan for {silence_s:.0f} s")
         parts += [self._sensor_text(name) for name in sorted(self._latest)]
         count = self._counters.get
@@ -94,7 +94,7 @@ class StatusSink(Sink):
     def _sensor_text(self, name: str) -> str:
         result = self._latest[name]
         silence_s = self._clock_s() - self._heard_s[name]
-        if silence_s >= SILENCE_S and len(self._latest) > 1:
+        if silence_s >= SHOWN_SILENT_S and len(self._latest) > 1:
             return f"{name} no scan for {silence_s:.0f} s"
         words = [name, result.state]
         if result.state in ("zeroing", "incomplete") and result.note is not None:

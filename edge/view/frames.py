@@ -10,12 +10,11 @@ from edge.sinks.binary_message import pack
 from edge.sinks.json_record import encodable, event_record, record
 from edge.view.run_snapshot import Heard, Newest, Point, Told
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.silence import SENSOR_SILENT_NS
 
 VERSION: Final = 1
 MAX_FPS: Final = 25
 """Result frames a second of one sensor: as many as an eye takes in."""
-SILENT_NS: Final = 500_000_000
-"""As long as for a sensor of which the link tells that it is silent."""
 
 
 class Run(NamedTuple):
@@ -69,7 +68,7 @@ class Frames:
     def silent(self) -> dict[str, float]:
         """Sensors of which nothing is heard, and for how long, in [s]."""
         away_ns = {sensor: self.now_ns - newest.heard_ns for sensor, newest in self._newest.items()}
-        return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SILENT_NS}
+        return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SENSOR_SILENT_NS}
 
     def _event(self, told: Told) -> bytes:
         said = event_record(told.event, told.counters, self._source)

@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterable
 from typing import Final
 
+from firmware_bridge.silence import ADAPTER_ASKED_NS
+
 STATUS_FLAGS: Final = b"F\r"
 
 FLAGS: Final = {
@@ -35,7 +37,6 @@ ERRORS: Final = {
 }
 LOSSES: Final = frozenset({"rx_full", "overrun"})
 NOISE: Final = frozenset({"error_passive", "bus_error"})
-SILENCE_NS: Final = 500_000_000
 INTERVAL_NS: Final = 5_000_000_000
 MOST_UNANSWERED: Final = 3
 FRAMES_TO_FORGET: Final = 1600
@@ -120,7 +121,7 @@ class AdapterStatus:
 class StatusQuestions:
     """When to ask for the flags.
 
-    After SILENCE_NS without a scan, since then there is something to learn, and else once in INTERVAL_NS at most:
+    After ADAPTER_ASKED_NS without a scan, since then there is something to learn, and else once in INTERVAL_NS at most:
     adapters that obey one command a USB packet have something else to do, the answer stands in the midst of frames,
     and asking clears the flags for whoever else might want them. One that refuses, or leaves MOST_UNANSWERED of them
     unanswered, is asked no more.
@@ -160,7 +161,7 @@ class StatusQuestions:
             self._scan_ns, self._answers_before_silence = now_ns, None
         if self._scan_ns is None or self._due_ns is None:  # the first read of all: silent from here on
             self._scan_ns, self._due_ns = now_ns, now_ns + INTERVAL_NS
-        if self._answers_before_silence is None and now_ns - self._scan_ns >= SILENCE_NS:
+        if self._answers_before_silence is None and now_ns - self._scan_ns >= ADAPTER_ASKED_NS:
             self._answers_before_silence = self._status.answers
         elif now_ns < self._due_ns:
             return False

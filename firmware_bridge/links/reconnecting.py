@@ -8,6 +8,7 @@ from typing import Final
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Notice, NoticeKind, SourceKind, Wait
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import LINK_SILENT_S
 
 FIRST_RETRY_S: Final = 0.1
 SOON_RETRY_S: Final = 0.5
@@ -15,9 +16,6 @@ SOON_RETRY_S: Final = 0.5
 LATE_RETRY_S: Final = 2.0
 SOON_S: Final = 60.0
 """Of an outage; after that somebody went to fetch a cable, and a robot's processor has better to do."""
-SILENT_S: Final = 0.7
-"""Without a scan: an adapter that was reset keeps its port and says nothing until its channel is opened anew. The
-slowest sensor on record renews a taxel four times a second."""
 
 
 class LastingLink(Link):
@@ -53,7 +51,7 @@ class LastingLink(Link):
         self._retry_ns = 0
         self._delay_s = FIRST_RETRY_S
         self._heard_ns = 0
-        self._silent_s = SILENT_S
+        self._silent_s = LINK_SILENT_S
         self._silent = False
         self._outages = 0
         self._reopenings = 0
@@ -121,7 +119,7 @@ class LastingLink(Link):
             away_s = (now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)) / 1e9
             self._tell("back", f"{self.name} is back after {away_s:.1f} s")
             self._lost_ns, self._silent = None, False
-            self._delay_s, self._silent_s = FIRST_RETRY_S, SILENT_S
+            self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
         self._heard_ns = now_ns
 
     def _suspect(self) -> None:
@@ -181,7 +179,7 @@ class LastingLink(Link):
             self._sleep(min(wait_s, timeout_s))
         now_ns = self._clock_ns()
         if now_ns >= self._retry_ns:
-            self._heard_ns, self._silent_s = now_ns, SILENT_S  # its silence begins with the opening
+            self._heard_ns, self._silent_s = now_ns, LINK_SILENT_S  # its silence begins with the opening
             self._away = False
             self._reopen(now_ns)
 

@@ -24,6 +24,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
 from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.silence import SERVER_QUIET_S
 
 DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0
@@ -31,8 +32,6 @@ REOPENING_S: Final = 1.0
 """Of a server that was met: one that hangs must not hold up for longer who reads other sources beside it."""
 FIRST_MESSAGE_S: Final = 0.5
 """A server greets at once; one that has nothing to say is no error."""
-QUIET_S: Final = 0.75
-"""Without a message for so long the server is asked whether it is there."""
 ANSWER_S: Final = 1.0
 """Who reads this link by itself is told of a pulled cable, or of a server that hangs, after 1.75 s without a message.
 LastingLink opens it anew before that, and what hangs is told by its handshake."""
@@ -158,7 +157,7 @@ class XelaServerLink(Link):
         """Ask a server that says nothing whether it is there: a connection can be dead without being closed."""
         now_ns = self._clock_ns()
         if self._pong is None:
-            if now_ns - self._heard_ns >= QUIET_S * NS_PER_S:
+            if now_ns - self._heard_ns >= SERVER_QUIET_S * NS_PER_S:
                 self._pong = connection.ping(), now_ns
         elif self._pong[0].is_set():
             self._heard_ns, self._pong = now_ns, None

@@ -20,9 +20,7 @@ from firmware_bridge.scans.can_id_maps import Cycle, ModelMap, Reading
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.scans.wire_cycle import SHORTEST_PAUSE_NS, WireCycle
-
-LONGEST_SCAN_NS: Final = 1_000_000_000
-"""The slowest sensor on record renews a taxel four times a second; older readings are another scan's."""
+from firmware_bridge.silence import SCAN_GIVEN_UP_NS
 
 _COUNTED: Final[tuple[str, ...]] = (
     "scans",
@@ -160,7 +158,7 @@ class _Sensor:
 
     def closes_before_long(self, now_ns: int) -> bool:
         """It exists, and the scan that may be open is not one that it left unfinished."""
-        return self.confirmed and (not self._taxels or now_ns - self._opened_ns <= LONGEST_SCAN_NS)
+        return self.confirmed and (not self._taxels or now_ns - self._opened_ns <= SCAN_GIVEN_UP_NS)
 
     @property
     def missing(self) -> int:

@@ -25,6 +25,7 @@ from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.silence import SERVER_READING_OLD_NS
 
 USUAL_UPS_HZ: Final = 83.0
 """By the vendor's data sheet; for a server that does not tell."""
@@ -33,8 +34,6 @@ DUE_PERIODS: Final = 1.5
 DUE_IN_CYCLE_PERIODS: Final = 0.5
 SLOW_SHARE: Final = 0.5
 """Of the median `ups`: a taxel renewed less often is not waited for."""
-SILENT_NS: Final = NS_PER_S
-"""A reading older than this when it is sent is one of a sensor that is heard no more, whatever `ups` still says."""
 STALE_NS: Final = 150_000_000
 """A reading older by this than usual of its server when it arrives is counted; more than what a clock may be set back
 unseen."""
@@ -128,7 +127,7 @@ class ServerScans:
             if name in heard:
                 age_ns = _age_ns(heard[name], message)
                 device_ns = None if sent_ns is None or age_ns is None else sent_ns - age_ns
-                scan = sensor.feed(heard[name], arrival_ns, device_ns, old=(age_ns or 0) > SILENT_NS)
+                scan = sensor.feed(heard[name], arrival_ns, device_ns, old=(age_ns or 0) > SERVER_READING_OLD_NS)
             if scan is not None:
                 self._follow_age(scan, age_ns or 0)
                 scans.append(scan)
@@ -211,7 +210,7 @@ class _ServerSensor:
     def look(self, now_ns: int) -> None:
         """Whether anything came of late."""
         self._heard_ns = now_ns if self._heard_ns is None else self._heard_ns
-        self.silent = now_ns - self._heard_ns > SILENT_NS
+        self.silent = now_ns - self._heard_ns > SERVER_READING_OLD_NS
 
     def feed(self, reading: ServerReading, arrival_ns: int, device_ns: int | None, *, old: bool = False) -> Scan | None:
         """The scan that a reading closes; `old` of one that was so already when it was sent."""
@@ -249,7 +248,7 @@ class _ServerSensor:
         if said_dead and self._said_dead and self._counts is not None and (reading.counts != self._counts).any():
             self._belied_ns = arrival_ns
         self._said_dead = said_dead
-        if said_dead and (self._belied_ns is None or arrival_ns - self._belied_ns > SILENT_NS):
+        if said_dead and (self._belied_ns is None or arrival_ns - self._belied_ns > SERVER_READING_OLD_NS):
             return np.zeros_like(self._usual_hz)
         return np.array(reading.ups_hz) if told else self._usual_hz
 
@@ -259,7 +258,7 @@ class _ServerSensor:
             return False
         if reading.acquired_s != self._acquired_s:
             self._acquired_s, self._acquired_ns = reading.acquired_s, arrival_ns
-        return arrival_ns - self._acquired_ns > SILENT_NS
+        return arrival_ns - self._acquired_ns > SERVER_READING_OLD_NS
 
     def _close(
         self, counts: NDArray[np.int32], arrival_ns: int, device_ns: int | None, vendor: VendorReading | None

@@ -9,7 +9,7 @@ from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Notice, Wait
 from firmware_bridge.links.mounted import MountedLink
-from firmware_bridge.links.reconnecting import LATE_RETRY_S, SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
+from firmware_bridge.links.reconnecting import LATE_RETRY_S, LINK_SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 S = 1_000_000_000
@@ -102,7 +102,7 @@ def test_a_long_outage_is_asked_after_every_two_seconds():
 
 def test_a_device_that_falls_silent_is_opened_anew_and_told_once():
     """As an adapter that was reset: its port is there, its channel closed until it is opened."""
-    world = World(mute=[(1.0, 1.0 + SILENT_S + 0.015)])
+    world = World(mute=[(1.0, 1.0 + LINK_SILENT_S + 0.015)])
     notices, link, heard_s = lasting(world, 4.0)
     assert kinds(notices) == ["silent", "back"]
     assert len(world.opened_at_s) == 2 and min(time_s for time_s in heard_s if time_s > 1.1) < 2.0
@@ -117,7 +117,7 @@ def test_a_device_that_stays_silent_is_opened_ever_more_seldom():
 
 
 def test_a_silence_that_turns_out_a_loss_is_one_outage():
-    world = World(mute=[(1.0, 1.0 + SILENT_S)], away=[(1.0 + SILENT_S, 5.0)])
+    world = World(mute=[(1.0, 1.0 + LINK_SILENT_S)], away=[(1.0 + LINK_SILENT_S, 5.0)])
     notices, link, _ = lasting(world, 7.0)
     assert kinds(notices) == ["silent", "lost", "back"]
     assert link.counters()["outages"] == 1
@@ -125,16 +125,16 @@ def test_a_silence_that_turns_out_a_loss_is_one_outage():
 
 
 def test_each_outage_is_met_with_the_same_haste():
-    world = World(away=[(1.0, 20.0), (30.0, 30.35)], mute=[(40.0, 60.0), (70.0, 70.0 + SILENT_S + 0.015)])
+    world = World(away=[(1.0, 20.0), (30.0, 30.35)], mute=[(40.0, 60.0), (70.0, 70.0 + LINK_SILENT_S + 0.015)])
     notices, _, heard_s = lasting(world, 75.0)
     assert kinds(notices) == ["lost", "back", "lost", "back", "silent", "back", "silent", "back"]
-    for back_s in (30.35, 70.0 + SILENT_S + 0.015):
+    for back_s in (30.35, 70.0 + LINK_SILENT_S + 0.015):
         assert next(time_s for time_s in heard_s if time_s > back_s) - back_s < 0.4
 
 
 def test_the_silence_of_one_that_came_back_begins_with_its_opening():
     """Who has to settle after it was plugged in is not opened over and over."""
-    world = World(away=[(1.0, 5.0)], mute=[(5.0, 5.0 + 0.9 * SILENT_S)])
+    world = World(away=[(1.0, 5.0)], mute=[(5.0, 5.0 + 0.9 * LINK_SILENT_S)])
     lasting(world, 8.0)
     assert len(world.opened_at_s) == 2
 
@@ -144,7 +144,7 @@ def test_the_end_of_a_finite_source_is_no_silence():
     inner = FakeLink([[make_scan(0)]])
     with LastingLink(inner, clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
         link.read(0.1)
-        world.sleep(SILENT_S + 1)
+        world.sleep(LINK_SILENT_S + 1)
         assert link.read(0.1) == [] and link.ended
         assert link.notices() == []
 

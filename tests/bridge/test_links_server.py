@@ -199,7 +199,7 @@ def test_a_server_that_closes_says_why():
 
 
 def test_a_half_open_connection_is_seen(monkeypatch):
-    monkeypatch.setattr(xela_server, "QUIET_S", 0.1)
+    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.1)
     monkeypatch.setattr(xela_server, "ANSWER_S", 0.2)
     with ServerEmulator(looping()) as server:
         link = XelaServerLink(server.url)
@@ -213,7 +213,7 @@ def test_a_half_open_connection_is_seen(monkeypatch):
 
 
 def test_a_connection_that_closes_just_before_it_is_asked_is_a_lost_link(monkeypatch):
-    monkeypatch.setattr(xela_server, "QUIET_S", 0.0)
+    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.0)
     with ServerEmulator(looping()) as server, XelaServerLink(server.url) as link:
         read_scans(link, 1)
         server.kill()
@@ -236,16 +236,16 @@ def test_a_server_with_nothing_to_say_is_no_lost_link(monkeypatch):
         asked = []
         ping = link._connection.ping
         monkeypatch.setattr(link._connection, "ping", lambda: asked.append(None))
-        monkeypatch.setattr(xela_server, "QUIET_S", 60.0)
+        monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 60.0)
         assert not any(link.read(0.01) for _ in range(3)) and not asked
-        monkeypatch.setattr(xela_server, "QUIET_S", 0.05)
+        monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.05)
         monkeypatch.setattr(link._connection, "ping", lambda: asked.append(ping()) or asked[-1])
         wait_for(lambda: link.read(0.02) is not None and len(asked) >= 4)
         assert all(pong.wait(1) for pong in asked[:-1])
 
 
 def test_a_server_that_talks_but_answers_no_ping_is_kept(monkeypatch):
-    monkeypatch.setattr(xela_server, "QUIET_S", 0.0)
+    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.0)
     now_ns = [0]
     with ServerEmulator(looping()) as server, XelaServerLink(server.url, clock_ns=lambda: now_ns[0]) as link:
         asked = []

@@ -142,7 +142,7 @@ def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatc
 
 
 def test_an_adapter_whose_stamps_are_no_milliseconds_of_a_minute_is_told_to_leave_them_out(monkeypatch):
-    monkeypatch.setattr(slcan_status, "SILENCE_NS", 10**12)
+    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         late = [line[:-5] + b"FA00\r" for line in cycle_lines(0, 0)]
         for line in late[: MOST_LATE_STAMPS - 1]:
@@ -159,7 +159,7 @@ def test_an_adapter_whose_stamps_are_no_milliseconds_of_a_minute_is_told_to_leav
 
 
 def test_a_stamp_that_flips_now_and_then_is_no_reason_to_leave_them_out(monkeypatch):
-    monkeypatch.setattr(slcan_status, "SILENCE_NS", 10**12)
+    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     monkeypatch.setattr(slcan_serial, "LATE_STAMPS_FRAMES", 20)
     flipped = cycle_lines(0, 0)[0][:-5] + b"FA00\r"
     with SilentDevice() as device:
@@ -192,7 +192,7 @@ def device_commands_after(link: SlcanSerialLink) -> bytes:
 def impatient(monkeypatch):
     """Asks every 50 ms instead of 5 s."""
     monkeypatch.setattr(slcan_status, "INTERVAL_NS", 50 * MS)
-    monkeypatch.setattr(slcan_status, "SILENCE_NS", 40 * MS)
+    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 40 * MS)
 
 
 def read_until(link: SlcanSerialLink, condition, timeout_s: float = 20.0) -> int:

@@ -20,6 +20,7 @@ from edge_samples import (
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad import GAINS, PAD_RANGES, Pad
@@ -200,7 +201,10 @@ class TestSession:
 class TestRuntime:
     def runtime(self, model, **settings):
         baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "6")}
-        return Runtime(model, **({"source": "device", "baselines": baselines, "reuse": False} | settings))
+        return Runtime(
+            model,
+            **({"source": "device", "baselines": baselines, "options": RuntimeOptions(every_scan=True)} | settings),
+        )
 
     def pads_of(self, settings, contract=None):
         model = FakeModel(contract or make_pad_contract())
@@ -257,7 +261,7 @@ class TestRuntime:
         assert together[0].traction is not None and not np.shares_memory(together[0].traction, together[1].traction)
 
     def test_a_pattern_that_is_given_again_keeps_its_wrench_and_a_dropped_scan_has_none(self):
-        runtime = self.runtime(FakeModel(make_pad_contract()), reuse=True)
+        runtime = self.runtime(FakeModel(make_pad_contract()), options=RuntimeOptions())
         first, again = (runtime.push(make_scan(number, press_counts=20_000)) for number in (0, 1))
         assert again.reused_from == 0 and again.wrench == first.wrench is not None
         assert again.traction is first.traction and again.wrench_origin == "nominal"

@@ -9,7 +9,7 @@ from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP, Reading
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
-from firmware_bridge.scans.scan_assembler import LONGEST_SCAN_NS, ScanAssembler, _Sensor
+from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler, _Sensor
 from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
@@ -157,7 +157,7 @@ def test_a_flipped_id_invents_no_sensor():
 
 def test_stray_readings_do_not_add_up_to_a_sensor():
     assembler = ScanAssembler(USPA44_MAP)
-    scans = [assembler.feed(reading, n * LONGEST_SCAN_NS * 2) for n, reading in enumerate(cycle(0, "5"))]
+    scans = [assembler.feed(reading, n * SCAN_GIVEN_UP_NS * 2) for n, reading in enumerate(cycle(0, "5"))]
     assert scans == [[]] * 16
     assert counters(assembler) == {"readings": 16, "unconfirmed": 15}
 
@@ -202,7 +202,7 @@ def test_what_comes_after_a_pause_is_of_another_scan(known):
 
 def test_a_pause_between_scans_makes_no_empty_one():
     assembler = ScanAssembler(USPA44_MAP)
-    scans = feed(assembler, cycle(0)) + feed(assembler, cycle(1), 5 * LONGEST_SCAN_NS)
+    scans = feed(assembler, cycle(0)) + feed(assembler, cycle(1), 5 * SCAN_GIVEN_UP_NS)
     assert [scan.complete for scan in scans] == [True, True]
     assert counters(assembler) == {"readings": 32, "scans": 2}
 
@@ -312,7 +312,7 @@ def test_who_closes_no_scan_does_not_change_how_many_readings_are_waited_for():
     assert assembler.fewest_missing() == 16
     feed(assembler, [*cycle(0, "6"), *cycle(1, "6")[:9]], 60)
     assert assembler.fewest_missing() == 7
-    feed(assembler, cycle(2), 60 + 2 * LONGEST_SCAN_NS)
+    feed(assembler, cycle(2), 60 + 2 * SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 16
 
 

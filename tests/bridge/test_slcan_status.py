@@ -1,6 +1,7 @@
 import pytest
 
 from firmware_bridge.can.slcan_status import (
+    ADAPTER_ASKED_NS,
     BUS_ERRORS,
     BUS_OFF,
     FLAGS,
@@ -8,7 +9,6 @@ from firmware_bridge.can.slcan_status import (
     FRAMES_TO_FORGET,
     INTERVAL_NS,
     MOST_UNANSWERED,
-    SILENCE_NS,
     STATUS_FLAGS,
     AdapterStatus,
     StatusQuestions,
@@ -163,13 +163,13 @@ def test_an_answer_is_of_a_silence_only_if_asked_in_it():
     assert questions.due(1, 0, T0 + INTERVAL_NS)
     status.hear(b"F80", 0)
     assert not questions.answered_in_silence, "asked in the midst of scans"
-    assert questions.due(0, 0, T0 + INTERVAL_NS + SILENCE_NS)
+    assert questions.due(0, 0, T0 + INTERVAL_NS + ADAPTER_ASKED_NS)
     assert not questions.answered_in_silence, "not answered yet"
     status.hear(b"F80", 0)
     assert questions.answered_in_silence
-    assert questions.due(0, 0, T0 + 2 * INTERVAL_NS + SILENCE_NS)
+    assert questions.due(0, 0, T0 + 2 * INTERVAL_NS + ADAPTER_ASKED_NS)
     assert questions.answered_in_silence, "asking again unsays nothing"
-    assert not questions.due(1, 0, T0 + 2 * INTERVAL_NS + SILENCE_NS + 1)
+    assert not questions.due(1, 0, T0 + 2 * INTERVAL_NS + ADAPTER_ASKED_NS + 1)
     assert not questions.answered_in_silence, "a scan came"
 
 

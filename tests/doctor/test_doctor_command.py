@@ -180,7 +180,7 @@ def test_the_wrong_id_map_names_the_right_one(monkeypatch):
 
 def test_another_line_speed_than_the_adapters(monkeypatch):
     with Emulator([recording(healthy_counts(200))], loop=True, left_open=True) as emulator:
-        monkeypatch.setattr(visit, "SILENCE_S", 0.5)
+        monkeypatch.setattr(visit, "GIVEN_UP_S", 0.5)
         done = doctor(monkeypatch, f"{emulator.port}@115200", "--json")
     found = verdicts(done)
     assert found["link"] == "wrong" and found["scans"] == "wrong" and len(found) == 2 and done.code == 1
@@ -189,7 +189,7 @@ def test_another_line_speed_than_the_adapters(monkeypatch):
 
 def test_a_sensor_that_says_nothing(monkeypatch):
     with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
-        monkeypatch.setattr(watch, "SILENCE_S", 0.5)
+        monkeypatch.setattr(watch, "GIVEN_UP_S", 0.5)
         done = doctor(monkeypatch, emulator.port, drift_s=60)
     assert done.code == 1 and "WRONG" in done.out and "is the sensor powered" in done.out
 
@@ -247,7 +247,7 @@ def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wr
 
 
 def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
-    monkeypatch.setattr(visit, "SILENCE_S", 0.3)
+    monkeypatch.setattr(visit, "GIVEN_UP_S", 0.3)
     options = doctor_parser().parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
     monkeypatch.setattr(watch, "link_to", lambda *_, **__: link)

@@ -39,7 +39,7 @@ class TestLoss:
     def test_a_visit_that_found_no_baseline_leaves_a_good_file(self, monkeypatch, good):
         content = good.read_text()
         with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
-            monkeypatch.setattr("edge.doctor.watch.SILENCE_S", 0.5)
+            monkeypatch.setattr("edge.doctor.watch.GIVEN_UP_S", 0.5)
             asked = ["doctor", "--source", f"slcan:{emulator.port}", "--out", str(good), "--drift-s", "5"]
             with monkeypatch.context() as streams:
                 err = io.StringIO()

@@ -8,8 +8,8 @@ from edge_samples import ROOT
 from edge.doctor.link_checks import LATENCY_LIMIT_MS
 from edge.doctor.press_findings import USUAL_COUNTS_PER_NEWTON
 from edge.doctor.timing_checks import USUAL_HZ
-from edge.doctor.watch import SILENCE_S
-from edge.perception.tap_tracker import ON_COUNTS
+from edge.perception.options import ON_COUNTS
+from firmware_bridge.silence import GIVEN_UP_S
 from firmware_bridge.zeroing.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS
 
 PAGE = (ROOT / "docs" / "trouble.md").read_text()
@@ -68,7 +68,7 @@ def test_what_is_to_be_done_can_be_looked_up_as_it_was_said():
         f"rate | under {USUAL_HZ[0]:g} Hz",
         f"rate | above {USUAL_HZ[1]:g} Hz",
         f"drift | more than {CREEP_LIMIT_COUNTS:g} counts on a taxel",
-        f"guided press | broken off | no scan for {SILENCE_S:g} s",
+        f"guided press | broken off | no scan for {GIVEN_UP_S:g} s",
         f"force | outside {USUAL_COUNTS_PER_NEWTON[0]:g} to {USUAL_COUNTS_PER_NEWTON[1]:g} counts per newton",
         f"a light touch (under {ON_COUNTS:g} counts",
     ],

@@ -7,6 +7,7 @@ import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from test_pump import run, scans
 
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.pipeline.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
 from edge.pipeline.run_statistics import Statistics
@@ -85,7 +86,12 @@ def test_collection_stands_still_in_the_loop_only():
 def test_the_loop_makes_no_cycles_and_holds_no_more_memory(press):
     """Patterns are copied for the sinks, and freed with their result."""
     # One taxel alone is believed up to 1500 counts.
-    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, on_counts=1000, reuse=False)
+    runtime = Runtime(
+        FakeModel(),
+        source="device",
+        baselines={"4": BASELINE},
+        options=RuntimeOptions(contact_on_counts=1000, every_scan=True),
+    )
     runtime._model.windows = _Nothing()  # the fake keeps them
     batches = [[make_scan(n, press_counts=press, noise=3)] for n in range(2300)]
     held, patterns, written = {}, 0, threading.Semaphore(1)

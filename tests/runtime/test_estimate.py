@@ -14,6 +14,7 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from edge.sinks.jsonl import record_line
@@ -181,7 +182,13 @@ def test_patterns_with_dead_taxels_found_are_better_than_with_what_they_send():
         rows = held + np.rint(np.random.default_rng(frame).normal(0, 1, (STUCK_SCANS + 3, *REST.shape)))
         rows[1:, :, 1, 2] = [16_300, 16_500, 40_000]
         for told, use in ((found, estimator()), (unfound, None)):
-            runtime = Runtime(model, source="replay", baselines={"4": BASELINE}, estimator=use, reuse=False)
+            runtime = Runtime(
+                model,
+                source="replay",
+                baselines={"4": BASELINE},
+                estimator=use,
+                options=RuntimeOptions(every_scan=True),
+            )
             results = pushed(runtime, rows)
             result = results[-1] if use else results[2]
             assert result.pattern is not None and bool(result.dead) == (use is not None)

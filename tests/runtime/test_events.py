@@ -8,7 +8,7 @@ from edge_samples import BASELINE, PERIOD_NS, ROOT, FakeModel, make_scan
 
 from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
 from edge.perception.runtime import Runtime
-from edge.perception.taxel_health import SILENT_SCANS
+from firmware_bridge.silence import TAXEL_SILENT_SCANS as SILENT_SCANS
 
 PAGE = ROOT / "edge" / "view" / "page.html"
 

@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.options import RuntimeOptions
 from edge.perception.result import mask_bits
 from edge.perception.runtime import Runtime
-from edge.perception.taxel_health import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, SILENT_SCANS
+from edge.perception.taxel_health import BACK_SCANS, HOLD_SCANS, RANGE_ENDS, TAXEL_SILENT_SCANS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import Baseline
@@ -170,8 +171,8 @@ def test_torn_scans_do_not_count_for_zeroing():
 
 def test_a_taxel_silent_from_the_start_does_not_stop_the_others_from_being_zeroed_but_half_of_them_do():
     runtime = make_runtime(baselines=None)
-    results = [runtime.push(make_scan(n, noise=4, absent=(0,))) for n in range(SILENT_SCANS + 100)]
-    assert [result.state for result in results] == ["zeroing"] * (SILENT_SCANS + 98) + ["incomplete"] * 2
+    results = [runtime.push(make_scan(n, noise=4, absent=(0,))) for n in range(TAXEL_SILENT_SCANS + 100)]
+    assert [result.state for result in results] == ["zeroing"] * (TAXEL_SILENT_SCANS + 98) + ["incomplete"] * 2
     baseline = results[-1].baseline
     assert baseline is not None
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(baseline.counts[2])), [0])
@@ -251,13 +252,13 @@ def test_reset_forgets_the_taps_of_every_sensor_and_keeps_the_baseline():
 
 
 def test_thresholds_and_idle_time_are_the_callers():
-    runtime = make_runtime(on_counts=100, off_counts=50, idle_timeout_s=0.5)
+    runtime = make_runtime(options=RuntimeOptions(100, 50, idle_reset_s=0.5))
     used = []
     for number, press in ((0, 120), (1, 60), (2, 49), (3, 120), (100, 120), (101, 0), (200, 120)):
         used.append(runtime.push(make_scan(number, press_counts=press)).taps_used)
     assert used == [1, 1, 0, 2, 2, 0, 1]
     with pytest.raises(UsageError):
-        make_runtime(on_counts=10, off_counts=50)
+        make_runtime(options=RuntimeOptions(10, 50))
 
 
 def test_a_sensor_that_the_model_was_not_trained_for_is_refused():
@@ -337,12 +338,12 @@ def test_any_scans_give_one_result_each_and_a_pattern_only_in_contact(scans):
 @pytest.mark.parametrize("baselines", [{}, {"4": BASELINE}])
 def test_a_taxel_that_stays_silent_is_named(silent, remedy, baselines):
     runtime = make_runtime(baselines=baselines)
-    notes = [runtime.push(make_scan(number, absent=tuple(silent))).note for number in range(SILENT_SCANS)]
+    notes = [runtime.push(make_scan(number, absent=tuple(silent))).note for number in range(TAXEL_SILENT_SCANS)]
     named = f"no pattern, taxel {', '.join(map(str, silent))} silent"
     assert notes[HOLD_SCANS - 1] is None and notes[HOLD_SCANS] == named
     assert notes[-1] == f"no pattern, taxel {', '.join(map(str, silent))} silent: {remedy}"
     for number in range(BACK_SCANS):
-        back = runtime.push(make_scan(SILENT_SCANS + number))
+        back = runtime.push(make_scan(TAXEL_SILENT_SCANS + number))
     assert back.note is None
 
 
@@ -383,7 +384,7 @@ def test_a_count_from_the_end_is_a_reading():
 def test_taxels_that_are_silent_are_named_beside_one_at_the_end_of_its_range():
     runtime = make_runtime()
     half = tuple(range(8, 16))
-    for number in range(SILENT_SCANS):
+    for number in range(TAXEL_SILENT_SCANS):
         scan = make_scan(number, absent=half)
         raw = scan.counts.copy()
         raw[2].flat[5] = RANGE_ENDS[1]

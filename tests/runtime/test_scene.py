@@ -5,6 +5,7 @@ import pytest
 from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 
 from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import TapState
 
@@ -119,7 +120,7 @@ def test_a_still_grip_is_inferred_once_and_says_whose_pattern_it_is():
 
 
 def test_every_scan_is_inferred_where_that_is_asked_for():
-    runtime, model = make_runtime(reuse=False)
+    runtime, model = make_runtime(options=RuntimeOptions(every_scan=True))
     assert all(runtime.push(make_scan(number, press_counts=3000)).reused_from is None for number in range(5))
     assert len(model.windows) == 5
 
@@ -154,7 +155,7 @@ def taps_used(runtime, presses):
 def test_earlier_taps_that_would_not_help_are_kept_from_the_network(gain, expected, every_tap):
     told = {"doubt": [0.1, 1.0], "error": [0.1, 0.2], "gain": [gain, gain]}
     contract = make_contract(interval_factor=1.6, confidence={"1": told, "2": told, "3": told})
-    runtime, model = make_runtime(contract, every_tap=every_tap)
+    runtime, model = make_runtime(contract, options=RuntimeOptions(every_tap=every_tap))
     expected = [1, 2, 3] if every_tap else expected
     assert taps_used(runtime, (2000, 3000, 4000)) == expected
     for used, window in zip(np.repeat(expected, 2), model.windows, strict=True):

@@ -6,7 +6,7 @@ from dataclasses import replace
 from edge_samples import make_scan
 
 from edge.pipeline.deadline import Deadline
-from edge.pipeline.silence import SETTLING_SCANS, SILENT_NS, Silence
+from edge.pipeline.silence import SENSOR_SILENT_NS, SETTLING_SCANS, Silence
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -99,7 +99,7 @@ def test_a_finger_that_falls_silent_while_the_other_goes_on_is_told_once_and_tol
                 events += [] if back is None else [back]
         events += silence.look()
     assert [(event.kind, event.sensor, event.time_ns // MS) for event in events] == [
-        ("silent", "6", 190 + SILENT_NS // MS + 10),
+        ("silent", "6", 190 + SENSOR_SILENT_NS // MS + 10),
         ("back", "6", 1200),
     ]
     assert events[0].text.startswith("no scan from sensor 6 for 0.5 s")
@@ -113,7 +113,7 @@ def test_after_the_link_was_away_no_finger_is_silent_for_coming_second():
     silence.begin_anew(5_000 * MS)
     silence.follow(scan(1, 5_000), PERIOD_NS)
     assert silence.look() == []
-    silence.follow(scan(2, 5_000 + SILENT_NS // MS + 1), PERIOD_NS)
+    silence.follow(scan(2, 5_000 + SENSOR_SILENT_NS // MS + 1), PERIOD_NS)
     assert [event.sensor for event in silence.look()] == ["6"]
 
 

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import EdgeError, UsageError
+from edge.perception.options import RuntimeOptions
 from edge.perception.tap_tracker import TapTracker
 
 S = 1_000_000_000
@@ -22,7 +23,7 @@ def play(tracker, z_counts, start_ns=0, step_ns=S // 100):
 
 
 def test_contact_has_hysteresis():
-    tracker = TapTracker(1, on_counts=1500, off_counts=750)
+    tracker = TapTracker(1, RuntimeOptions(1500, 750))
     got = [tracker.push(frame(z), i).contact for i, z in enumerate([1499, 1500, 750, 749, 1499, 2000, 800, 1499, 0])]
     assert got == [False, True, True, False, False, True, True, True, False]
 
@@ -83,7 +84,7 @@ def test_a_touch_of_one_scan_is_shown_but_not_remembered():
 
 def test_idle_longer_than_the_timeout_forgets_earlier_taps():
     for idle_s, used in ((4.9, 2), (5.0, 2), (5.1, 1)):
-        tracker = TapTracker(4, idle_timeout_s=5.0)
+        tracker = TapTracker(4, RuntimeOptions(idle_reset_s=5.0))
         tracker.push(frame(2000), 0)
         tracker.push(frame(2000), 0)
         tracker.push(frame(0), 1)
@@ -91,24 +92,24 @@ def test_idle_longer_than_the_timeout_forgets_earlier_taps():
 
 
 def test_idle_is_measured_from_the_last_scan_in_contact():
-    tracker = TapTracker(4, idle_timeout_s=5.0)
+    tracker = TapTracker(4, RuntimeOptions(idle_reset_s=5.0))
     play(tracker, [2000, 2000, 0])
     play(tracker, [2000] * 7 + [0], start_ns=4 * S, step_ns=S)  # ends at 10 s
     assert tracker.push(frame(2000), 14 * S).taps_used == 3
 
 
 def test_idle_forgets_in_the_window_too():
-    tracker = TapTracker(2, idle_timeout_s=5.0)
+    tracker = TapTracker(2, RuntimeOptions(idle_reset_s=5.0))
     play(tracker, [2000, 2000, 0])
     assert not tracker.push(frame(0), 6 * S).window.any()
 
 
 def test_time_running_backwards_counts_as_no_time():
-    tracker = TapTracker(2, idle_timeout_s=5.0)
+    tracker = TapTracker(2, RuntimeOptions(idle_reset_s=5.0))
     play(tracker, [2000, 2000, 0], start_ns=100 * S)
     tracker.push(frame(0), 1 * S)
     assert tracker.push(frame(2000), 5 * S).taps_used == 2
-    tracker = TapTracker(2, idle_timeout_s=5.0)
+    tracker = TapTracker(2, RuntimeOptions(idle_reset_s=5.0))
     play(tracker, [2000, 2000, 0], start_ns=100 * S)
     tracker.push(frame(0), 1 * S)
     assert tracker.push(frame(2000), 7 * S).taps_used == 1
@@ -162,18 +163,19 @@ def test_a_frame_is_copied():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"taps": 0},
-        {"taps": 1, "on_counts": 100, "off_counts": 200},
-        {"taps": 1, "off_counts": 0},
-        {"taps": 1, "on_counts": float("inf")},
-        {"taps": 1, "on_counts": float("nan")},
-        {"taps": 1, "idle_timeout_s": 0},
-        {"taps": 1, "idle_timeout_s": float("nan")},
+        {"contact_on_counts": 100, "contact_off_counts": 200},
+        {"contact_off_counts": 0},
+        {"contact_on_counts": float("inf")},
+        {"contact_on_counts": float("nan")},
+        {"idle_reset_s": 0},
+        {"idle_reset_s": float("nan")},
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong):
     with pytest.raises(UsageError, match="expected"):
-        TapTracker(**wrong)
+        RuntimeOptions(**wrong)
+    with pytest.raises(UsageError, match="expected"):
+        TapTracker(0)
     assert issubclass(UsageError, EdgeError) and issubclass(UsageError, ValueError)
 
 

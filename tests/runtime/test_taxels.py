@@ -19,8 +19,8 @@ from edge.perception.taxel_health import (
     HOLD_SCANS,
     LONE_COUNTS,
     REST_COUNTS,
-    SILENT_SCANS,
     STUCK_SCANS,
+    TAXEL_SILENT_SCANS,
     TaxelWatch,
 )
 from firmware_bridge.geometry import USPA44
@@ -145,7 +145,7 @@ def test_the_dead_do_not_count_among_those_that_should_be_new():
 
 def test_half_of_the_taxels_silent_are_a_wrong_id_map():
     pad = Pad()
-    pad.read(SILENT_SCANS, *(silent(taxel) for taxel in range(8)))
+    pad.read(TAXEL_SILENT_SCANS, *(silent(taxel) for taxel in range(8)))
     assert not pad.watch.may_be_estimated
     assert joined(pad.watch.notes(None)) == "no pattern, taxel 0, 1, 2, 3, 4, 5, 6, 7 silent: try another --id-map"
 

@@ -9,6 +9,7 @@ from functools import partial
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
 from websockets.sync.client import connect
 
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.sinks.binary_message import unpack
@@ -28,7 +29,11 @@ class Press:
     """Results of scans, of an emulated sensor, pressed five times in eight."""
 
     def __init__(self, sensor="4", contract=CONTRACT, **settings):
-        settings = {"source": "emulated", "baselines": {sensor: BASELINE}, "reuse": False} | settings
+        settings = {
+            "source": "emulated",
+            "baselines": {sensor: BASELINE},
+            "options": RuntimeOptions(every_scan=True),
+        } | settings
         self.runtime = Runtime(FakeModel(contract), **settings)
         self.sensor = sensor
         self.number = 0

@@ -34,6 +34,7 @@ from edge.errors import EdgeError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.options import RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
@@ -121,7 +122,7 @@ def write(pipe: Connection, setup: str, endpoint: str, sensors: list[str], ticks
     scans, _ = stream(load_frozen_set(FROZEN_FILE), 1)
     rest, now_s = REST.astype(np.float32), time.time()
     baselines = {name: Baseline.of(name, rest, created_unix_s=now_s, scans=100, origin="file") for name in sensors}
-    runtime = Runtime(model, source="emulated", baselines=baselines, reuse=False)
+    runtime = Runtime(model, source="emulated", baselines=baselines, options=RuntimeOptions(every_scan=True))
     sink = ZenohSink(f"{KEY}?connect={endpoint}")
     made = [] if setup == "whole" else _made(runtime, scans[: ticks + APART_SCANS * len(sensors)], sensors)
     pipe.send("ready")

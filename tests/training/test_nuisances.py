@@ -5,7 +5,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from edge.perception.tap_tracker import ON_COUNTS
+from edge.perception.options import ON_COUNTS
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from train.physics.hysteresis import frame_weights, maxwell

@@ -6,8 +6,8 @@ from typing import Any, Final, NamedTuple
 
 from edge.perception.result import Result
 from edge.sinks.json_record import record
+from firmware_bridge.silence import SHOWN_SILENT_S
 
-SILENCE_S: Final = 1.0
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
 
 
@@ -58,7 +58,7 @@ def _findings(result: Result, silence_s: float | None, trouble: str | None) -> l
     found: list[tuple[Level, str]] = []
     if result.source != "device":
         found.append((Level.WARN, f"{result.source.upper()}, not a sensor"))
-    if silence_s is not None and silence_s >= SILENCE_S:
+    if silence_s is not None and silence_s >= SHOWN_SILENT_S:
         found.append((Level.STALE, f"no scan for {silence_s:.0f} s"))
     if trouble is not None:
         found.append((Level.ERROR, trouble))

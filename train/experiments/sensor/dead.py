@@ -24,6 +24,7 @@ from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import STUCK_SCANS, TaxelWatch
 from edge.terminal.progress_bar import tracked
@@ -128,7 +129,11 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
             stuck = stuck + np.random.default_rng([SEED, 3, tap]).uniform(high * [[-1], [-1], [0]], high, (3, _TAXELS))
         # Readings may lie above one another's range here, so the contact thresholds are set explicitly.
         runtime = Runtime(
-            model, source="replay", baselines={"4": _BASELINE}, estimator=estimator, on_counts=1.0, off_counts=0.5
+            model,
+            source="replay",
+            baselines={"4": _BASELINE},
+            estimator=estimator,
+            options=RuntimeOptions(contact_on_counts=1.0, contact_off_counts=0.5),
         )
         series, known, took_us, result = ScanSeries("4", USPA44), None, 0.0, None
         course = list(_course(frozen, frame, model.contract.taps, STUCK_SCANS + 5 if estimator else 1))

@@ -26,6 +26,7 @@ from edge.evaluation.classical_methods import fit_linear_map, fitted_methods
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import load_estimator
+from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
@@ -83,7 +84,13 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None) -> Played:
     """
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
-    runtime = Runtime(model, source="replay", estimator=estimator, baselines={name: grip.free}, reuse=False)
+    runtime = Runtime(
+        model,
+        source="replay",
+        estimator=estimator,
+        baselines={name: grip.free},
+        options=RuntimeOptions(every_scan=True),
+    )
     series = ScanSeries(name, USPA44)
     none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
     patterns, times_us = [], []

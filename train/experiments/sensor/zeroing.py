@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
-from edge.perception.tap_tracker import OFF_COUNTS, ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
@@ -325,7 +325,12 @@ def _cost(model: ModelSession, quick: bool) -> list[Row]:
     scans = [series.close_whole(one, int(n * 1e9 / RATE_HZ)) for n, one in enumerate(counts)]
     took_us: dict[str, list[float]] = {"fixed": [], "followed": []}
     runtimes = {
-        name: Runtime(model, source="emulated", baselines={"4": _BASELINE}, follow_drift=name == "followed")
+        name: Runtime(
+            model,
+            source="emulated",
+            baselines={"4": _BASELINE},
+            options=RuntimeOptions(follow_drift=name == "followed"),
+        )
         for name in took_us
     }
     for first in range(0, count, 500):  # alternating, so that load on the machine slows both

@@ -1,0 +1,46 @@
+"""What a run may be asked for, under one name each from the flags of `edge-sr` to the tap tracker."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from edge.errors import UsageError
+
+ON_COUNTS: Final = 1500.0
+"""Summed z at which a tap begins: about 1.3 N, twelve times the thermal drift of one taxel."""
+OFF_COUNTS: Final = 750.0
+IDLE_RESET_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class RuntimeOptions:
+    """How results are made of scans; each field is the flag of its name, and the keyword of `edge.api.open_runtime`.
+
+    Attributes:
+        contact_on_counts: summed z at which a tap begins.
+        contact_off_counts: summed z below which it ends.
+        idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
+        every_scan: infer also where nothing has changed beyond noise since the pattern before.
+        every_tap: use all taps there are, also those that are not expected to help.
+        follow_drift: let the rest level follow what a free pad reads.
+
+    Raises:
+        UsageError: contact thresholds or a time that cannot be.
+    """
+
+    contact_on_counts: float = ON_COUNTS
+    contact_off_counts: float = OFF_COUNTS
+    idle_reset_s: float = IDLE_RESET_S
+    every_scan: bool = False
+    every_tap: bool = False
+    follow_drift: bool = True
+
+    def __post_init__(self) -> None:
+        on_counts, off_counts = self.contact_on_counts, self.contact_off_counts
+        if not 0 < off_counts <= on_counts < math.inf:
+            raise UsageError(f"contact thresholds are on {on_counts}, off {off_counts}: expected 0 < off <= on")
+        if not self.idle_reset_s > 0:
+            raise UsageError(f"idle_reset_s is {self.idle_reset_s} s, expected more than 0")
+
+
+DEFAULTS: Final = RuntimeOptions()
