@@ -46,12 +46,8 @@ class Deadline:
             del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
         self._intervals.append(interval_ns)
         insort(self._sorted, interval_ns)
-        self._measure()
-
-    def _measure(self) -> None:
-        if not self._known:
-            enough = len(self._sorted) >= FEWEST_INTERVALS
-            self.period_ns = self._sorted[len(self._sorted) // 2] if enough else None
+        if not self._known and len(self._sorted) >= FEWEST_INTERVALS:
+            self.period_ns = self._sorted[len(self._sorted) // 2]
 
     def _is_of_a_burst(self, interval_ns: int) -> bool:
         """Whether the scan was held up somewhere and came right behind the one before; not if all of late did."""
@@ -60,7 +56,7 @@ class Deadline:
         if self._hurried > LONGEST_BURST:
             self._intervals.clear()
             self._sorted.clear()
-            self._measure()
+            self.period_ns = self.period_ns if self._known else None
         return hurried and self._hurried <= LONGEST_BURST
 
     def check(self, scan_time_ns: int, done_ns: int) -> bool:

@@ -95,7 +95,7 @@ class BurstReader:
         """Return how long the next call of `read` may be put off while the descriptor is not readable, in [s]."""
         if self.held_until_s is None:
             hurried = wanted_bytes < FULL_BYTES and self._clock_s() - self._newest_s <= LONGEST_REST_S
-            return STEP_S if hurried else LONGEST_WAIT_S
+            return 0.0 if hurried else LONGEST_WAIT_S
         left_s = max(self.held_until_s - self._clock_s(), 0.0)
         return left_s if wanted_bytes >= FULL_BYTES else min(left_s, STEP_S)
 

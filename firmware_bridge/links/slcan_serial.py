@@ -161,7 +161,7 @@ class SlcanSerialLink(Link):
         scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
         if self._questions.due(len(scans), self._scans.decoder.refusals, now_ns):
             _ask(self._serial, STATUS_FLAGS)
-        silence = self._questions.answered_in_silence
+        silence = not scans and self._questions.answered_in_silence
         self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
         if self._stamps_on and self._stamps_are_none():
             self._asks_stamps = self._stamps_on = False

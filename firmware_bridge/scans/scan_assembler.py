@@ -100,8 +100,9 @@ class ScanAssembler:
         """
         fewest = self._taxels + 1
         for sensor in self._sensors.values():
-            if sensor.closes_before_long(self._newest_ns):
-                fewest = min(fewest, sensor.missing)
+            missing = sensor.missing(self._newest_ns)
+            if missing is not None and missing < fewest:
+                fewest = missing
         if fewest <= self._taxels:
             return fewest
         # While the order of the only sensor is still to be learnt, too: its pauses are not to be slept through.
@@ -156,13 +157,13 @@ class _Sensor:
         self._last = self._last_cycle = self._device = None
         self.wire.begin_anew()
 
-    def closes_before_long(self, now_ns: int) -> bool:
-        """It exists, and the scan that may be open is not one that it left unfinished."""
-        return self.confirmed and (not self._taxels or now_ns - self._opened_ns <= SCAN_GIVEN_UP_NS)
+    def missing(self, now_ns: int) -> int | None:
+        """Return the readings until the open scan closes; one where that is not known: no pause is slept through.
 
-    @property
-    def missing(self) -> int:
-        """Readings until the open scan closes; one where that is not known, so that no pause is slept through."""
+        None: the sensor does not exist, or has left its open scan unfinished.
+        """
+        if not self.confirmed or (self._taxels and now_ns - self._opened_ns > SCAN_GIVEN_UP_NS):
+            return None
         return self._last_place - self._place if self.wire.order else 1
 
     def awaits(self, cycle: Cycle) -> bool:

@@ -250,7 +250,7 @@ def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
     monkeypatch.setattr(visit, "GIVEN_UP_S", 0.3)
     options = doctor_parser().parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
-    monkeypatch.setattr(watch, "link_to", lambda *_, **__: link)
+    monkeypatch.setattr(watch, "links_to", lambda *_, **__: [link])
     assert command.run(options, out, Terminal(Person())) == 1
     settled = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"

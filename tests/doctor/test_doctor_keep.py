@@ -157,7 +157,7 @@ class TestUse:
 
     def test_every_command_that_reads_a_sensor_takes_the_force(self, tmp_path, monkeypatch):
         save_sensor_file(tmp_path / "s.toml", EMULATED)
-        monkeypatch.setattr("edge.api.link_to", lambda *_, **__: FakeLink([], kind="device"))
+        monkeypatch.setattr("edge.api.links_to", lambda *_, **__: [FakeLink([], kind="device")])
         with pytest.raises(SensorFileError), open_source(sensor=tmp_path / "s.toml"):
             pass
         with open_source(sensor=tmp_path / "s.toml", force=True):
@@ -168,7 +168,7 @@ class TestUse:
         monkeypatch.chdir(tmp_path)
         save_sensor_file(tmp_path / "s.toml", EMULATED)
         for module in ("edge.api", "edge.doctor.watch"):
-            monkeypatch.setattr(f"{module}.link_to", lambda *_, **__: FakeLink([], kind="device"))
+            monkeypatch.setattr(f"{module}.links_to", lambda *_, **__: [FakeLink([], kind="device")])
         code = cli.main([*command, "--sensor", "s.toml"])
         lines = [line for line in capsys.readouterr().err.splitlines() if "emulated sensor 4" in line]
         assert code == 2 and len(lines) == 1

@@ -24,7 +24,7 @@ def told(*arguments, link=None, out=None):
     options = doctor_parser().parse_args(["--no-press", *map(str, arguments)])
     out = io.StringIO() if out is None else out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(watch, "link_to", lambda *_, **__: FakeLink([WELL], kind="replay") if link is None else link())
+        patch.setattr(watch, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()])
         return command.run(options, out, io.StringIO()), out.getvalue()
 
 
