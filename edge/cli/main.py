@@ -174,7 +174,12 @@ def _baseline(arguments: Sequence[str]) -> int:
 
 
 def _bench(arguments: Sequence[str]) -> int:
-    from edge.bench.options import bench_parser
+    try:
+        from edge.bench.options import bench_parser
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            "the wheel leaves edge-sr bench out: install a checkout (pip install --editable '.[bench]')"
+        ) from error
 
     options = bench_parser().parse_args(arguments)
     if options.soak is not None and not options.system:

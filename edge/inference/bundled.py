@@ -34,6 +34,12 @@ def find_model(name: str | Path) -> Path:
     for model in bundled_models():
         if str(name) in (model.name, model.stem):
             return model
+    in_integers = f"{path.name.removesuffix('.onnx')}{INT8_SUFFIX}"
+    if in_integers in {model.stem for model in bundled_models()}:
+        raise ModelError(
+            f"model '{name}' is in float32, which this installation lacks: take {in_integers}, "
+            "or install a checkout (pip install --editable .), which has all models"
+        )
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")
 
