@@ -23,13 +23,13 @@ from edge_samples import ROOT, make_pad_contract
 from view_samples import Press, live_page, wait_for
 from websockets.sync.client import connect
 
-from edge import view as edge_view
 from edge.inference.bundled import demo_recording
 from edge.perception.wrench import Wrench
 from edge.sinks.binary_message import unpack
 from edge.terminal.heatmap import colours
 from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
+from edge.view.static_page import page_script
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
@@ -426,7 +426,7 @@ class TestHeld:
         assert here < there + 0.07 * part(page, "force-plot").evaluate("canvas => canvas.width")
 
     def test_a_held_trace_stays_as_it_is_though_more_comes_for_its_last_point(self, page):
-        source = (Path(edge_view.__file__).parent / "page.html").read_text()
+        source = page_script().decode()
         parts = r"^const (?:LONGEST_S|POINTS|STEP_S) .*\n|^class Trace \{\n(?:.*\n)*?\}\n"
         before, held, after = page.evaluate(
             f"""() => {{

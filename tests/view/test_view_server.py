@@ -24,7 +24,7 @@ from edge.view import connection_limits as connections
 from edge.view import server
 from edge.view import viewer_connection as attended
 from edge.view.live_view import LiveView
-from edge.view.static_page import PAGE_FILE
+from edge.view.static_page import SCRIPTS, load_page
 from firmware_bridge.recording.formats import load_recording
 
 GOODBYE = b"\x88\x80\x00\x00\x00\x00"
@@ -60,7 +60,8 @@ def viewers(page):
 class TestPage:
     def test_one_file_without_outside_assets_and_nothing_else(self, page):
         status, headers, body = get(page)
-        assert status == 200 and body == PAGE_FILE.read_bytes() and headers["Content-Type"].startswith("text/html")
+        assert status == 200 and body == load_page().body and headers["Content-Type"].startswith("text/html")
+        assert b"page.css" not in body and not any(name.encode() in body for name in SCRIPTS)
         policy = headers["Content-Security-Policy"]
         assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy and "connect-src 'self'" in policy
         assert "script-src 'sha256-" in policy  # whatever else finds its way into the page does not run

@@ -1,0 +1,121 @@
+// ---- What is kept between visits; a browser may refuse it ----
+
+const memory = {
+  get: (key) => { try { return localStorage.getItem(`edge-sr.${key}`); } catch { return null; } },
+  set: (key, value) => { try { localStorage.setItem(`edge-sr.${key}`, value); } catch { /* it is only forgotten */ } },
+};
+
+/** The token opens the socket; it is kept for this tab's reloads, and not left in the address bar. */
+function takeToken() {
+  const address = new URL(location.href);
+  const given = address.searchParams.get("token");
+  try {
+    if (given === null) return sessionStorage.getItem("edge-sr.token");
+    sessionStorage.setItem("edge-sr.token", given);
+  } catch { /* a reload will need the whole address again */ }
+  if (given !== null) {
+    address.searchParams.delete("token");
+    history.replaceState(null, "", address);
+  }
+  return given;
+}
+
+// ---- Frames ----
+
+/** A frame as the program packs it (edge/sinks/binary_message.py): {header, maps by name}. */
+function unpack(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  const maps = {};
+  let at = 4 + length;
+  for (const [name, shape] of header.maps ?? []) {
+    const count = shape.reduce((product, size) => product * size, 1);
+    maps[name] = { shape, values: new Float32Array(buffer, at, count) };
+    at += 4 * count;
+  }
+  return { header, maps };
+}
+
+// ---- The link ----
+
+const SILENT_S = 2.5; // the program says something every second
+const WAITS_S = [0.25, 0.5, 1, 2, 4];
+const VERSION = 1;
+const GOING_AWAY = 1001; // the run has ended
+const REFUSED = [403, 503]; // not who asks; not so many
+
+class Link {
+  constructor({ onFrame, onChange }) {
+    Object.assign(this, { onFrame, onChange, socket: null, up: false, tries: 0, timer: 0, heardS: nowS(), nextS: null, ended: false, why: null });
+    const token = takeToken();
+    this.path = token === null ? "/ws" : `/ws?token=${encodeURIComponent(token)}`;
+  }
+
+  open() {
+    clearTimeout(this.timer);
+    this.nextS = null;
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}${this.path}`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => this.hear(socket, data);
+    socket.onclose = (event) => this.lose(socket, event.code);
+    this.heardS = nowS();
+    this.socket = socket;
+    this.onChange();
+  }
+
+  hear(socket, data) {
+    if (socket !== this.socket || typeof data === "string") return;
+    this.heardS = nowS();
+    if (!this.up) {
+      this.up = true; // first of all: what hears the first frame may answer it
+      this.tries = 0;
+      this.why = null;
+      this.onChange();
+    }
+    this.onFrame(unpack(data));
+  }
+
+  lose(socket, code = null) {
+    if (socket !== this.socket) return;
+    socket.onmessage = socket.onclose = null;
+    this.socket = null;
+    if (this.up) this.ended = code === GOING_AWAY;
+    else this.inquire();
+    this.up = false;
+    const wait = WAITS_S[Math.min(this.tries++, WAITS_S.length - 1)];
+    this.nextS = nowS() + wait;
+    this.timer = setTimeout(() => this.open(), 1000 * wait);
+    this.onChange();
+  }
+
+  /** Why a socket is refused only a plain request is told. */
+  async inquire() {
+    let why = null;
+    try {
+      const answer = await fetch(this.path, { signal: AbortSignal.timeout(1000 * SILENT_S) });
+      if (REFUSED.includes(answer.status)) why = (await answer.text()).trim();
+    } catch { /* nobody answers */ }
+    if (this.up || why === this.why) return;
+    this.why = why;
+    this.onChange();
+  }
+
+  /** A program that says nothing is gone, whatever the socket believes. */
+  look() {
+    if (this.socket === null || nowS() - this.heardS < SILENT_S) return;
+    const socket = this.socket;
+    this.lose(socket);
+    socket.close();
+  }
+
+  hurry() {
+    if (this.socket === null) this.open();
+  }
+
+  send(command) {
+    if (!this.up) return false;
+    this.socket.send(JSON.stringify(command));
+    return true;
+  }
+}

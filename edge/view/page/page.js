@@ -1,0 +1,278 @@
+// ---- Painting: only what changed, only when it can be seen ----
+
+const painter = {
+  asked: 0,
+  ask() {
+    if (this.asked === 0 && !document.hidden) this.asked = requestAnimationFrame(() => this.paint());
+  },
+  all() {
+    for (const sensor of page.sensors.values()) sensor.dirty = true;
+    this.ask();
+  },
+  paint() {
+    this.asked = 0;
+    paintPage();
+    for (const sensor of page.sensors.values()) if (sensor.dirty) sensor.paint();
+  },
+};
+
+// ---- The page ----
+
+const MOST_LINES = 100;
+const COUNTED = ["reset", "zeroing", "in_contact", "given_up", "rest_level"]; // events that differ by numbers alone
+const REFUSAL_S = 10; // so long a refusal is shown, and may be forced
+
+const page = {
+  hello: null,
+  sensors: new Map(),
+  state: { recording: false },
+  told: 0, // number of the run's latest event that was told here
+  paused: false,
+  pausedS: 0,
+  auto: memory.get("scale") === "auto",
+  spanS: memory.get("span") === "60" ? 60 : 10,
+  asked: null, // what this page asked to zero last: {sensor, or undefined for all; untilS}
+  forcible: new Set(), // sensors of which that was refused, while it may be forced
+  refusalTimer: 0,
+  lostS: null,
+  link: null,
+};
+
+function announce(text) { say(byId("live"), text); }
+
+/** One more line; one of the same key as the line before is counted, since it may differ by its numbers alone. */
+function log(what, { key = what, bad = false, ageS = 0 } = {}) {
+  const list = byId("log");
+  const clock = new Date(Date.now() - 1000 * ageS).toLocaleTimeString();
+  list.querySelector(".none")?.remove();
+  const first = list.firstElementChild;
+  if (first?.dataset.key === key) {
+    first.dataset.times = String(Number(first.dataset.times) + 1);
+    [clock, what, `${first.dataset.times} times`].forEach((said, place) => { first.children[place].textContent = said; });
+    return;
+  }
+  const line = document.createElement("li");
+  line.dataset.key = key;
+  line.dataset.times = "1";
+  const time = line.appendChild(document.createElement("time"));
+  time.textContent = clock;
+  const words = line.appendChild(document.createElement("span"));
+  words.textContent = what;
+  words.classList.toggle("bad", bad);
+  line.append(document.createElement("span"));
+  list.prepend(line);
+  while (list.children.length > MOST_LINES) list.lastChild.remove();
+  if (bad) announce(what);
+}
+
+function paintPage() {
+  const { hello, link } = page;
+  const origin = byId("origin");
+  const source = hello?.source ?? "device";
+  show(origin, hello !== null && source !== "device");
+  origin.dataset.source = source;
+  say(origin, source === "replay" ? "REPLAY: nothing here is happening now" : "EMULATED: there is no sensor behind this");
+  const models = new Set([...page.sensors.values()].map((sensor) => sensor.said?.model ?? hello.model));
+  say(byId("about"), hello === null ? "" : [hello.name, ...(models.size ? models : [hello.model])].join(", "));
+  paintTrouble();
+  byId("pause").setAttribute("aria-pressed", String(page.paused));
+  byId("pause").firstChild.textContent = page.paused ? "Go on " : "Pause ";
+  const recording = Boolean(page.state.recording);
+  byId("record").setAttribute("aria-pressed", String(recording));
+  byId("record").firstChild.textContent = recording ? "Recording " : "Record ";
+  say(byId("scale").firstElementChild, `Scale: ${page.auto ? "auto" : "fixed"}`);
+  for (const id of ["zero", "reset", "record", "force"]) byId(id).disabled = !link.up;
+  show(byId("waiting"), page.sensors.size === 0);
+  say(byId("waiting"), `Waiting for ${hello === null ? "edge-sr" : "the first scan"}`);
+  document.title = titleText(source);
+}
+
+function paintTrouble() {
+  const { link } = page;
+  const [trouble, state] = [byId("trouble"), byId("link")];
+  const waitS = link.nextS === null ? 0 : Math.max(0, Math.ceil(link.nextS - nowS()));
+  const next = waitS > 0 ? `next try in ${waitS}${THIN}s` : "trying again";
+  state.dataset.up = link.up ? "yes" : "no";
+  const viewers = page.state.viewers > 1 ? `, ${page.state.viewers} viewers` : "";
+  say(state, link.up ? `connected${viewers}` : page.hello === null && link.tries === 0 ? "connecting" : "not connected");
+  const lost = !link.up && link.tries > 0;
+  show(trouble, lost || page.paused);
+  trouble.dataset.kind = lost ? "lost" : "pause";
+  const since = ago(nowS() - page.lostS);
+  const what = page.hello === null ? "no connection to edge-sr" : `${link.ended ? `the run has ended (${since})` : `connection lost ${since}`}: what is shown is old`;
+  say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor goes on. Space goes on here`);
+}
+
+const lostWord = () => (page.link.ended ? "run ended" : "connection lost");
+
+function titleText(source) {
+  const mark = source === "device" ? "" : `${source.toUpperCase()} `;
+  const words = [...page.sensors.values()].map((sensor) => sensor.word()[0]);
+  return `${mark}${page.link.up ? [...new Set(words)].join(", ") || "waiting" : lostWord()} \u2013 edge-sr`;
+}
+
+// ---- What comes ----
+
+const hear = {
+  hello(header) {
+    if (header.version !== VERSION) log(`this page is of another version (${VERSION}) than edge-sr (${header.version}): load it again`, { bad: true });
+    if (page.hello !== null && page.hello.run !== header.run) forgetRun();
+    page.hello = header;
+    document.documentElement.style.setProperty("--pad", `${header.cols} / ${header.rows}`);
+    page.state.recording = header.recording;
+    for (const sensor of page.sensors.values()) sensor.hello = header;
+    if (page.paused) page.link.send({ cmd: "pause", on: true });
+  },
+  result(header, maps) {
+    if (page.hello === null) return;
+    const sensor = sensorOf(header.sensor);
+    if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the program heard of the pause, and not again
+    else sensor.hear(header, maps);
+  },
+  event({ note, event, sensor, number, age_s = 0 }) {
+    if (number <= page.told) return; // a newcomer is told the latest again, and after a reconnect this page is one
+    page.told = number ?? page.told; // the answer to this page alone has none
+    const refused = ["refused", "in_contact", "given_up"].includes(event);
+    const key = COUNTED.includes(event) ? `${event} ${sensor}` : note;
+    log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink"].includes(event), ageS: age_s });
+    if (refused && age_s < REFUSAL_S) refuse(note, event === "in_contact" ? sensor : null);
+  },
+  state(header) {
+    page.state = header;
+    if (page.hello === null) return;
+    for (const [name, sensor] of page.sensors) {
+      const silentS = header.silent?.[name] ?? null;
+      if (silentS !== null || sensor.silentS !== null) sensor.dirty = true;
+      sensor.silentS = silentS;
+    }
+  },
+};
+
+/** What was refused is told where it is seen; where a touched sensor is why, this page may force what it asked for, by another button and only for a while. */
+function refuse(text, touchedSensor) {
+  const { asked, forcible } = page;
+  if (touchedSensor !== null && asked !== null && nowS() < asked.untilS && (asked.sensor ?? touchedSensor) === touchedSensor) forcible.add(touchedSensor);
+  else if (forcible.size > 0) return; // what stands there is to be decided; the log has this one, too
+  clearTimeout(page.refusalTimer);
+  page.refusalTimer = setTimeout(forgetRefusal, 1000 * REFUSAL_S);
+  const touched = [...forcible].map((name) => `sensor ${name} is in contact`);
+  say(byId("refusal").firstElementChild, touched.length > 0 ? `zeroing refused: ${touched.join(", ")}` : text);
+  show(byId("force"), touched.length > 0);
+  show(byId("refusal"), true);
+}
+
+function forgetRefusal() {
+  clearTimeout(page.refusalTimer);
+  page.asked = null;
+  page.forcible.clear();
+  show(byId("refusal"), false);
+}
+
+function sensorOf(name) {
+  if (!page.sensors.has(name)) {
+    const later = [...page.sensors.values()].filter((other) => other.name.localeCompare(name, "en", { numeric: true }) > 0);
+    const sensor = new Sensor(name, page.hello);
+    sensor.trace.hold(page.paused);
+    const next = [...byId("sensors").children].find((root) => later.some((other) => other.root === root));
+    byId("sensors").insertBefore(sensor.root, next ?? null);
+    page.sensors.set(name, sensor);
+    painter.all();
+  }
+  return page.sensors.get(name);
+}
+
+/** Nothing that was seen of one run, and nothing that was stopped to look at, is of the next. */
+function forgetRun() {
+  for (const sensor of page.sensors.values()) sensor.remove();
+  page.sensors.clear();
+  page.paused = false;
+  page.told = 0;
+  forgetRefusal();
+  log("another run has begun");
+}
+
+// ---- What is done ----
+
+function command(what) {
+  const sent = page.link.send(what);
+  if (!sent) log("not done: there is no connection to edge-sr", { bad: true });
+  return sent;
+}
+
+const act = {
+  zero(sensor) {
+    forgetRefusal();
+    if (command({ cmd: "zero", sensor })) page.asked = { sensor, untilS: nowS() + REFUSAL_S };
+  },
+  force() {
+    for (const sensor of page.forcible) command({ cmd: "zero", sensor, force: true });
+    forgetRefusal();
+  },
+  reset() { command({ cmd: "reset" }); },
+  record() { command({ cmd: "record", on: !page.state.recording }); },
+  pause() {
+    page.paused = !page.paused;
+    page.pausedS = nowS();
+    for (const sensor of page.sensors.values()) sensor.trace.hold(page.paused);
+    page.link.send({ cmd: "pause", on: page.paused });
+    painter.all();
+  },
+  scale() {
+    page.auto = !page.auto;
+    for (const sensor of page.sensors.values()) sensor.highest = sensor.pattern ? largest(sensor.pattern.values) : 0;
+    memory.set("scale", page.auto ? "auto" : "fixed");
+    painter.all();
+  },
+  span() {
+    page.spanS = page.spanS === 10 ? 60 : 10;
+    memory.set("span", String(page.spanS));
+    painter.all();
+  },
+  help() { if (!byId("manual").open) byId("manual").showModal(); },
+};
+
+const KEYS = { z: "zero", "shift z": "force", r: "reset", "shift r": "record", " ": "pause", s: "scale", t: "span", "?": "help" };
+
+function pressed(event) {
+  if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || byId("manual").open) return;
+  if (event.key === " " && event.target instanceof HTMLButtonElement) return; // it presses that button
+  const letter = event.key.toLowerCase(); // whatever Caps Lock makes of it
+  const action = KEYS[event.shiftKey && letter !== "?" ? `shift ${letter}` : letter];
+  if (action === undefined) return;
+  event.preventDefault();
+  act[action]();
+}
+
+// ---- Beginning ----
+
+page.link = new Link({
+  onFrame({ header, maps }) {
+    hear[header.kind]?.(header, maps);
+    painter.ask();
+  },
+  onChange() {
+    const { link } = page;
+    if (link.tries === 1 && !link.up && page.hello !== null && link.nextS !== null) {
+      page.lostS = link.heardS;
+      announce(lostWord());
+    }
+    if (link.why !== null) announce(link.why);
+    if (link.up && page.lostS !== null) {
+      log(`connected again after ${duration(nowS() - page.lostS)}`);
+      page.lostS = null;
+    }
+    painter.all();
+  },
+});
+
+for (const id of ["zero", "force", "reset", "record", "pause", "scale", "help"]) byId(id).onclick = () => act[id]();
+document.addEventListener("keydown", pressed);
+document.addEventListener("visibilitychange", () => { page.link.hurry(); painter.all(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => painter.all());
+// Ages and waits are the only things that move without news.
+setInterval(() => {
+  page.link.look();
+  const moving = !page.link.up || page.paused || [...page.sensors.values()].some((sensor) => !sensor.live());
+  if (moving) painter.all();
+}, 500);
+page.link.open();

@@ -1,0 +1,399 @@
+// ---- A sensor ----
+
+class Sensor {
+  constructor(name, hello) {
+    Object.assign(this, { name, hello, said: null, heardS: 0, pattern: null, deviation: null, touchedS: 0, zeroed: null, taps: null, cursor: null });
+    Object.assign(this, { trace: new Trace(), touched: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
+    const root = byId("sensor").content.firstElementChild.cloneNode(true);
+    this.root = root;
+    this.part = Object.fromEntries([...root.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
+    this.part.name.id = `sensor-${encodeURIComponent(name)}`;
+    root.setAttribute("aria-labelledby", this.part.name.id);
+    root.dataset.sensor = name;
+    say(this.part.name, `sensor ${name}`);
+    this.part.field.setAttribute("aria-label", `pattern of sensor ${name}; arrow keys read out a pixel`);
+    this.part.taxels.setAttribute("aria-label", `taxels of sensor ${name}, z in colour and shear as arrows`);
+    this.fields = this.addNumbers();
+    this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"]];
+    for (const canvas of this.sized) sizes.observe(canvas);
+    paintBar(this.part["pattern-bar"], VIRIDIS);
+    paintBar(this.part["taxels-bar"], CIVIDIS);
+    paintBar(this.part["deviation-bar"], MAGMA);
+    this.listen();
+  }
+
+  addNumbers() {
+    const fields = {};
+    for (const [title, rows] of Object.entries(NUMBERS)) {
+      if (title === "Wrench" && !this.hello.wrench) continue;
+      const group = document.createElement("div");
+      const heading = group.appendChild(document.createElement("h3"));
+      heading.textContent = title;
+      const list = group.appendChild(document.createElement("dl"));
+      for (const [label, key, size] of rows) {
+        const term = list.appendChild(document.createElement("dt"));
+        const value = list.appendChild(document.createElement("dd"));
+        term.textContent = label;
+        value.dataset.number = key;
+        if (size) { term.className = value.className = size; }
+        fields[key] = value;
+      }
+      this.part.numbers.append(group);
+    }
+    return fields;
+  }
+
+  listen() {
+    const { field, zero, span } = this.part;
+    zero.onclick = () => act.zero(this.name);
+    span.onclick = () => act.span();
+    field.onpointermove = (event) => {
+      const box = field.getBoundingClientRect();
+      this.point((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
+    };
+    field.onpointerleave = () => this.point(null);
+    field.onblur = () => this.point(null);
+    field.onkeydown = (event) => this.steer(event);
+  }
+
+  remove() {
+    for (const canvas of this.sized) sizes.unobserve(canvas);
+    this.root.remove();
+  }
+
+  // -- what comes --
+
+  hear(header, maps) {
+    const first = this.said === null;
+    this.said = header;
+    this.heardS = nowS() - (header.age_s ?? 0);
+    this.silentS = null;
+    this.trace.add(header.trace ?? []);
+    this.zeroed = maps.zeroed ?? null;
+    this.taps = maps.taps ?? null;
+    if (maps.pattern) {
+      this.pattern = maps.pattern;
+      this.deviation = maps.deviation ?? null;
+      this.touchedS = this.heardS;
+      this.touched = header;
+      this.highest = largest(maps.pattern.values, this.highest);
+    } else if (header.baseline === null) {
+      this.pattern = this.deviation = null; // before a baseline nothing that was seen means anything
+    }
+    this.tellNotes(header, first);
+    this.dirty = true;
+  }
+
+  /** Notes whose numbers alone change are told once; a step in rest level is an event besides. */
+  tellNotes({ note, note_kinds = [], dead }, first) {
+    const told = note_kinds.filter((kind) => kind !== "rest_level");
+    const kinds = told.length === 0 ? "" : JSON.stringify([told, dead]);
+    if (kinds !== "" && kinds !== this.noteKinds && !(first && this.said.state === "zeroing")) {
+      log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}` });
+    }
+    this.noteKinds = kinds;
+  }
+
+  // -- reading a pixel --
+
+  size() {
+    const [rows, cols] = this.pattern?.shape ?? [this.hello.height, this.hello.width];
+    return [rows, cols];
+  }
+
+  point(x, y) {
+    const [rows, cols] = this.size();
+    const inside = x !== null && x >= 0 && x < 1 && y >= 0 && y < 1;
+    this.cursor = inside ? [Math.floor(y * rows), Math.floor(x * cols)] : null;
+    this.dirty = true;
+    painter.ask();
+  }
+
+  steer(event) {
+    const steps = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] };
+    if (event.key === "Escape" && this.cursor !== null) return this.point(null);
+    const step = steps[event.key];
+    if (!step || event.ctrlKey || event.altKey || event.metaKey) return undefined;
+    event.preventDefault();
+    const stride = event.shiftKey ? 5 : 1;
+    const limits = this.size();
+    const from = this.cursor ?? limits.map((limit) => Math.floor(limit / 2));
+    this.cursor = from.map((place, axis) => Math.max(0, Math.min(limits[axis] - 1, place + stride * step[axis])));
+    this.dirty = true;
+    painter.ask();
+    announce(this.reading());
+    return undefined;
+  }
+
+  reading() {
+    const [rows, cols] = this.size();
+    const [row, col] = this.cursor;
+    const pitch = this.hello.pixel_pitch_mm;
+    const place = `x ${number((col + 0.5 - cols / 2) * pitch, 1)}, y ${number((row + 0.5 - rows / 2) * pitch, 1)}${THIN}mm`;
+    if (this.pattern === null) return `${place}: no pattern`;
+    const unit = this.unit();
+    const at = row * cols + col;
+    const doubt = this.deviation === null ? "" : ` \u00b1 ${amount(this.deviation.values[at], 3, unit)}`;
+    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${doubt}${this.live() ? "" : ", not live"}`;
+  }
+
+  // -- how it stands --
+
+  unit() { return this.said?.pattern_unit || this.hello.pattern_unit || "mm"; }
+
+  ageS() { return nowS() - this.heardS; }
+
+  /** No word from the sensor: the program says so, or what it last said has become old. */
+  away() { return this.silentS !== null || (this.said !== null && this.ageS() > 1); }
+
+  /** The pattern shown is of the newest scan here; one that was overtaken keeps the pattern before for a moment. */
+  newest() {
+    if (this.pattern === null) return false;
+    return this.touchedS === this.heardS || (this.said.state === "dropped" && this.heardS - this.touchedS < FRESH_S);
+  }
+
+  live() { return this.newest() && page.link.up && !this.away() && !page.paused; }
+
+  /** To be shown in grey; what a person stopped to look at keeps its colours, under a word that says so. */
+  old() { return this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest()); }
+
+  /** What was said of the pattern that is shown, if it is live; else what was said last. */
+  made() { return this.newest() ? this.touched : this.said; }
+
+  word() {
+    if (!page.link.up) return ["lost", lostWord()];
+    if (page.paused) return ["paused", "paused"];
+    if (this.said === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
+    if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
+    const state = this.said.state === "dropped" ? "contact" : this.said.state; // a newer scan was already waiting
+    return [state, state];
+  }
+
+  // -- drawing --
+
+  paint() {
+    this.dirty = false;
+    this.paintWord();
+    this.paintPattern();
+    this.paintTaxels();
+    this.paintDeviation();
+    this.paintTaps();
+    this.paintTraces();
+    this.paintNumbers();
+  }
+
+  paintWord() {
+    const [state, word] = this.word();
+    const { badge, why, zero } = this.part;
+    const source = this.said?.source ?? this.hello.source;
+    if (this.part.word.dataset.state !== state) {
+      announce(`sensor ${this.name}: ${word}`);
+      this.part.word.dataset.state = state;
+    }
+    say(this.part.word, word);
+    show(badge, source !== "device");
+    badge.dataset.source = source;
+    say(badge, source.toUpperCase());
+    say(why, this.said?.note ?? "");
+    this.root.classList.toggle("lost", state === "lost" || state === "silent");
+    show(zero, page.sensors.size > 1);
+  }
+
+  high() {
+    const full = this.hello.full_scale || 1;
+    return page.auto ? Math.max(this.highest, LEAST_MM) : full;
+  }
+
+  paintPattern() {
+    const { pattern, field, stamp, over, readout } = this.part;
+    const [unit, high, live] = [this.unit(), this.high(), this.live()];
+    field.classList.toggle("old", this.old());
+    stamp.classList.toggle("aside", page.paused);
+    field.dataset.live = live ? "yes" : "no";
+    say(stamp, this.stampText());
+    show(stamp, !live);
+    say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
+    if (this.pattern !== null) {
+      const [rows, cols] = this.pattern.shape;
+      paintMap(pattern, this.pattern.values, rows, cols, high, VIRIDIS);
+      const most = largest(this.pattern.values);
+      say(this.part["pattern-most"], live ? `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}` : "");
+    } else {
+      pattern.getContext("2d").clearRect(0, 0, pattern.width, pattern.height);
+      say(this.part["pattern-most"], "");
+    }
+    this.paintOver(over, live);
+    readout.classList.toggle("read", this.cursor !== null);
+    say(readout, this.cursor === null ? "hover, or use the arrow keys, to read a pixel" : this.reading());
+  }
+
+  stampText() {
+    if (page.paused && this.newest()) return `paused ${ago(nowS() - page.pausedS)}`;
+    if (this.pattern === null) return this.said === null ? "no scan yet" : this.said.baseline === null ? "no baseline yet" : "no contact yet";
+    return `last contact ${ago(nowS() - this.touchedS)}`;
+  }
+
+  paintOver(canvas, live) {
+    const [context, width, height] = blank(canvas);
+    const [rows, cols] = this.size();
+    const widthMm = cols * this.hello.pixel_pitch_mm;
+    if (!(widthMm > 0) || width === 0) return;
+    const ink = this.pattern === null ? [colour("text"), colour("card")] : ["#fff", "#0009"];
+    const barMm = SCALE_BARS_MM.find((mm) => mm <= widthMm / 3) ?? widthMm;
+    const bar = (barMm / widthMm) * width;
+    haloed(context, ink, 2, () => {
+      context.moveTo(10, height - 16);
+      context.lineTo(10, height - 10);
+      context.lineTo(10 + bar, height - 10);
+      context.lineTo(10 + bar, height - 16);
+    });
+    context.font = FONT;
+    context.textAlign = "center";
+    haloedText(context, ink, `${barMm}${THIN}mm`, 10 + bar / 2, height - 16);
+    const centre = live ? this.touched.centroid_mm : null;
+    if (centre) {
+      const [x, y] = [width / 2 + (centre[0] / widthMm) * width, height / 2 + (centre[1] / widthMm) * width];
+      haloed(context, ink, 1.5, () => { context.moveTo(x - 6, y); context.lineTo(x + 6, y); context.moveTo(x, y - 6); context.lineTo(x, y + 6); });
+    }
+    const wrench = live ? this.touched.wrench : null;
+    if (wrench?.centre_of_pressure_mm) {
+      const [x, y] = wrench.centre_of_pressure_mm.map((mm, axis) => [width, height][axis] / 2 + (mm / widthMm) * width);
+      const [fx, fy] = wrench.force_n;
+      const length = (SHEAR_SHARE * width) / Math.hypot(...wrench.force_n);
+      haloed(context, ink, 1.5, () => context.arc(x, y, 5, 0, 2 * Math.PI));
+      arrow(context, ink, x, y, fx * length, fy * length);
+    }
+    if (this.cursor !== null) {
+      const [row, col] = this.cursor;
+      haloed(context, ink, 2, () => context.rect((col * width) / cols, (row * height) / rows, width / cols, height / rows));
+    }
+  }
+
+  paintTaxels() {
+    const { taxels, shear, dead } = this.part;
+    show(this.part["shear-legend"], this.zeroed !== null);
+    const [context, width, height] = blank(shear);
+    const deaths = Object.entries(this.said?.dead ?? {});
+    show(dead, deaths.length > 0);
+    say(dead, `not believed: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
+    if (this.zeroed === null) {
+      taxels.getContext("2d").clearRect(0, 0, taxels.width, taxels.height);
+      say(this.part["taxels-high"], "counts");
+    } else {
+      const [, rows, cols] = this.zeroed.shape;
+      const [count, values] = [rows * cols, this.zeroed.values];
+      const z = values.subarray(2 * count, 3 * count);
+      const believed = Array.from(z, (value, taxel) => (this.said.dead?.[taxel] ? 0 : value));
+      const high = roundUp(largest(believed, LEAST_COUNTS));
+      paintMap(taxels, z, rows, cols, high, CIVIDIS);
+      say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
+      if (width > 0) this.paintShear(context, width, height, rows, cols, values, high);
+    }
+    const [rows, cols] = [this.hello.rows, this.hello.cols];
+    for (const [taxel] of deaths) cross(context, width, height, rows, cols, Number(taxel));
+  }
+
+  paintShear(context, width, height, rows, cols, values, high) {
+    const count = rows * cols;
+    let longest = LEAST_SHEAR_COUNTS;
+    for (let taxel = 0; taxel < count; taxel++) {
+      if (!this.said.dead?.[taxel]) longest = Math.max(longest, Math.hypot(values[taxel], values[count + taxel]));
+    }
+    longest = roundUp(longest);
+    const cell = Math.min(width / cols, height / rows);
+    this.part.ruler.style.width = `${0.45 * cell}px`;
+    say(this.part["shear-most"], `${short(longest)}${THIN}counts`);
+    context.font = '10px system-ui, "DejaVu Sans", sans-serif';
+    context.textAlign = "center";
+    for (let taxel = 0; taxel < count; taxel++) {
+      if (this.said.dead?.[taxel]) continue;
+      const [x, y] = [((taxel % cols) + 0.5) * (width / cols), (Math.floor(taxel / cols) + 0.5) * (height / rows)];
+      const z = values[2 * count + taxel];
+      const ink = level(z, high) > 0.6 * LEVELS ? ["#000", "#fff6"] : ["#fff", "#0006"];
+      arrow(context, ink, x, y, (values[taxel] / longest) * 0.45 * cell, (values[count + taxel] / longest) * 0.45 * cell);
+      if (cell > 34) {
+        context.fillStyle = ink[0];
+        context.fillText(number(z), x, y + cell / 2 - 4);
+      }
+    }
+  }
+
+  paintDeviation() {
+    const { deviation } = this.part;
+    const field = this.part["deviation-field"];
+    const stamp = this.part["deviation-stamp"];
+    const there = this.deviation !== null;
+    field.classList.toggle("old", this.old());
+    show(stamp, !there);
+    say(stamp, this.pattern !== null ? "not given by this model" : "no contact yet");
+    if (!there) {
+      deviation.getContext("2d").clearRect(0, 0, deviation.width, deviation.height);
+      return say(this.part["deviation-high"], this.unit());
+    }
+    const [rows, cols] = this.deviation.shape;
+    const high = roundUp(largest(this.deviation.values, LEAST_DEVIATION_MM));
+    paintMap(deviation, this.deviation.values, rows, cols, high, MAGMA);
+    return say(this.part["deviation-high"], `${short(high)}${THIN}${this.unit()}`);
+  }
+
+  paintTaps() {
+    const { thumbs } = this.part;
+    const slots = Math.max(this.hello.taps || 1, this.taps?.shape[0] ?? 0);
+    while (thumbs.children.length > slots) thumbs.lastChild.remove();
+    while (thumbs.children.length < slots) thumbs.append(thumb(thumbs.children.length));
+    const [there, rows, cols] = this.taps?.shape ?? [0, this.hello.rows, this.hello.cols];
+    const high = there ? largest(this.taps.values, LEAST_COUNTS) : 1;
+    [...thumbs.children].forEach((item, tap) => {
+      item.classList.toggle("empty", tap >= there);
+      const canvas = item.firstChild;
+      if (tap < there) paintMap(canvas, this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), rows, cols, high, CIVIDIS);
+      else canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+    });
+  }
+
+  paintTraces() {
+    const newtons = known(this.said?.force_n);
+    const span = page.spanS;
+    say(this.part.span, `last ${span}${THIN}s`);
+    paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts");
+    paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2");
+    say(this.part["force-now"], newtons ? amount(this.said.force_n, 2, "N") : amount(this.said?.force_counts, 0, "counts"));
+    say(this.part["area-now"], amount(this.made()?.area_mm2, 0, "mm\u00b2"));
+  }
+
+  paintNumbers() {
+    const said = this.said;
+    const made = this.made();
+    if (said === null) return;
+    const counters = said.counters ?? {};
+    const drift = said.drift_counts;
+    const texts = {
+      force: this.part["force-now"].textContent,
+      area: this.part["area-now"].textContent,
+      centroid_mm: made.centroid_mm ? `${made.centroid_mm.map((mm) => number(mm, 1)).join(", ")}${THIN}mm` : "\u2013",
+      ...wrenchTexts(made),
+      taps_used: made.taps_used ? `${made.taps_used} of ${this.hello.taps}` : "\u2013",
+      another_tap: made.another_tap === true ? "would help" : made.another_tap === false ? "would not help" : "\u2013",
+      interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
+      expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
+      reused_from: !this.live() ? "\u2013" : known(made.reused_from) ? "unchanged" : "new",
+      rate_hz: amount(said.rate_hz, 1, "Hz"),
+      run_time_us: amount(made.run_time_us, 0, "\u00b5s"),
+      latency_us: amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms"),
+      model: said.model ?? "\u2013",
+      baseline: said.baseline ?? "none",
+      baseline_origin: ORIGINS[said.baseline_origin] ?? said.baseline_origin ?? "\u2013",
+      baseline_age_s: said.baseline === null ? "\u2013" : duration(said.baseline_age_s),
+      drift: drift ? `${drift.common.map((counts) => number(counts, 1)).join(" ")}` : "\u2013",
+      own: drift ? `${number(drift.own, 1)}, ${number(drift.step, 0)} counts` : "\u2013",
+    };
+    for (const [key, element] of Object.entries(this.fields)) {
+      if (!LOSSES.has(key)) say(element, texts[key]);
+      else {
+        say(element, String(counters[key] ?? 0));
+        element.classList.toggle("warn", counters[key] > 0);
+      }
+    }
+    this.fields.baseline_age_s.classList.toggle("warn", said.baseline !== null && !known(said.baseline_age_s));
+  }
+}
