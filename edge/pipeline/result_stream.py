@@ -155,7 +155,8 @@ class Stream:
         deadline = self._deadlines.get(scan.sensor)
         if deadline is None:
             deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
-        deadline.follow(scan.time_ns)
+        if not scan.unread_ns:  # what lay there came at no pace
+            deadline.follow(scan.time_ns)
         heard_again = self._silence.follow(scan, deadline.period_ns)
         if result.pattern is not None and not self._source.patient:  # whose scans are of another time than the clock's
             statistics.late += deadline.check(scan.time_ns, done_ns)

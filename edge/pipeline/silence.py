@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from edge.perception.event import Event
+from edge.pipeline.deadline import Deadline
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import SENSOR_SILENT_NS
 
@@ -17,6 +18,8 @@ SETTLING_SCANS: Final = 5
 PACED_SCANS: Final = 32
 """Without a gap, from which on their mean period is better known than the median of the newest: by that, 1 % off, a
 stall of a second would seem to have swallowed a scan."""
+SHORTEST_PERIOD_NS: Final = 500_000
+"""Twice as fast as any sensor is read: scans nearer to each other lay there, and tell no period."""
 
 
 @dataclass(slots=True)
@@ -54,6 +57,7 @@ class Silence:
         self._gaps: dict[str, _Gap] = {}
         self._paced_from: dict[str, Scan] = {}
         self._periods_ns: dict[str, float] = {}
+        self._paces: dict[str, Deadline] = {}
         self._silent: set[str] = set()
         self._since_ns: dict[str, int] = {}
 
@@ -69,7 +73,11 @@ class Silence:
             self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
             self._paced_from[scan.sensor] = scan
             return None
-        if period_ns:
+        if scan.device_ns is not None:  # by the device's own time, too, or bursts of a busy reader would look like gaps
+            pace = self._paces.setdefault(scan.sensor, Deadline())
+            pace.follow(scan.device_ns)
+            period_ns = pace.period_ns or period_ns
+        if period_ns and period_ns >= SHORTEST_PERIOD_NS:
             self._follow_gap(before, scan, period_ns)
         if scan.sensor in self._silent:
             self._silent.remove(scan.sensor)
@@ -81,12 +89,16 @@ class Silence:
         """Count what is missing behind a gap, once scans come at their pace again: what was late comes in a burst."""
         gap_ns = _on_bus_ns(scan) - _on_bus_ns(before)
         gap = self._gaps.get(scan.sensor)
-        if gap_ns > GAP_PERIODS * period_ns:
-            if gap is None:
-                self._gaps[scan.sensor] = _Gap(before, self._mean_period_ns(before, period_ns))
-            else:
+        if gap is not None and period_ns > GAP_PERIODS * gap.period_ns:
+            del self._gaps[scan.sensor]  # it was of the pace, which was not known: what is read late comes in bursts
+            self._periods_ns.pop(scan.sensor, None)
+            self._paced_from[scan.sensor] = scan
+        elif gap_ns > GAP_PERIODS * period_ns:
+            if gap is not None:
                 gap.least, gap.settled = math.inf, 0
-        elif gap is not None and gap_ns >= period_ns / 2:
+            elif gap_ns > GAP_PERIODS * (mean_ns := self._mean_period_ns(before, period_ns)):
+                self._gaps[scan.sensor] = _Gap(before, mean_ns)
+        elif gap is not None and gap_ns >= gap.period_ns / 2:
             periods = (_on_bus_ns(scan) - _on_bus_ns(gap.before)) / gap.period_ns
             gap.least = min(gap.least, periods - (scan.number - gap.before.number))
             gap.settled += 1
@@ -96,12 +108,16 @@ class Silence:
                 self._paced_from[scan.sensor] = scan
 
     def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
-        """Over all scans since the last gap, or before it, where there were enough."""
+        """Over all scans since the last gap, or before it, where there were enough.
+
+        Over few, bursts make the median too small, and hardly the mean.
+        """
         first = self._paced_from[scan.sensor]
         scans = scan.number - first.number
+        mean_ns = (_on_bus_ns(scan) - _on_bus_ns(first)) / scans if scans else 0.0
         if scans >= PACED_SCANS:
-            self._periods_ns[scan.sensor] = (_on_bus_ns(scan) - _on_bus_ns(first)) / scans
-        return self._periods_ns.get(scan.sensor, period_ns)
+            self._periods_ns[scan.sensor] = mean_ns
+        return self._periods_ns.get(scan.sensor, max(period_ns, mean_ns))
 
     def look(self) -> list[Event]:
         """Sensors found silent since the last call, while another was heard; of all of them, the link tells."""

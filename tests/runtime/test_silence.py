@@ -3,6 +3,7 @@
 import random
 from dataclasses import replace
 
+import pytest
 from edge_samples import make_scan
 
 from edge.pipeline.deadline import Deadline
@@ -76,6 +77,44 @@ def test_a_stall_that_lost_nothing_misses_nothing():
             deadline.follow(one.time_ns)
             silence.follow(one, deadline.period_ns)
         assert silence.missed == 0, seed
+
+
+def missed_by_a_busy_reader(seed, *, stamped, away_ms, busy, lost=()):
+    """Of a thousand scans that came whenever it had time, which it did not have at first."""
+    noise, silence, deadline = random.Random(seed), Silence(), Deadline()
+    free_ms, arrival_ms = away_ms, 0.0
+    for number, due in enumerate(due for due in range(1000) if due not in lost):
+        due_ms = 10 * due + noise.uniform(-0.4, 0.4)
+        if due_ms > free_ms and noise.random() < busy:
+            free_ms = due_ms + noise.expovariate(1 / 15)
+        arrival_ms = max(arrival_ms + 0.1, due_ms + 0.2, free_ms)
+        unread_ms = arrival_ms - due_ms if arrival_ms - due_ms > 50 else 0
+        one = replace(
+            make_scan(number, sensor="4"),
+            time_ns=round(arrival_ms * MS),
+            device_ns=round(due_ms) * MS if stamped else None,
+            unread_ns=round(unread_ms * MS),
+        )
+        if not one.unread_ns:
+            deadline.follow(one.time_ns)
+        silence.follow(one, deadline.period_ns)
+    return silence.missed
+
+
+@pytest.mark.parametrize("away_ms", [0, 500])
+def test_a_busy_reader_misses_with_time_stamps_just_what_was_lost(away_ms):
+    """By the pace at which it read, thousands were missed of a thousand."""
+    lost = {*range(300, 307), *range(600, 640)}
+    for seed in range(20):
+        assert missed_by_a_busy_reader(seed, stamped=True, away_ms=away_ms, busy=0.6) == 0
+        assert missed_by_a_busy_reader(seed, stamped=True, away_ms=away_ms, busy=0.6, lost=lost) == 47
+
+
+@pytest.mark.parametrize("away_ms", [0, 500])
+def test_a_busy_reader_misses_next_to_nothing_without(away_ms):
+    """Nothing was lost: its guess is off by one scan now and then, where it was off by thousands."""
+    counts = [missed_by_a_busy_reader(seed, stamped=False, away_ms=away_ms, busy=0.2) for seed in range(20)]
+    assert max(counts) <= 10 and sorted(counts)[10] == 0
 
 
 def test_the_device_s_own_time_tells_bursts_from_losses():
