@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from typing import Self
 
-from firmware_bridge.links.base import Link, Notice, SourceKind
+from firmware_bridge.links.base import Link, Notice, SerialLine, SourceKind
 from firmware_bridge.scans.scan import Scan
 
 
@@ -49,3 +49,11 @@ class ChangedLink(Link):
     def counters(self) -> dict[str, int]:
         """The link's."""
         return self.wrapped.counters()
+
+    def can_ids(self) -> frozenset[int]:
+        """Return the link's."""
+        return self.wrapped.can_ids()
+
+    def serial_line(self) -> SerialLine | None:
+        """Return the link's."""
+        return self.wrapped.serial_line()

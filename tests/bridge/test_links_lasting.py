@@ -8,6 +8,7 @@ import pytest
 from edge_samples import FakeLink, make_scan
 
 from edge.doctor.link_checks import LineFacts, line_facts
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links.base import Link, Notice
 from firmware_bridge.links.merged import NamedLink, SeveralLinks
@@ -249,7 +250,15 @@ def test_sensors_of_several_links_bear_their_names():
 
 def test_the_doctor_knows_the_port_behind_a_name():
     link = NamedLink("left", SlcanSerialLink("/dev/ttyUSB7", 115_200))
-    assert line_facts(link) == LineFacts("/dev/ttyUSB7", 115_200)
+    assert line_facts(link) == line_facts(LastingLink(link)) == LineFacts("/dev/ttyUSB7", 115_200)
+    assert line_facts(FakeLink([])) == LineFacts()
+
+
+def test_can_ids_are_known_behind_names_and_outages():
+    serial = SlcanSerialLink("/dev/ttyUSB7")
+    serial._scans.feed(encode_frame(CanFrame(0x004, bytes(8))), 1)
+    assert LastingLink(NamedLink("left", serial)).can_ids() == {0x004}
+    assert FakeLink([]).can_ids() == frozenset()
 
 
 def test_a_link_that_hangs_holds_up_no_other():
