@@ -381,6 +381,8 @@ def test_every_standard_id_that_came_is_known_whoever_it_is_of():
     for frame in frames:
         by_frame.feed(frame, 1)
     assert text.can_ids == by_frame.can_ids == expected
-    alone = SlcanScans()
-    alone.feed(b"".join(map(encode_frame, half)), 1)
-    assert alone.can_ids == {frame.can_id for frame in half}
+    for known in ([frames[:0], half], [half[:3], *[whole] * 5], [whole[10:], *[whole] * 5]):
+        alone = SlcanScans()
+        for number, piece in enumerate(known):
+            alone.feed(b"".join(map(encode_frame, piece)), 10_000_000 * number)
+        assert alone.can_ids == {frame.can_id for piece in known for frame in piece}

@@ -144,7 +144,7 @@ def test_a_change_of_model_is_counted_and_told():
     statistics = Statistics()
     changes = [("a", "chosen"), ("a", None), ("b", "stepped down"), ("b", None), ("a", "stepped up"), ("a", None)]
     for number, (model, why) in enumerate(changes):
-        events = () if why is None else (Event(number, "model", None, why), Event(number, "reset", None))
+        events = () if why is None else (Event(number, "reset", None), Event(number, "model", None, why))
         statistics.add(Result(make_scan(number), "device", model, "contact", run_time_us=9.0, events=events))
     assert statistics.model_changes == 2 and statistics.model_patterns == {"a": 4, "b": 2}
     lines = statistics.summary(source="x").splitlines()
