@@ -31,7 +31,7 @@ from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_mo
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
 from edge.perception.dead_taxel_fill import load_estimator
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from edge.perception.tap_tracker import IDLE_TIMEOUT_S, OFF_COUNTS, ON_COUNTS
@@ -94,6 +94,7 @@ __all__ = [
     "Model",
     "ModelError",
     "NoDeviceError",
+    "Note",
     "Pad",
     "RecordingError",
     "Result",
