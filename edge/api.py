@@ -31,7 +31,7 @@ from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_mo
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
 from edge.perception.dead_taxel_fill import load_estimator
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.perception.options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
@@ -96,6 +96,7 @@ __all__ = [
     "ModelError",
     "ModelMap",
     "NoDeviceError",
+    "Note",
     "Pad",
     "RecordingError",
     "Result",

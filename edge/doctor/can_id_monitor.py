@@ -1,9 +1,7 @@
 """Which CAN ids are really on the bus, and whose they are."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Set as AbstractSet
 
 from edge.doctor.findings import Finding
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
@@ -11,41 +9,11 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
 _SHOWN = 8
 
 
-class HeardIds(Mapping[int, tuple[str, int]]):
-    """A model's taxels by CAN id, which notes what ids are looked up with `get`: those that came over the bus.
-
-    Attributes:
-        ids: how often each was asked for; a scan whose frames come as a scan before is asked for once.
-    """
-
-    def __init__(self, taxels: Mapping[int, tuple[str, int]]) -> None:
-        self.ids: Counter[int] = Counter()
-        self._taxels = taxels
-
-    def get(self, key: int, default: Any = None) -> Any:
-        """Sensor and taxel of a CAN id that came; noted, whether it is one of the map's or not."""
-        self.ids[key] += 1
-        return self._taxels.get(key, default)
-
-    def __getitem__(self, key: int) -> tuple[str, int]:
-        return self._taxels[key]
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._taxels)
-
-    def __len__(self) -> int:
-        return len(self._taxels)
-
-    def listening(self, model: ModelMap) -> ModelMap:
-        """A model that sorts by these taxels."""
-        return replace(model, taxels=self)
-
-
-def check_id_map(ids: Mapping[int, int], model: ModelMap, half_silent: bool) -> Finding | None:
+def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> Finding | None:
     """Does the id map that was asked for know the sensors that speak? None where no CAN ids are seen at all.
 
     Args:
-        ids: how often each CAN id came.
+        ids: the CAN ids that came.
         model: asked for.
         half_silent: of some sensor half of the taxels or more are silent.
     """
@@ -76,7 +44,7 @@ def check_id_map(ids: Mapping[int, int], model: ModelMap, half_silent: bool) -> 
     return Finding("id map", "ok", measured, norm)
 
 
-def _whole_sensors(ids: Mapping[int, int], model: ModelMap) -> list[str]:
+def _whole_sensors(ids: AbstractSet[int], model: ModelMap) -> list[str]:
     """Sensors of a model whose every id was heard."""
     taxels: Counter[str] = Counter(sensor for can_id, (sensor, _) in model.taxels.items() if can_id in ids)
     return [sensor for sensor, count in taxels.items() if count == model.geometry.taxel_count]

@@ -39,7 +39,7 @@ class Watched:
         counters: of the link.
         duration_s: for which it was watched, in [s].
         facts: of the line.
-        ids: how often each CAN id came; empty where the link has none.
+        ids: the CAN ids that came; empty where the link sees none.
         model: the id map that was asked for.
         rate_hz: that a user expects of each sensor, in [Hz].
         references: what the free pads read before, by sensor.
@@ -51,7 +51,7 @@ class Watched:
     counters: Mapping[str, int]
     duration_s: float
     facts: LineFacts = field(default_factory=LineFacts)
-    ids: Mapping[int, int] = field(default_factory=dict)
+    ids: frozenset[int] = frozenset()
     model: ModelMap = USPA44_MAP
     rate_hz: float | None = None
     references: Mapping[str, Baseline] = field(default_factory=dict)

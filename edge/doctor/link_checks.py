@@ -44,9 +44,8 @@ class LineFacts:
 
 def line_facts(link: Link, root: Path = LATENCY_ROOT) -> LineFacts:
     """Of an open link; `root` is where the kernel shows USB serial ports."""
-    link = getattr(link, "wrapped", link)
-    port, baud = getattr(link, "port", None), getattr(link, "baudrate", None)
-    return LineFacts() if port is None else LineFacts(port, baud, latency_timer_ms(port, root))
+    line = link.serial_line()
+    return LineFacts() if line is None else LineFacts(line.port, line.baud, latency_timer_ms(line.port, root))
 
 
 def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from edge.doctor.can_id_monitor import HeardIds
 from edge.doctor.examine import Watched
 from edge.doctor.link_checks import line_facts
 from edge.errors import UsageError
@@ -56,9 +55,7 @@ class Watch:
         if rate_hz is not None:
             check_positive("rate_hz", rate_hz)
         check_baselines(references, known.model_map.geometry)
-        self._heard = HeardIds(known.model_map.taxels)
-        self._model = self._heard.listening(known.model_map)
-        (self.link,) = links_to(texts, known, model=self._model, rate_hz=rate_hz, give_up_s=None)
+        (self.link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=None)
         self.known = with_recorded(known, [self.link])
         self.scans: dict[str, list[Scan]] = {}
         self.duration_s = 0.0
@@ -97,8 +94,8 @@ class Watch:
             self.link.counters(),
             self.duration_s,
             line_facts(self.link),
-            self._heard.ids,
-            self._model,
+            self.link.can_ids(),
+            self.known.model_map,
             self._rate_hz,
             self._references,
             None if self.link.kind == "replay" else int(self._clock_s() * NS_PER_S),

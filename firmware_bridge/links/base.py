@@ -44,6 +44,13 @@ class Notice(NamedTuple):
     sensors: str = ""
 
 
+class SerialLine(NamedTuple):
+    """The serial port of a link, and the speed that it was opened with in [bit/s]."""
+
+    port: str
+    baud: int
+
+
 class Link(Protocol):
     """A source of scans. Inherit it to get what is optional.
 
@@ -98,6 +105,14 @@ class Link(Protocol):
     def counters(self) -> dict[str, int]:
         """What was received, skipped and missed so far, by name; also after it was closed."""
         ...
+
+    def can_ids(self) -> frozenset[int]:
+        """Return the standard CAN ids that came so far, of whatever device; none where the link sees no ids."""
+        return frozenset()
+
+    def serial_line(self) -> SerialLine | None:
+        """Return the serial line of an open link; None where it has none."""
+        return None
 
 
 def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:

@@ -145,6 +145,10 @@ class CanBusLink(Link):
         counts = self._counts | {"clock_restarts": self._device_clock.restarts}
         return counts | self._errors.counters() | self._scans.counters()
 
+    def can_ids(self) -> frozenset[int]:
+        """Return the standard CAN ids that came so far."""
+        return frozenset(self._scans.can_ids)
+
     def _take(self, message: Any, time_ns: int) -> list[Scan]:
         if message.is_error_frame:
             self._counts["error_frames"] += 1

@@ -135,6 +135,10 @@ class GsUsbLink(Link):
         """Received bytes, transfers, and the counters of decoder, bus and assembler."""
         return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
 
+    def can_ids(self) -> frozenset[int]:
+        """Return the standard CAN ids that came so far."""
+        return frozenset(self._scans.can_ids)
+
     def _fetch(self, device: usb.core.Device, timeout_ms: int) -> bytes:
         # libusb waits for ever where the time-out is 0.
         try:

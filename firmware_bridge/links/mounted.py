@@ -5,7 +5,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Self
 
-from firmware_bridge.links.base import Link, Notice, SourceKind, Wait
+from firmware_bridge.links.base import Link, Notice, SerialLine, SourceKind, Wait
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
@@ -58,6 +58,14 @@ class MountedLink(Link):
     def wait_on(self) -> Wait | None:
         """Return what the link waits for."""
         return self.wrapped.wait_on()
+
+    def can_ids(self) -> frozenset[int]:
+        """Return the link's."""
+        return self.wrapped.can_ids()
+
+    def serial_line(self) -> SerialLine | None:
+        """Return the link's."""
+        return self.wrapped.serial_line()
 
     def notices(self) -> list[Notice]:
         """The link's, under the user's name for it."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, NoticeKind, SourceKind, Wait
+from firmware_bridge.links.base import Link, Notice, NoticeKind, SerialLine, SourceKind, Wait
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import LINK_SILENT_S
 
@@ -107,6 +107,14 @@ class LastingLink(Link):
     def counters(self) -> dict[str, int]:
         """The link's own; outages: how often it was lost or fell silent; reopenings: how often it was opened again."""
         return {**self._link.counters(), "outages": self._outages, "reopenings": self._reopenings}
+
+    def can_ids(self) -> frozenset[int]:
+        """Return the link's."""
+        return self._link.can_ids()
+
+    def serial_line(self) -> SerialLine | None:
+        """Return the link's."""
+        return self._link.serial_line()
 
     def _follow_trouble(self) -> None:
         if self._link.trouble != self.trouble:

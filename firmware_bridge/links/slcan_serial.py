@@ -18,7 +18,7 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind, Wait
+from firmware_bridge.links.base import Link, SerialLine, SourceKind, Wait
 from firmware_bridge.links.fd_reader import BurstReader
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
@@ -183,6 +183,14 @@ class SlcanSerialLink(Link):
         """Counters of decoder and assembler, bytes received, and bytes that an opening or a closing dropped."""
         sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
         return sizes | self._scans.counters()
+
+    def can_ids(self) -> frozenset[int]:
+        """Return the standard CAN ids that came so far."""
+        return frozenset(self._scans.can_ids)
+
+    def serial_line(self) -> SerialLine:
+        """Return the port and its speed."""
+        return SerialLine(self.port, self.baudrate)
 
     def _open_port(self) -> serial.Serial:
         try:

@@ -56,6 +56,11 @@ class GsUsbScans:
         """What the adapter reports at `time_ns` [ns] of monotonic time that the user must know of."""
         return self._errors.trouble(time_ns)
 
+    @property
+    def can_ids(self) -> set[int]:
+        """The standard CAN ids that came so far."""
+        return self._scans.can_ids
+
     def counters(self) -> dict[str, int]:
         """Counters of all stages."""
         return self._sum_decoder_counts() | self._errors.counters() | self._scans.counters()

@@ -5,10 +5,11 @@ counts become deformation. So a record tells what the chips said, at the place w
 software tells are never zeroed: their axes are turned at once.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,29 +144,8 @@ def placed_map(model: ModelMap, mountings: Mapping[str, Mounting]) -> ModelMap:
     }
     if not place_of:
         return model
-    return replace(model, taxels=_Places(model.taxels, place_of))
-
-
-class _Places(Mapping[int, tuple[str, int]]):
-    """Taxels by CAN id, where they lie; asks the map before each time, which may note what it is asked for."""
-
-    def __init__(self, taxels: Mapping[int, tuple[str, int]], place_of: Mapping[str, Mapping[int, int]]) -> None:
-        self._taxels = taxels
-        self._place_of = place_of
-
-    def get(self, key: int, default: Any = None) -> Any:
-        found = self._taxels.get(key)
-        return default if found is None else self._put(*found)
-
-    def __getitem__(self, key: int) -> tuple[str, int]:
-        return self._put(*self._taxels[key])
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._taxels)
-
-    def __len__(self) -> int:
-        return len(self._taxels)
-
-    def _put(self, sensor: str, taxel: int) -> tuple[str, int]:
-        places = self._place_of.get(sensor)
-        return sensor, taxel if places is None else places[taxel]
+    placed = {
+        can_id: (sensor, place_of[sensor][taxel] if sensor in place_of else taxel)
+        for can_id, (sensor, taxel) in model.taxels.items()
+    }
+    return replace(model, taxels=MappingProxyType(placed))

@@ -17,6 +17,7 @@ class SlcanScans:
 
     Attributes:
         decoder: the first of them, with what it has counted and what the adapter told of itself.
+        can_ids: the standard CAN ids that came so far, of whatever device.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
@@ -29,12 +30,15 @@ class SlcanScans:
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
         self._foreign = 0
+        self.can_ids: set[int] = set()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Scans that close within `data`, which arrived at `time_ns` [ns]."""
         scans: list[Scan] = []
         for piece in self.decoder.cut(data):
             if isinstance(piece, CanFrame):
+                if not piece.extended:  # of these there are 2048 at most
+                    self.can_ids.add(piece.can_id)
                 self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
                 continue
             packed, frame_bytes = piece
@@ -47,6 +51,7 @@ class SlcanScans:
                     scans.append(scan)
                 else:
                     end = start + frame_bytes
+                    self.can_ids.add(packed[start] << 4 | packed[start + 1] >> 4)
                     stamp_ms = _stamp_ms(packed, end) if frame_bytes != PACKED_BYTES else None
                     self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans)
                 start = end
@@ -81,7 +86,9 @@ class SlcanScans:
             if len(self._cycles) >= _MOST_ORDERS:  # frames of two sensors mix in many orders
                 self._cycles.clear()
             high, low = can_ids[: len(can_ids) // 2], can_ids[len(can_ids) // 2 :]
-            self._cycles[can_ids] = self._model.cycle([h << 4 | b >> 4 for h, b in zip(high, low, strict=True)])
+            order = [h << 4 | b >> 4 for h, b in zip(high, low, strict=True)]
+            self.can_ids.update(order)
+            self._cycles[can_ids] = self._model.cycle(order)
         cycle = self._cycles[can_ids]
         # Before its last stamp is looked at: a clock that is told of the first ones after it seems to be set back.
         longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle)

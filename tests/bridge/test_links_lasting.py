@@ -6,6 +6,7 @@ import pytest
 from edge_samples import FakeLink, make_scan
 
 from edge.doctor.link_checks import LineFacts, line_facts
+from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Notice, Wait
 from firmware_bridge.links.mounted import MountedLink
@@ -218,7 +219,15 @@ def test_trouble_is_told_when_it_comes_and_when_it_goes():
 
 def test_the_doctor_knows_the_port_behind_a_name():
     link = MountedLink(SlcanSerialLink("/dev/ttyUSB7", 115_200), "left")
-    assert line_facts(link) == LineFacts("/dev/ttyUSB7", 115_200)
+    assert line_facts(link) == line_facts(LastingLink(link)) == LineFacts("/dev/ttyUSB7", 115_200)
+    assert line_facts(FakeLink([])) == LineFacts()
+
+
+def test_can_ids_are_known_behind_names_and_outages():
+    serial = SlcanSerialLink("/dev/ttyUSB7")
+    serial._scans.feed(encode_frame(CanFrame(0x004, bytes(8))), 1)
+    assert LastingLink(MountedLink(serial, "left")).can_ids() == {0x004}
+    assert FakeLink([]).can_ids() == frozenset()
 
 
 def test_trouble_and_notices_are_of_the_name():

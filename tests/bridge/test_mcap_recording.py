@@ -130,12 +130,12 @@ class TestSink:
     def test_events_are_on_a_topic_of_their_own(self, tmp_path):
         sink = McapSink(tmp_path / "out.mcap", SURE, unix_offset_ns=OFFSET_NS)
         sink.tell(Event(5, "lost", None, "the link is gone"), {})
-        sink.write(replace(make_results([make_scan()])[0], events=(Event(9, "model", "4", "another model"),)), {})
+        sink.write(replace(make_results([make_scan()])[0], events=(Event(9, "zeroed", "4", "baseline b"),)), {})
         sink.close()
         said = [(at, ros_messages.LOG.decode(data)) for at, data in messages_of(tmp_path / "out.mcap")["/events"]]
         assert [(one["name"], one["function"], one["msg"]) for _, one in said] == [
             ("edge-sr", "lost", "the link is gone"),
-            ("4", "model", "another model"),
+            ("4", "zeroed", "sensor 4 zeroed on demand: baseline b"),
         ]
         assert said[0][0] == OFFSET_NS + 5
 

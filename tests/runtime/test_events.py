@@ -10,7 +10,7 @@ from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
 from edge.perception.runtime import Runtime
 from firmware_bridge.silence import TAXEL_SILENT_SCANS as SILENT_SCANS
 
-PAGE = ROOT / "edge" / "view" / "page.html"
+PAGE = [path for path in (ROOT / "edge" / "view").rglob("*") if path.suffix in (".html", ".js")]
 
 
 def test_a_kind_that_is_not_in_the_list_is_refused():
@@ -32,7 +32,7 @@ def test_the_docs_name_every_kind_of_note(kind):
 
 
 def test_the_page_goes_by_kinds_that_there_are():
-    page = PAGE.read_text()
+    page = "".join(path.read_text() for path in PAGE)
     lists = re.findall(r"COUNTED = \[(.*?)\]|\[([^\]]*)\]\.includes\(event\)|event === (\"\w+\")", page)
     named = set(re.findall(r'"(\w+)"', str(lists)))
     assert {"refused", "in_contact", "rest_level", "lost"} <= named <= KINDS

@@ -392,7 +392,7 @@ def test_types_are_called_and_hashed_as_ros_does(kind):
 def test_bytes_on_the_wire_are_plain_cdr(sink):
     published = []
     sink._publish = lambda writer, message: published.append(message)
-    result = contact(3, force_n=1.25, events=(Event(3, "model", "4", "another model, ä"),))
+    result = contact(3, force_n=1.25, events=(Event(3, "refused", "4", "not done, ä"),))
     sink.write(result, {"dropped": 1})
     sink._diagnose()
     pattern, deviation, wrench, event, diagnostics = (
@@ -408,7 +408,7 @@ def test_bytes_on_the_wire_are_plain_cdr(sink):
     decoded = ros2_messages.decode(WRENCH, wrench)
     assert decoded["header"] == header and decoded["wrench"]["force"]["z"] == 1.25
     said = json.loads(ros2_messages.decode("std_msgs/msg/String", event)["data"])
-    assert (said["event"], said["sensor"], said["note"]) == ("model", "4", "another model, ä")
+    assert (said["event"], said["sensor"], said["note"]) == ("refused", "4", "not done, ä")
     assert said["counters"] == {"dropped": 1}
     (status,) = ros2_messages.decode("diagnostic_msgs/msg/DiagnosticArray", diagnostics)["status"]
     values = {pair["key"]: pair["value"] for pair in status["values"]}

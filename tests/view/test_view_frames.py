@@ -9,7 +9,7 @@ import pytest
 from edge_samples import PERIOD_NS
 from view_samples import CONTRACT, Press
 
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_record import record
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
@@ -277,6 +277,14 @@ def test_what_is_refused_is_an_event():
     header, _ = unpack(refused(7, "no command", "emulated"))
     assert (header["kind"], header["event"], header["note"], header["time_ns"]) == ("event", "refused", "no command", 7)
     assert "number" not in header and header["sensor"] is None
+
+
+def test_a_result_has_the_kinds_of_its_notes(heard, clock):
+    press = Press()
+    heard.add(press.next(), {})
+    heard.add(replace(press.next(), notes=(Note("late", "old"), Note("dead", "taxel 3"))), {})
+    ((header, _),) = look(Viewer(), heard, clock)
+    assert header["note_kinds"] == ["late", "dead"] and header["note"] == "old; taxel 3"
 
 
 def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(heard, clock):
