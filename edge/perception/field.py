@@ -61,13 +61,7 @@ class Kind:
 
 
 class Column(NamedTuple):
-    """One value to read from a result.
-
-    Attributes:
-        attribute: dotted path from the result.
-        make: makes the value of what the attribute holds, unless that is None.
-        unknown: stands for None.
-    """
+    """One value to read: `make` makes it of an attribute that is not None; `unknown` stands for None."""
 
     attribute: str
     make: Function | None
@@ -83,9 +77,7 @@ class Columns:
         self._made = tuple((index, one.make) for index, one in enumerate(columns) if one.make is not None)
         self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
         # From the last to the first, so that a vector that is spread out moves none that is still to be.
-        self._vectors = tuple(
-            index for index, _ in reversed(self._unknown) if isinstance(columns[index].unknown, tuple)
-        )
+        self._vectors = tuple(index for index, unknown in reversed(self._unknown) if isinstance(unknown, tuple))
 
     def of(self, result: Result) -> list[Any]:
         """Return the values, in the order of the columns."""
@@ -182,14 +174,7 @@ class Field:
 
 def _then(first: Function | None, second: Function) -> Function:
     """Join two functions; the second sees no None."""
-    if first is None:
-        return second
-
-    def joined(value: Any) -> Any:
-        made = first(value)
-        return None if made is None else second(made)
-
-    return joined
+    return second if first is None else lambda value: None if (made := first(value)) is None else second(made)
 
 
 def _utf8(text: str, most_bytes: int) -> bytes:

@@ -30,55 +30,23 @@ WrenchOrigin = Literal["calibrated", "nominal"]
 class Result:
     """One scan and what was made of it; there is one for every scan, whatever its state.
 
+    The attributes that are not listed here are fields of a record: `edge.perception.result_fields` describes them. None
+    stands for what is not known, or not there.
+
     Attributes:
         scan: as it came.
-        source: what kind of source it came from; "emulated" is not a sensor.
-        model: name of the model.
-        state: "zeroing" while there is no baseline, "incomplete" when a taxel was not heard yet, or more are dead than
-            can be made up for, "idle" without contact, "contact" with a pattern, "dropped" when there was contact but
-            a newer scan was already waiting.
-        contact: None while it cannot be known.
-        taps_used: taps that the pattern was made from; 0 without contact. Fewer than there were where no more were
-            expected to help.
-        pattern: (H, W) float32 in `pattern_unit`, or None.
-        pattern_unit: unit of the pattern.
-        deviation: (H, W) float32, standard deviation of each pixel of the pattern, in `pattern_unit`; None without a
-            pattern, or where the model gives none.
+        pattern: (H, W) float32 in `pattern_unit`, as is `deviation`; `traction` is (3, h, w) float32 in [kPa].
         zeroed: (3, rows, cols) float32, each taxel's newest reading over the baseline in counts, along the pad's axes,
             NaN where it was not zeroed; those of dead taxels as they read. None without a baseline.
         window: (taps, 3, rows, cols) float32, the taps that the pattern is made from, newest first, as `zeroed` with
             something for dead taxels; None without contact.
-        force_counts: summed z over the baseline, or None while it cannot be known.
-        force_n: the same in [N], if a calibration was given; else the vendor's z force, where the scan has one.
-        area_mm2: touched area of the pattern, in [mm2].
-        centroid_mm: x, y of the touched area's centroid from the sensor's centre, x to the right
-            and y down, in [mm].
-        interval_mm: how far a touched pixel may be off: half of the interval that holds 90 % of pixels, mean over the
-            touched ones, in [mm]; None without a deviation.
-        traction: (3, h, w) float32, force on the pad per area along x, y and z, z into the pad, over the same face as
-            the pattern, in [kPa]; None without a pattern, or where the model gives none.
-        wrench: the traction summed up, see edge.perception.wrench; None without.
-        wrench_origin: "calibrated" where the model was told the sensor's counts per newton, else "nominal": in the
-            sensitivity that it was trained for, which is not this sensor's own; None without a wrench.
-        reused_from: number of the scan whose pattern this is, where nothing had changed beyond noise since; else None.
-        expected_rmse_mm: RMS error that patterns so doubtful had on taps not trained on, in [mm]; None where not known.
-        another_tap: whether another tap is expected to lower that error enough to be worth it; None where the model
-            takes no further tap, or it is not known.
-        run_time_us: of the inference, of all sensors' that ran in one call, scaling of the input included, in [us];
-            None where the pattern was there already.
-        latency_us: from the read that gave the scan's last byte to the pattern being ready, in [us]; what the adapter
-            and the kernel took before that read is not in it. None without a pattern.
-        baseline: subtracted from the scan, or None.
-        baseline_age_s: how long ago the baseline was taken, in [s]; None also where a clock was wrong then.
+        wrench: the traction summed up, see edge.perception.wrench.
+        baseline: subtracted from the scan.
         drift: what of the baseline was followed since it was taken, and which step in rest level was not.
-        dead: taxels that are not believed, row-major from the top left, and why: "silent", "saturated", "stuck", "far"
-            (reads what no contact makes) or "unzeroed"; empty where all are. A pattern made meanwhile is made without
-            them.
-        filled: what stood for the dead ones: an estimate from their "neighbours"; None where none is dead, or there is
-            no pattern.
+        dead: taxels that are not believed, row-major from the top left, and why; empty where all are.
         notes: what the user should know, such as why zeroing started over.
         events: what happened before this scan: taps were forgotten, zeroing was done or refused, the rest level made a
-            step, another model makes the patterns.
+            step.
     """
 
     scan: Scan

@@ -71,6 +71,7 @@ LEFT_OUT = {
     r"tensorboard .*": "serves until it is ended, and is not ours",
     r"python docs/live_pictures\.py": "takes pictures of a browser for half a minute; test_view_asked takes one of them",
     r"mkdocs build .*": "test_site builds the site",
+    r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }
 
 
