@@ -145,6 +145,8 @@ FIELDS: Final = (
           "`wrench`", make=attrgetter("centre_of_pressure_mm"), parts=_CENTRE_PARTS, out=Out.NPZ, byte=560),
     Field("wrench_origin", _one_of("nominal", "calibrated", unknown=""), "wrench_origin",
           "whether newtons are this sensor's own: see [Wrench](formats.md#wrench)", out=_RECORD_NPZ, byte=504),
+    Field("shear_ratio", _REAL, "wrench", "tangential over normal force: an object slips where it reaches the "
+          "coefficient of friction; needs no counts per newton", make=attrgetter("shear_ratio"), decimals=4, byte=576),
     Field("reused_from", _NUMBER_OR_NOT, "reused_from",
           "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
     Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "

@@ -5,6 +5,7 @@ origin is the middle of the face. What is told acts on the pad: pressing is a po
 about z, is positive where it turns x to y, clockwise for one who looks at the pad from above.
 """
 
+import math
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -29,6 +30,12 @@ class Wrench(NamedTuple):
     force_n: tuple[float, float, float]
     torque_n_mm: tuple[float, float, float]
     centre_of_pressure_mm: tuple[float, float] | None
+
+    @property
+    def shear_ratio(self) -> float | None:
+        """Tangential over normal force, whatever the sensor's counts per newton; None where nothing much presses."""
+        x, y, z = self.force_n
+        return math.hypot(x, y) / z if z >= LEAST_FORCE_N else None
 
 
 def wrench_of(traction_kpa: NDArray[np.floating], pixel_mm: float) -> Wrench:

@@ -73,6 +73,11 @@ def test_of_a_light_touch_no_centre_is_told(share, told):
     assert (wrench.centre_of_pressure_mm is not None) == told
 
 
+@pytest.mark.parametrize(("traction_kpa", "ratio"), [((3, -4, 10), 0.5), ((0, 0, 10), 0), ((1, 0, -10), None)])
+def test_the_ratio_of_shear_is_that_of_the_forces(traction_kpa, ratio):
+    assert wrench_of(even(*traction_kpa), PIXEL_MM).shear_ratio == pytest.approx(ratio)
+
+
 @given(st.integers(1, 9), st.integers(1, 9), st.floats(0.1, 10), st.integers(0, 99))
 def test_any_traction_gives_the_sums_over_its_pixels(height, width, pixel_mm, seed):
     traction = np.random.default_rng(seed).normal(size=(3, height, width))

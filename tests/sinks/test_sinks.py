@@ -100,7 +100,7 @@ class TestJsonLines:
         assert record.pop("counts") == result.scan.counts.tolist()
         assert record.pop("centroid_mm") == pytest.approx([-2.35, -2.35])
         assert record.pop("deviation") is record.pop("traction") is None
-        assert record.pop("wrench") is record.pop("wrench_origin") is None
+        assert record.pop("wrench") is record.pop("wrench_origin") is record.pop("shear_ratio") is None
         assert record == {
             "time_ns": 8 * PERIOD_NS,
             "device_time_ns": None,
