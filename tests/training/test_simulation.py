@@ -205,7 +205,7 @@ def test_wrong_input_is_refused():
         SENSOR.tap(["S"], [Pose(50, 0, 0)], 1.0)
     flat = SimulatedSensor(SensorGeometry("flat", 1, 6, 4.7, 28.2, 4.7))
     with pytest.raises(ValueError, match="lies under the pad at a pose"):  # but beside it, within the square
-        flat.tap(["small square"], [Pose(0, 10, 0)], 1.0)
+        flat.tap(["small square"], [Pose(0, 18, 0)], 1.0)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 27.0])
