@@ -82,8 +82,7 @@ def kept_frames(readings: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the frames to train on, (FRAMES_KEPT, 3, 4, 4), from readings (frames, 48) x, y, z by taxel.
 
     Frames are evenly spaced from the first with FIRST_SHARE of the largest sum of z to the one with the largest; in a
-    short
-    press some frames appear twice. Rows are reversed, because the file counts them from the bottom.
+    short press some frames appear twice. Rows are reversed, because the file counts them from the bottom.
 
     Raises:
         ValueError: no frame, or no frame with a positive sum of z.
