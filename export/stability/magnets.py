@@ -20,7 +20,7 @@ _DIPOLE: Final = 0.3
 def cases(_quick: bool = False) -> Iterator[Case]:
     """Yield all cases."""
     magnet = Magnet()
-    # The chip is at the gap from the magnet's centre; at .2 mm the magnet nearly touches it.
+    # Distances are from the magnet's centre to the chip; with .2 mm of clearance the magnet nearly touches it.
     for centre_mm in (2.0, 1.5, 1.0, 0.95, 0.7, 0.45):
         for tilt_deg in (0.0, 30.0, 60.0):
             yield _against_cylinder(magnet, centre_mm, tilt_deg)

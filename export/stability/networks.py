@@ -53,7 +53,7 @@ def of_graph(name: str, model: onnx.ModelProto, net: PatternNet, contract: Contr
 
 
 def _share(found: Difference, contract: Contract) -> float:
-    """Return an output's difference; in int8, a deviation's is at least a share of full scale, both in [mm].
+    """Return an output's relative difference; in int8, a deviation's is relative to full scale at least.
 
     At rest patterns are zero and deviations some .0001 mm: a share of these would be of the quantisation steps.
     """

@@ -25,7 +25,7 @@ _MAX_STEPS: Final = 200
 _DIES_WITHIN: Final = 8
 """Least period of the kernel's grid, in thicknesses, which limits the error of a punch's force to 5e-4.
 
-On a period of twice the pad the error was .8 % at 10 mm and 9 % at 50 mm.
+On a period of twice the pad the error was .8 % for a layer of 10 mm and 9 % for one of 50 mm.
 """
 REACH: Final = 1.5
 """Depth in indentations up to which cells may touch.

@@ -251,7 +251,7 @@ def _read(
     if nuisances.noise_counts:
         shape = (n, taps, frame.shape[2] - torn, *scan)
         noise = stream("noise_counts").standard_normal(shape, dtype=np.float32)
-        if torn:  # drawn separately, so that torn scans leave the noise of the other nuisances' draws unchanged
+        if torn:  # drawn separately, so that torn scans leave the noise of the other frames unchanged
             before = stream("noise_before").standard_normal((n, taps, 1, *scan), dtype=np.float32)
             noise = np.concatenate([before, noise], axis=2)
         counts += np.float32(nuisances.noise_counts) * noise
