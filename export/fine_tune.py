@@ -154,7 +154,7 @@ def quantised_well(
     Args:
         net: without batch normalisation, see `export.rounding.folded`.
         geometry: of the sensor.
-        seen: batch from which ranges are measured, see `export.int8.quantised`.
+        seen: of which ranges are taken, see `export.int8.quantised`.
         sequences: training taps.
         tuning: settings of the fine-tuning, or None for no fine-tuning.
         most_loss_db: largest accepted loss by int8, in [dB].

@@ -53,7 +53,7 @@ INT8_READ: Final = 0.25
 Measured: .10 on the test set, .17 on recordings.
 """
 INT8_EXTREME: Final = 0.75
-"""Bound on extreme windows, against nonsense rather than for accuracy; measured: .57 at ten times the range."""
+"""On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
 READINGS: Final = ("test set", "recordings")
 PASSES: Final = 1 + len(LEVELS)
 """Passes over all windows of a model: by torch, and at each level."""

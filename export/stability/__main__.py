@@ -49,8 +49,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(parts: tuple[str, ...], folder: Path, quick: bool = False) -> list[Case]:
-    """Write the report `stability`, and return the broken rows."""
-    works = {part: _cases(part) for part in parts}  # missing extras are detected before any computation
+    """Write the report `stability`, and give the rows that are broken."""
+    works = {part: _cases(part) for part in parts}  # what lacks is missed before anything is worked out
     report = Report(_name(parts, quick), folder, quick=quick)
     found: dict[str, list[Case]] = {}
     for part in tracked(parts, "stability", "part"):

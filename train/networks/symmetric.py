@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 Group = Literal["p1", "p4", "p4m"]
-"""Symmetry groups: no symmetry, the four quarter turns, or these and their mirror images."""
+"""Symmetries: none, the four quarter turns, or these and their mirror images."""
 
 _ELEMENTS: Final[dict[Group, tuple[tuple[int, bool], ...]]] = {
     "p1": ((0, False),),

@@ -83,7 +83,7 @@ class Skin:
             response += added.reshape(response.shape) * cell_mm**2
         response[:, :2] *= in_plane_share
         self._response = response.astype(np.float32)
-        # Calibrated as by a user: the sum of z per newton, here under an even load on the whole pad.
+        # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.
         even_mpa = np.full((size, size), _CALIBRATION_N / (size * cell_mm) ** 2)
         z_sum_mt = self._magnets.change_mt(self.movement(even_mpa))[:, 2].sum()
         self.counts_per_mt = float(_CALIBRATION_N * counts_per_newton / z_sum_mt)
