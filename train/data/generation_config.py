@@ -58,7 +58,7 @@ class Generation:
         pose_error_mm: of every tap, as in Nuisances; the truth is that of the true pose.
         pose_error_deg: the same of its angle.
         seed: of the poses.
-        chunk: sequences solved in one go.
+        chunk: sequences solved at once.
     """
 
     surfaces: tuple[str, ...] = SURFACES
