@@ -1,6 +1,7 @@
-"""The site is README.md, docs/ and reports/: pages lie once in the repository, where its own links lead to them.
+"""Hooks of mkdocs for a site of README.md, docs/ and reports/.
 
-mkdocs calls these; a link from docs/ to ../reports/ is right in the repository, and is set right here for the site.
+Pages exist once in the repository, with links that work there; a link from docs/ to ../reports/ is rewritten here for
+the site.
 """
 
 import re
@@ -16,7 +17,7 @@ _LINK: Final = re.compile(r"(?<=\]\()(?:docs/|\.\./)(?=[\w.])")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the first page and the reports."""
+    """Add the first page and the reports to the site."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     files.append(File.generated(config, "index.md", content=readme))
     for path in sorted((ROOT / "reports").rglob("*")):
@@ -27,10 +28,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Lead to pages of the site what leads to files of the repository."""
+    """Rewrite links to files of the repository as links to pages of the site."""
     return markdown if page.file.src_uri.startswith("reports/") else _LINK.sub("", markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Show a bar in a table's code as GitHub shows it, without the stroke that it is written with."""
+    """Show a bar in a table's code as GitHub does, without its escaping backslash."""
     return re.sub(r"<code>[^<]*</code>", lambda code: code[0].replace("\\|", "|"), html)

@@ -32,11 +32,11 @@ NOISE_COUNTS: Final = 2
 DEAD: Final = (1, 2)
 HIGHEST_COUNT: Final = 65_535
 LOOKS_S: Final = 1.0
-"""So that numbers are of the hold, not of its first scan."""
+"""Wait before a picture, so that its numbers are of the hold, not of its first scan, in [s]."""
 
 
 def held_demo() -> NDArray[np.int32]:
-    """Counts (n, 3, 4, 4) of the demo up to the depth of its last tap, and of that held for long."""
+    """Return counts (n, 3, 4, 4) of the demo up to the depth of its last tap, followed by a long hold at that depth."""
     with np.load(demo_recording()) as data:
         counts, tap, depth_mm = data["counts"].astype(np.int32), data["tap"], data["indentation_mm"]
     last = np.flatnonzero(tap == tap.max())
@@ -46,7 +46,7 @@ def held_demo() -> NDArray[np.int32]:
 
 
 def emulator(folder: Path, *tracks: NDArray[np.int32]) -> Emulator:
-    """A bus on which a sensor plays each of these counts."""
+    """Return a bus on which a sensor plays each of these counts."""
     recordings = []
     for number, counts in enumerate(tracks):
         path = folder / f"{number}.npz"
@@ -59,7 +59,7 @@ def emulator(folder: Path, *tracks: NDArray[np.int32]) -> Emulator:
 
 @contextmanager
 def live_page(port: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`edge-sr --view` on a bus, and its address."""
+    """Run `edge-sr --view` on a bus, and yield its process and address."""
     arguments = ["--source", f"slcan:{port}", "--model", "mtsr4-int8", "--counts-per-newton", "1180", "--every-tap"]
     command = [sys.executable, "-m", "edge.cli.main", "--view", "0", *arguments]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
@@ -73,7 +73,7 @@ def live_page(port: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def look(browser: Browser, url: str, size: tuple[int, int], scheme: str) -> Page:
-    """A page of this size in [px], in a "light" or a "dark" browser."""
+    """Open a page of this size in [px], in a "light" or a "dark" browser."""
     viewport = ViewportSize(width=size[0], height=size[1])
     page = browser.new_page(viewport=viewport, color_scheme="dark" if scheme == "dark" else "light")
     page.goto(url)
@@ -81,7 +81,7 @@ def look(browser: Browser, url: str, size: tuple[int, int], scheme: str) -> Page
 
 
 def keep(page: Page, name: str, bar: Progress) -> None:
-    """Keep what is seen."""
+    """Save a screenshot of the page."""
     path = PICTURES / f"live-{name}.png"
     page.screenshot(path=path)
     bar.advance()

@@ -1,4 +1,4 @@
-"""Draw overview.svg: what the taxels feel in four taps, what MTSR-4 makes of it, and the truth.
+"""Draw overview.svg: the taxels' readings in four taps, the pattern of MTSR-4, and the truth.
 
 python docs/overview.py
 """
@@ -20,7 +20,7 @@ GAP_PX: Final = 24
 
 
 def squares(values: NDArray[np.floating], high: float, left: float, top: float, side: float) -> str:
-    """A map (H, W) as rectangles, runs of one colour joined."""
+    """Return a map (H, W) as rectangles, with runs of one colour joined."""
     rgb = np.rint(colours(np.clip(values / high, 0, 1))).astype(int)
     height, width = values.shape
     parts = []
@@ -39,7 +39,7 @@ def squares(values: NDArray[np.floating], high: float, left: float, top: float, 
 
 
 def arrows(shear: NDArray[np.floating], left: float, top: float, side: float) -> str:
-    """Shear (2, rows, cols) as lines from the taxels' centres."""
+    """Return shear (2, rows, cols) as lines from the taxels' centres."""
     _, rows, cols = shear.shape
     length = 0.45 * side / cols / np.abs(shear).max()
     parts = []
@@ -53,12 +53,12 @@ def arrows(shear: NDArray[np.floating], left: float, top: float, side: float) ->
 
 
 def caption(text: str, x: float, y: float) -> str:
-    """A line of text, centred."""
+    """Return a centred line of text."""
     return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="middle">{text}</text>'
 
 
 def main() -> None:
-    """Write the picture beside this file."""
+    """Write the picture next to this file."""
     with np.load(demo_recording(), allow_pickle=False) as demo:
         tap, depth_mm, counts = demo["tap"], demo["indentation_mm"], demo["counts"]
         truth_mm, angles = demo["unit_patterns"].astype(np.float32), demo["angles_deg"]

@@ -14,13 +14,13 @@ from edge.api import BridgeError, EdgeError, Event, Result, Stream, open_runtime
 
 
 def line(result: Result) -> str:
-    """One result as a line."""
-    # Whatever does not come from hardware says so, here as in every other output.
+    """Format one result as a line."""
+    # Results that do not come from hardware are marked, here as in every other output.
     words = [] if result.source == "device" else [result.source.upper()]
     words += [f"{result.scan.time_ns / 1e9:.3f} s", f"sensor {result.scan.sensor}", result.state]
-    if result.force_counts is not None:  # not known while zeroing, or while a taxel was not heard
+    if result.force_counts is not None:  # None while zeroing, or while a taxel is silent
         words.append(f"{result.force_counts:.0f} counts")
-    if result.force_n is not None:  # in newtons where a sensor file, or counts_per_newton=..., tells how many counts
+    if result.force_n is not None:  # None without counts per newton, from a sensor file or counts_per_newton=...
         words.append(f"{result.force_n:.2f} N")
     if result.dead:
         words.append(f"without taxels {sorted(result.dead)}")
@@ -30,12 +30,12 @@ def line(result: Result) -> str:
 
 
 def tell(event: Event) -> None:
-    """Say what happens beside scans: the cable is out, it is back, ..."""
+    """Print events that come between scans: a lost cable, its return, ..."""
     print(event.text, file=sys.stderr)
 
 
 def main() -> None:
-    """Open, iterate, print."""
+    """Open a source, iterate over its results, and print them."""
     parser = argparse.ArgumentParser(description="Print the force on each pad.")
     parser.add_argument("--source", action="append", default=[], help="as of edge-sr; may be repeated, with names")
     parser.add_argument("--sensor", help="what edge-sr doctor wrote")
@@ -49,7 +49,7 @@ def main() -> None:
                 print(line(result), flush=True)
             for name, rate_hz in stream.statistics.rate_hz().items():
                 print(f"sensor {name}: {rate_hz:.1f} scans a second", file=sys.stderr)
-    except BrokenPipeError:  # who read has had enough; point stdout elsewhere, or Python complains at exit
+    except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         pass  # the with statement has closed everything

@@ -1,6 +1,6 @@
 """Act on the newest pattern of a sensor that `edge-sr --sink shm:NAME` writes: shm_read.py NAME SENSOR [--pretend].
 
-`attach` and `latest` are a reader to copy; offsets, and what else there is, are in docs/middleware.md. Linux.
+`attach` and `latest` are a reader to copy; docs/middleware.md lists the offsets and the other contents. Linux.
 """
 
 import mmap
@@ -17,7 +17,7 @@ DEVICE = 1
 
 
 def attach(name: str) -> memoryview:
-    """See the memory; FileNotFoundError while nobody writes it."""
+    """Open the memory; raises FileNotFoundError while no writer exists."""
     with Path("/dev/shm", name).open("rb") as file:
         memory = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     if memory[:12] != b"TESR-SHM\1\0\0\0":
@@ -26,11 +26,11 @@ def attach(name: str) -> memoryview:
 
 
 def latest(memory: memoryview, sensor: str, oldest_s: float = 0.05, pretend: bool = False) -> bytes | None:
-    """The newest result of a sensor, whole; None unless it is young and a device's, or one is to `pretend` it is."""
+    """Return the newest whole result of a sensor, or None unless it is recent and from a device (or `pretend`)."""
     header_bytes, slots, slot_bytes, half_bytes, first_half_at = unpack_from("<5I", memory, 12)
     sequences = memory.cast("Q")  # unlike struct, this reads eight bytes in one piece
     for slot_at in range(header_bytes, header_bytes + slots * slot_bytes, slot_bytes):
-        for _ in range(100):  # once more where it was written anew while it was copied
+        for _ in range(100):  # again if it was overwritten during the copy
             newest = sequences[slot_at // 8]
             if newest == 0:
                 return None
@@ -48,7 +48,7 @@ def latest(memory: memoryview, sensor: str, oldest_s: float = 0.05, pretend: boo
 
 
 def main(name: str, sensor: str, pretend: bool) -> None:
-    """Print ten lines a second, as long as there is the memory; attached anew, for a writer may have begun anew."""
+    """Print ten lines a second while the memory exists, attaching each time, because a writer may restart."""
     while True:
         memory = attach(name)
         half = latest(memory, sensor, pretend=pretend)

@@ -3,12 +3,12 @@
     python stop_on_area.py --area-mm2 60 --source slcan:serial=D30BL366
     python stop_on_area.py --area-mm2 60 --source demo --pretend        # without a sensor
 
-Replace `PrintedGripper` by your own. It is stopped for everything that may be wrong as well: too much force, a dead
-taxel, readings that are old or do not come, a lost link, an error, Ctrl-C. Of several sensors every one must be well
-and free before it begins, and any one stops it; --name goes by one alone. It never moves by what an emulated sensor or
-a recording feels, unless asked to by --pretend. Exit code 0 only where the area was reached.
+Replace `PrintedGripper` by your own. It is also stopped for everything that may be wrong: too much force, a dead
+taxel, readings that are old or missing, a lost link, an error, Ctrl-C. Of several sensors every one must be well and
+free before it begins, and any one stops it; --name restricts this to one. It never moves by an emulated sensor or a
+recording, unless --pretend is set. Exit code 0 only if the area was reached.
 
-What no program can do is to watch itself: let the gripper's own controller stop where nobody tells it to go on.
+No program can monitor itself: let the gripper's own controller stop when it receives no further commands.
 """
 
 import argparse
@@ -23,11 +23,11 @@ from typing import Protocol
 from edge.api import BridgeError, EdgeError, Event, Result, Source, Stream, open_runtime, open_source
 
 SETTLING_NS = 500_000_000
-"""Who has not been heard so long after the first is not there."""
+"""Time after the first reading by which every present sensor must have sent one, in [ns]."""
 
 
 class Gripper(Protocol):
-    """All that is asked of a gripper."""
+    """Methods that a gripper must have."""
 
     def close(self) -> None:
         """Begin to close slowly, and return at once."""
@@ -39,29 +39,29 @@ class Gripper(Protocol):
 
 
 class PrintedGripper:
-    """Says what a gripper would do."""
+    """Gripper that prints its movements."""
 
     def __init__(self) -> None:
         self._moves = False
 
     def close(self) -> None:
-        """Say so."""
+        """Print that it closes."""
         self._moves = True
         print("gripper: closing", flush=True)
 
     def stop(self) -> None:
-        """Say so, once."""
+        """Print that it stops, once."""
         moved, self._moves = self._moves, False
         if moved:
             print("gripper: stopped", flush=True)
 
 
 class Grip:
-    """One closing of a gripper, from when every pad is known to be well and free to whatever ends it.
+    """One closing of a gripper, from the time when every pad is ready and free until it ends.
 
     Attributes:
-        why: it ended.
-        reached: it ended because the area was large enough.
+        why: reason for its end.
+        reached: True if it ended because the area was large enough.
     """
 
     def __init__(
@@ -70,11 +70,11 @@ class Grip:
         """Prepare to grip.
 
         Args:
-            gripper: stands still.
+            gripper: at rest.
             area_mm2: touched area at which to stop.
             most_counts: summed z over the baseline at which to stop in any case.
-            oldest_ms: age of a reading, or time without one, that is no ground to go on.
-            name: of the one sensor to go by; None goes by all.
+            oldest_ms: age of a reading, or time without one, at which to stop.
+            name: of the one sensor to use; None for all.
         """
         self.why = "it never began: nothing was heard"
         self.reached = False
@@ -91,7 +91,7 @@ class Grip:
         self._ended = threading.Event()
 
     def run(self, source: Source, model: str, duration_s: float) -> None:
-        """Grip; the gripper stands still when this returns, and however else it is left."""
+        """Grip; the gripper is stopped whenever this returns or raises."""
         runtime = open_runtime(model, source)
         if self._name is None:
             self._missing = runtime.expected
@@ -113,7 +113,7 @@ class Grip:
             self._gripper.stop()
 
     def follow(self, result: Result) -> None:
-        """Go by one reading: begin, go on, or end."""
+        """Evaluate one reading: begin, continue, or end."""
         scan = result.scan
         if self._name not in (None, scan.sensor):
             return
@@ -126,19 +126,19 @@ class Grip:
         elif result.area_mm2 is not None and result.area_mm2 >= self._area_mm2:
             self.reached = self._closing
             self._end(f"{result.area_mm2:.0f} mm2 touch, as felt {self._age_ms(scan.sensor):.1f} ms ago")
-        elif result.state == "idle":  # zeroed, every taxel heard, nothing touches
+        elif result.state == "idle":  # zeroed, every taxel has sent readings, no contact
             self._free.add(scan.sensor)
             self._begin(scan.time_ns - self._first_ns)
 
     def _begin(self, after_ns: int) -> None:
-        """Close if every sensor that there is was heard, and its pad is free."""
+        """Close if every sensor has sent readings, and every pad is free."""
         settled = after_ns >= SETTLING_NS and self._heard_ns.keys() >= self._missing
         if settled and self._free == self._heard_ns.keys() and not self._closing:
             self._closing = True
             self._gripper.close()
 
     def _hear(self, event: Event) -> None:
-        """Lost, silent, in trouble: each is reason enough, but of a sensor that is not gone by."""
+        """End on any event (lost, silent, in trouble) unless it is of a sensor that is not used."""
         if self._name is None or event.sensor in (None, self._name):
             self._end(event.text)
 
@@ -163,7 +163,7 @@ class Grip:
             self._end(silent)
 
     def _silent(self) -> str | None:
-        """Which sensor nothing was heard of for too long; None if that is so of none."""
+        """Return a message about the first sensor that is silent for too long, or None."""
         for sensor in self._heard_ns:
             if self._age_ms(sensor) > self._oldest_ms:
                 return f"no reading of sensor {sensor} for {self._age_ms(sensor):.0f} ms"
@@ -173,7 +173,7 @@ class Grip:
         return (time.monotonic_ns() - self._heard_ns[sensor]) / 1e6
 
     def _end(self, why: str) -> None:
-        if not self._closing:  # there is nothing to end; it waits until all is well
+        if not self._closing:  # not closing yet; it waits until all sensors are ready
             self.why = f"it never began: {why}"
         elif not self._ended.is_set():
             self._gripper.stop()
@@ -182,12 +182,12 @@ class Grip:
 
 
 def end(number: int, frame: object) -> None:
-    """Make an exception of a kill, so that `finally` stops the gripper, which it would leave moving else."""
+    """Raise an exception on SIGTERM, so that `finally` stops the gripper."""
     sys.exit(128 + number)
 
 
 def positive(text: str) -> float:
-    """A limit, which a number that is none would take away."""
+    """Parse a limit; NaN or infinity would disable it."""
     number = float(text)
     if not 0 < number < math.inf:
         raise ValueError
@@ -195,7 +195,7 @@ def positive(text: str) -> float:
 
 
 def main() -> None:
-    """Open, grip, say why it stopped."""
+    """Open a source, grip, and print the reason for the stop."""
     parser = argparse.ArgumentParser(description="Close a gripper until enough of it touches.")
     source_help = "as of edge-sr; may be repeated, with names (default: the adapter that is plugged in)"
     parser.add_argument("--source", action="append", default=[], help=source_help)
@@ -217,7 +217,7 @@ def main() -> None:
                 sys.exit(f"stop_on_area: {source.name} is {source.kind}, no sensor: --pretend goes by it all the same")
             grip.run(source, options.model, options.duration_s)
         print(f"why: {grip.why}", flush=True)
-    except BrokenPipeError:  # who read has gone; point stdout elsewhere, or Python complains at exit
+    except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except (BridgeError, EdgeError) as error:

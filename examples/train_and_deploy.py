@@ -4,13 +4,12 @@
     python train_and_deploy.py bolt.stl --out bolt                    # the real thing, see below
     python train_and_deploy.py bolt.stl --out bolt --sequences 32 --steps 20    # whether all of it works
 
-An STL, OBJ or PLY in millimetres. Its taps are simulated: presses into the pad at random places and turns; training
-adds the noise, drift and dead taxels of real sensors. The numbers that stand in for none, 9000 presses and 16000 steps,
-are those of the bundled networks and take about an hour on two cores. A run that was cut short goes on where it was, by
-the same command.
+The file is an STL, OBJ or PLY in millimetres. Its taps are simulated: presses into the pad at random places and
+turns; training adds the noise, drift and dead taxels of real sensors. The defaults, 9000 presses and 16000 steps, are
+those of the bundled networks and take about an hour on two cores. The same command resumes an interrupted run.
 
-A network that has seen one object alone draws that object whatever it feels, and looks right. Unless nothing else can
-be touched, add --figures 9000: random figures beside it, as the bundled networks have seen them.
+A network that was trained on one object alone draws that object for every contact, and looks right. Unless nothing
+else can be touched, add --figures 9000: random figures as well, as for the bundled networks.
 """
 
 import argparse
@@ -25,7 +24,7 @@ from train.generate import main as generate
 
 
 def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, seed: int) -> Path:
-    """From a mesh to a model's file; each call is a command that can be run by itself as well."""
+    """Train a model from a mesh, and return its file; each call is also a command of its own."""
     out.mkdir(parents=True, exist_ok=True)
     name, checkpoints = out.resolve().name, out / "checkpoints"
     data = [taps(out / "object.npz", ["--mesh", str(mesh)], sequences, seed)]
@@ -35,24 +34,24 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
     # python -m train.fit ...
     network = ["--network", "compact-stsr", "--name", name, "--steps", str(steps), "--seed", str(seed)]
     fit([str(checkpoints), "--data", *data, *network])
-    # python -m export.to_onnx ...; holds ONNX against torch. Its error is on the frozen test set: letters, grains and
-    # the like, so it says how the network does on objects that it was not made for.
+    # python -m export.to_onnx ...; compares ONNX with torch. Its error is on the frozen test set, letters and shapes,
+    # so it shows the network's error on objects that it was not trained for.
     export([str(checkpoints / f"{name}.pt"), "--out", str(out), "--batch", "any"])
     return out / f"{name}.onnx"
 
 
 def taps(out: Path, surfaces: list[str], count: int, seed: int) -> str:
-    """Simulated taps: python -m train.generate ..."""
+    """Simulate taps: python -m train.generate ..."""
     code = generate(
         [str(out), "--surfaces", "none", *surfaces, "--count", str(count), "--taps", "1", "--seed", str(seed)]
     )
     if code != 0:
-        sys.exit(code)  # it has said why
+        sys.exit(code)  # it has printed the reason
     return str(out)
 
 
 def deploy(model: Path, source_text: str | None, duration_s: float) -> None:
-    """Run it, as `edge-sr --model FILE` does."""
+    """Run the model, as `edge-sr --model FILE` does."""
     session = load_model(model)
     print(f"{session.name}: error on the frozen test set {session.contract.test_error}")
     patterns = 0
@@ -89,7 +88,7 @@ def main() -> None:
     )
     try:
         deploy(model, options.source, options.duration_s)
-    except BrokenPipeError:  # who read has had enough; point stdout elsewhere, or Python complains at exit
+    except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         pass  # the with statement has closed everything

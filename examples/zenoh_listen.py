@@ -1,7 +1,7 @@
-"""Print what grippers send that run `edge-sr --sink zenoh:KEY`: python zenoh_listen.py KEY [tcp/ADDRESS:7447].
+"""Print the messages of grippers that run `edge-sr --sink zenoh:KEY`: python zenoh_listen.py KEY [tcp/ADDRESS:7447].
 
-It is the one place that they connect to, on this machine unless told otherwise; with a zenoh router, zenohd, in that
-place, insert "connect/endpoints" instead of "listen/endpoints". Messages are described in docs/middleware.md.
+The grippers connect to this program, on this machine by default; with a zenoh router, zenohd, in its place, insert
+"connect/endpoints" instead of "listen/endpoints". Messages are described in docs/middleware.md.
 """
 
 import json
@@ -16,7 +16,7 @@ import zenoh
 
 
 def unpack(message: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """Header and maps of a pattern's message."""
+    """Return header and maps of a pattern's message."""
     (length,) = unpack_from("<I", message)
     header, at, maps = json.loads(message[4 : 4 + length]), 4 + length, {}
     for name, shape in header["maps"]:
@@ -26,10 +26,10 @@ def unpack(message: bytes) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def tell(line: str) -> None:
-    """Print at once; from any thread, since zenoh has its own."""
+    """Print at once, from any thread, since zenoh has its own."""
     try:
         print(line, flush=True)
-    except BrokenPipeError:  # who read has had enough
+    except BrokenPipeError:  # the reader has closed
         os._exit(0)
 
 

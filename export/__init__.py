@@ -1,4 +1,4 @@
-"""Checkpoints to single-file ONNX models with a contract: the only place that knows torch and ONNX."""
+"""Checkpoints to single-file ONNX models with a contract: the only package that imports both torch and ONNX."""
 
 import edge  # noqa: F401  before onnxruntime, whose telemetry it switches off
 from firmware_bridge.extras import need

@@ -10,4 +10,4 @@ class ExportError(Exception):
 
 
 class ParityError(ExportError, ArithmeticError):
-    """The ONNX graph does not compute what the network computes."""
+    """Failed comparison: the ONNX graph does not compute what the network computes."""

@@ -3,8 +3,8 @@
 python -m export.peer mtsr4 --out seed-mtsr4.onnx
 edge-sr bench --against seed-mtsr4.onnx
 
-It has no contract, so no runtime takes it for a model, and says in its metadata that nobody trained it. Of a trained
-checkpoint `export.to_onnx` makes a model that `edge-sr bench --against` takes as well.
+It has no contract, so the runtime does not load it as a model, and its metadata states that it is untrained. From a
+trained checkpoint `export.to_onnx` makes a model that `edge-sr bench --against` takes as well.
 """
 
 import argparse
@@ -28,17 +28,17 @@ SCALE: Final = 10
 
 
 def export_peer(name: str, path: Path, seed: int = 0, scale: int = SCALE) -> str:
-    """Write a network that nobody trained, and say in a line what it is.
+    """Write an untrained network, and return a line that describes it.
 
     Args:
         name: one of train.networks.registry.NETWORKS.
-        path: where it goes.
+        path: file to write.
         seed: of its weights.
         scale: pattern pixels per taxel pitch.
 
     Raises:
         ValueError: no network of that name, or the scale is out of range.
-        ExportError: torch gives no graph.
+        ExportError: torch returns no graph.
         OSError: the file cannot be written.
     """
     torch.manual_seed(seed)
@@ -53,7 +53,7 @@ def export_peer(name: str, path: Path, seed: int = 0, scale: int = SCALE) -> str
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.peer", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("network", choices=NETWORKS, metavar="NETWORK", help=f"one of {', '.join(NETWORKS)}")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .onnx file to write")

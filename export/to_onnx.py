@@ -3,7 +3,7 @@
 python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr4.pt --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --int8 data/seen.npz data/figures.npz --out edge/models
 
-Where integers cost more than they may on the validation set, the network is trained on for them, on the same taps.
+If int8 costs more than the limit on the validation set, the network is fine-tuned for it, on the same taps.
 """
 
 import argparse
@@ -45,21 +45,21 @@ from train.surfaces.poses import ANGLE_STEP_DEG
 
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1
-"""Largest cost of integers on the frozen test set."""
+"""Largest accepted loss by int8 on the frozen test set, in [dB]."""
 FINE_TUNE_STEPS: Final = 500
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02
-"""What integers may change the share of pixels by that the 90 % interval holds."""
+"""Largest accepted change of the 90 % interval's coverage by int8."""
 _UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
 def contract_of(
     net: PatternNet, report: dict[str, Any], frozen: FrozenSet, geometry: SensorGeometry, batch: int | str = 1
 ) -> Contract:
-    """What a network's graph keeps, its error not yet known.
+    """Return the contract of a network's graph, with its error still empty.
 
     Raises:
-        CheckpointError: the report beside the weights lacks a key; it is named.
+        CheckpointError: the report of the weights lacks a key; the error names it.
     """
     example = torch.zeros(1, 3 * net.taps, geometry.rows, geometry.cols)
     given = outputs(net, example)
@@ -107,28 +107,28 @@ def export(
     tuning: FineTuning | None = None,
     validation: Sequence[FrozenSet] = (),
 ) -> str:
-    """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and say in a line what it is.
+    """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
-    Parity is checked in float32, also of what is quantised afterwards. Where a network is trained on for integers, its
-    NAME.onnx is written with them, in a line of its own.
+    Parity is checked in float32, also for graphs that are then quantised. If a network is fine-tuned for int8, its
+    NAME.onnx is written as well, with a line of its own.
 
     Args:
         checkpoint: NAME.pt of train.fit.
-        folder: where the model goes.
+        folder: folder of the model.
         frozen: the test set.
         geometry: of the sensor.
         batch: windows in one run, or ANY_BATCH.
-        calibration: training taps of which integers take their ranges; float32 without.
-        every: all convolutions in integers, not only those that are worth it.
-        tuning: how a network is trained on for integers, and when; None for never.
-        validation: sets of no test and no training, on which is found what deviations tell; without, the contract's
+        calibration: training taps from which int8 ranges are measured; None for float32.
+        every: quantise all convolutions, not only the expensive ones.
+        tuning: settings of the fine-tuning for int8; None for no fine-tuning.
+        validation: sets apart from test and training, on which confidence is fitted; without them, the contract's
             confidence stays empty.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
         ParityError: the graph does not compute what the network computes; nothing is written.
-        ModelError: the graph does not keep its contract; nothing is written.
-        ExportError: nothing of the graph can be done in integers, or the batch is not positive.
+        ModelError: the graph does not match its contract; nothing is written.
+        ExportError: no node of the graph can be quantised, or the batch is not positive.
     """
     net, report = load_network(checkpoint)
     net = folded(net)
@@ -167,7 +167,7 @@ def export(
 
 
 def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
-    """What integers cost, and what of that is too much; nothing where errors are not known."""
+    """Return the loss by int8 as text, with each exceeded limit; nothing without errors on the test set."""
     if not in_float:
         return []
     lost_db = in_float["psnr_db"] - in_integers["psnr_db"]
@@ -184,7 +184,7 @@ def _batch(text: str) -> int | str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.to_onnx", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("checkpoints", type=Path, nargs="+", help="NAME.pt of train.fit")
     parser.add_argument("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")

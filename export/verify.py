@@ -2,9 +2,9 @@
 
 python -m export.verify edge/models/*.onnx
 
-Every graph is run at every optimisation level of onnxruntime on the frozen test set, on real recordings where there are
-some, and on stiff and extreme windows. float32 graphs are compared with torch, int8 graphs with the torch network that
-they are the integers of. That network is made again from the float32 graph's own weights, or is a checkpoint's.
+Every graph is run at every optimisation level of onnxruntime on the frozen test set, on real recordings if available,
+and on extreme windows. float32 graphs are compared with torch, int8 graphs with the torch network from which they were
+quantised. That network is restored from the float32 graph's own weights, or loaded from a checkpoint.
 """
 
 import argparse
@@ -49,26 +49,28 @@ from train.networks.blocks import PatternNet
 _TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
 INT8_READ: Final = 0.25
-"""Largest relative difference of integers from their network on readings, in any pixel; measured: .10 on the test set,
-.17 on recordings."""
+"""Largest relative difference of int8 from its network on readings, in any pixel.
+
+Measured: .10 on the test set, .17 on recordings.
+"""
 INT8_EXTREME: Final = 0.75
 """On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
 READINGS: Final = ("test set", "recordings")
 PASSES: Final = 1 + len(LEVELS)
-"""Over all windows of a model: by torch, and at each level."""
+"""Passes over all windows of a model: by torch, and at each level."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parity:
-    """One graph at one level on some windows.
+    """Comparison of one graph at one level on some windows.
 
     Attributes:
         model: its name.
         level: of optimisation.
-        windows: which.
-        differences: by output; empty where nothing could be compared.
-        psnr_change_db: of the graph over the network, where truth is known.
-        broken: which bound, or "".
+        windows: name of the windows.
+        differences: by output; empty if the outputs could not be compared.
+        psnr_change_db: PSNR of the graph over the network's, if there is a truth.
+        broken: description of the broken bound, or "".
     """
 
     model: str
@@ -79,7 +81,7 @@ class Parity:
     broken: str
 
     def cells(self) -> list[str]:
-        """As a table shows it."""
+        """Return the comparison as cells of a table."""
         largest = " ".join(f"{difference.largest:.1e}" for difference in self.differences) or "-"
         relative = " ".join(f"{difference.relative:.1e}" for difference in self.differences) or "-"
         change = "-" if self.psnr_change_db is None else f"{self.psnr_change_db:+.4f}"
@@ -97,18 +99,18 @@ def verify(
     *,
     on_pass: Callable[[], object] = lambda: None,
 ) -> Iterator[Parity]:
-    """Every level and every kind of windows of one model.
+    """Compare one model with its network at every level, on every kind of windows.
 
     Args:
-        path: NAME.onnx or NAME-int8.onnx; then NAME.onnx lies beside it, or NAME.pt in `checkpoints`.
-        frozen: the test set; a model of another scale is compared with its network, but not judged.
-        checkpoints: folder of NAME.pt; without, networks are made of the float32 graphs.
-        recordings: folder of TRIAL/xela_SENSOR.csv; left out without.
-        on_pass: called PASSES times, each time that all windows were run.
+        path: NAME.onnx or NAME-int8.onnx; the latter needs NAME.onnx in the same folder, or NAME.pt in `checkpoints`.
+        frozen: the test set; a model of another scale is compared with its network, but not evaluated.
+        checkpoints: folder of NAME.pt; None to restore networks from the float32 graphs.
+        recordings: folder of TRIAL/xela_SENSOR.csv; None for no recordings.
+        on_pass: called PASSES times, each time after all windows were run.
 
     Raises:
-        ModelError: no model, or its contract is broken.
-        ExportError: its network is not to be had.
+        ModelError: no model, or an invalid contract.
+        ExportError: its network is not available.
         CheckpointError: its checkpoint cannot be used.
     """
     model = _load(path)
@@ -183,7 +185,7 @@ def _judge(
 
 
 def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints: Path | None) -> PatternNet:
-    """The network that a model is of, by name and by what both say of its training."""
+    """Return a model's network, whose name and training hash must match."""
     made = origin_of(model)["training_sha256"]
     if checkpoints is not None:
         source = checkpoints / f"{path.stem.removesuffix(INT8_SUFFIX)}.pt"
@@ -218,13 +220,13 @@ def _run_torch(net: PatternNet, windows: NDArray[np.float32]) -> list[NDArray[np
 
 
 def table(rows: list[Parity]) -> str:
-    """In Markdown, the windows that no test set holds as one line a level: the worst of them."""
+    """Format rows in Markdown, with one line a level for extreme windows: the worst of them."""
     lines = [COLUMNS, ("---",) * len(COLUMNS), *(row.cells() for row in _worst(rows))]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def _worst(rows: list[Parity]) -> list[Parity]:
-    """All rows of readings; of extreme windows those that break a bound, or else the one that is off most."""
+    """Return all rows of readings; of extreme windows those that break a bound, or else the largest difference."""
     shown: dict[tuple[str, str, str], list[Parity]] = {}
     for row in rows:
         read = row.windows in READINGS
@@ -237,7 +239,7 @@ def _worst(rows: list[Parity]) -> list[Parity]:
 
 
 def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os.environ) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.verify", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
     parser.add_argument("--checkpoints", type=Path, help="folder of NAME.pt (default: the graphs' own weights)")

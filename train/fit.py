@@ -4,9 +4,8 @@
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
     python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start seed-stsr --steps 5000
 
-The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older
-taps and the pads' constants are dropped at random in training, so that a network works with fewer taps than it takes
-and
+The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older taps
+and the pads' constants are dropped at random in training, so that a network works with fewer taps than it takes and
 without constants. An interrupted run resumes with the same command. `tensorboard --logdir checkpoints/logs` shows its
 progress.
 """

@@ -29,8 +29,8 @@ class Report:
 
     Args:
         name: of the experiment, and of its files.
-        folder: where the files are written; made if absent.
-        quick: True where the run was cut short for a test, which the top of the page states.
+        folder: where they go; made if absent.
+        quick: the run was cut short for a test: said at the top of the page.
     """
 
     def __init__(self, name: str, folder: Path, *, quick: bool = False) -> None:
@@ -73,7 +73,7 @@ class Report:
         self._parts.append(f"![{path.stem}]({path.name})")
 
     def write(self) -> Path:
-        """Write the page, and return its path."""
+        """Write the page, and say where it lies."""
         head = [f"# {self._path.name}", _circumstances()]
         if self._quick:
             head.append("**A quick run, for the tests: no figure here means anything.**")

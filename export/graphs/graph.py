@@ -1,4 +1,4 @@
-"""Networks to ONNX graphs: fixed shapes but for the batch, one file, nothing of the machine they were made on."""
+"""Networks to ONNX graphs: fixed shapes except for the batch, one file, without traces of the machine."""
 
 import logging
 import warnings
@@ -15,21 +15,21 @@ from train.networks.blocks import PatternNet
 
 OPSET: Final = 18
 _TRACED: Final = 2
-"""Windows that a graph of any batch is traced with: of one, the tracer would take the one for granted."""
+"""Windows with which a graph of any batch is traced: with one window, the tracer would take the size 1 as fixed."""
 
 
 def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) -> onnx.ModelProto:
-    """The network as an ONNX graph, checked, without a contract yet.
+    """Return the network as a checked ONNX graph without a contract.
 
     The exporter folds batch normalisation into the convolutions before it.
 
     Args:
         net: in evaluation mode.
         geometry: of the sensor.
-        batch: windows in one run, or ANY_BATCH; onnxruntime is no slower for not knowing it.
+        batch: windows in one run, or ANY_BATCH, which is equally fast in onnxruntime.
 
     Raises:
-        ExportError: the batch is not positive, or torch gives no graph.
+        ExportError: the batch is not positive, or torch returns no graph.
     """
     if not isinstance(batch, str) and batch < 1:
         raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
@@ -37,9 +37,9 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
     example = torch.zeros(traced, 3 * net.taps, geometry.rows, geometry.cols)
     width = known_width(net)
     inputs = {INPUT_NAME: example} | ({PAD_NAME: torch.zeros(traced, width)} if width else {})
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not there
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # torch's own, about torch's own
+        warnings.simplefilter("ignore", FutureWarning)  # raised inside torch about torch
         program = torch.onnx.export(
             net,
             tuple(inputs.values()),
@@ -54,7 +54,7 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
         raise ExportError("torch.onnx.export gave no program")
     model = program.model_proto
     graph = model.graph
-    # Where a layer was traced from is the exporter's affair, and holds paths of the machine it ran on.
+    # The place where a layer was traced is of no use in the model, and includes paths of the machine.
     del model.metadata_props[:]
     for node in graph.node:
         del node.metadata_props[:]
@@ -66,12 +66,12 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
 
 
 def known_width(net: nn.Module) -> int:
-    """Numbers that a network takes of what is known of a pad."""
+    """Return the number of pad inputs of a network."""
     return getattr(net, "known", 0)
 
 
 def outputs(net: nn.Module, windows: Tensor, pads: Tensor | None = None) -> tuple[Tensor, ...]:
-    """The patterns, and their deviations and the tractions where the network gives any; without pads none is known."""
+    """Return the patterns, and deviations and tractions if any; without pads all constants are absent."""
     with torch.inference_mode():
         given = net(windows) if pads is None else net(windows, pads)
     return given if isinstance(given, tuple) else (given,)

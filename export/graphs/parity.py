@@ -1,4 +1,4 @@
-"""Does a graph compute what its network computes? At every optimisation level of onnxruntime, for stiff windows too."""
+"""Parity between a graph and its network at every optimisation level of onnxruntime, with extreme windows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,34 +24,34 @@ LEVELS: Final = {
     "layout": onnxruntime.GraphOptimizationLevel.ORT_ENABLE_LAYOUT,
     "all": onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL,
 }
-"""What onnxruntime may do to a graph, by name; each does what those before it do. The runtime takes the last."""
+"""Optimisation levels of onnxruntime by name; each includes the ones before it. The runtime uses the last."""
 
 TOLERANCE: Final = 1e-5
-"""Largest difference between torch and a float32 graph on readings, as `Difference.relative`.
+"""Largest accepted difference between torch and a float32 graph on readings, as `Difference.relative`.
 
-Both compute in float32 and add in another order. Measured from x4 to x20: compact networks 6e-7, seed-size ones 2e-6.
+Both compute in float32 but add in another order. Measured from x4 to x20: compact networks 6e-7, seed-size ones 2e-6.
 """
 EXTREME_TOLERANCE: Final = 5e-5
-"""The same on windows beyond any touch; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""
+"""Largest accepted difference on extreme windows; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""
 FULL_TRACTION_KPA: Final = 100.0
-"""Traction of 40 N evenly on the pad: what differences of tractions are a share of, where none is larger."""
+"""Traction of 40 N evenly on the pad, in [kPa]: differences of smaller tractions are relative to it."""
 FULL_RANGE_COUNTS: Final = 32768
-"""No zeroed reading is further from rest: `firmware_bridge.zeroing.baseline.deformation` goes the short way round."""
+"""Largest distance of a zeroed reading from rest: `firmware_bridge.zeroing.baseline.deformation` wraps around."""
 _DENORMAL_BITS: Final = 0x000116C2
-"""Of 1e-40 in float32: written as a number it would be zero wherever onnxruntime has made denormals so."""
+"""Bits of 1e-40 in float32: written as a number it would be zero wherever onnxruntime has set denormals to zero."""
 PARITY_WINDOWS: Final = 100
-"""Readings of the frozen set that parity is checked on, about; they have no scale, so they serve networks of any."""
+"""Approximate number of frozen readings in the parity check; readings have no scale, so they fit every network."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """How far a graph's output lies from its network's, over some windows.
+    """Difference between outputs of a graph and its network over some windows.
 
     Attributes:
         output: its name.
         largest: in the output's unit.
-        relative: as a share of full scale (deviations have none) or, where that is more, of the largest value that the
-            network gives for the same window: a pattern that is cut at zero may be small where all before it is large.
+        relative: as a share of full scale (deviations have none) or, if that is larger, of the network's largest value
+            for the same window: a pattern that is cut at zero may be small where all values before it are large.
     """
 
     output: str
@@ -60,7 +60,7 @@ class Difference:
 
 
 class GraphRun:
-    """A graph in onnxruntime at one optimisation level, for comparison: no contract is asked for and nothing is bound.
+    """Graph in onnxruntime at one optimisation level, for comparison without a contract and bound arrays.
 
     Args:
         model: the graph.
@@ -72,7 +72,7 @@ class GraphRun:
         options.log_severity_level = LOG_FATAL_ONLY
         options.intra_op_num_threads = 1
         options.graph_optimization_level = LEVELS[level]
-        # As the runtime has it: a denormal is none.
+        # As in the runtime, denormals count as zero.
         options.add_session_config_entry("session.set_denormal_as_zero", "1")
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
@@ -86,11 +86,11 @@ class GraphRun:
     def __call__(
         self, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Each output (n, ...) of windows (n, 3K, rows, cols); a last batch that is not full is filled with zeros.
+        """Return each output (n, ...) of windows (n, 3K, rows, cols); the last batch is padded with zeros.
 
         Args:
             windows: in network units.
-            pads: (n, width), what is known of the pads; without, nothing is.
+            pads: (n, width), inputs of the pads; None for no constants.
         """
         count = len(windows)
         inputs = {INPUT_NAME: windows}
@@ -113,7 +113,7 @@ def differences(
     got: Sequence[NDArray[np.float32]],
     full_scale: float,
 ) -> list[Difference]:
-    """How far outputs lie apart, each (n, ...); what a difference is a share of is of the output's own unit.
+    """Return the differences between outputs, each (n, ...), relative to values in the output's own unit.
 
     Raises:
         ParityError: number or shapes of the outputs differ, or a value is not finite.
@@ -145,14 +145,14 @@ def _largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def example_pads(count: int, width: int) -> NDArray[np.float32]:
-    """What may be known of pads, (count, width): of every third nothing."""
+    """Draw pad inputs, (count, width); every third pad is without constants."""
     pads = np.random.default_rng(0).standard_normal((count, width)).astype(np.float32)
     pads[::3] = 0
     return pads
 
 
 def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
-    """Largest relative difference between torch and a float32 graph, on readings and beyond any touch.
+    """Return the largest relative difference between torch and a float32 graph, on readings and extreme windows.
 
     Args:
         net: in evaluation mode.
@@ -184,8 +184,8 @@ def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, cont
 
 
 def read_windows(frozen: FrozenSet, contract: Contract, count: int | None = PARITY_WINDOWS) -> NDArray[np.float32]:
-    """About `count` readings of the frozen set, of all forces, or all of them: (n, 3K, rows, cols) in network units."""
-    # Odd, or one frame of a tap would always be the one taken.
+    """Return about `count` readings of the frozen set, of all forces, or all: (n, 3K, rows, cols) in network units."""
+    # Odd, because an even step could always select the same frame of a tap.
     step = 1 if count is None else max(1, len(frozen) // count) | 1
     windows = frozen.windows(contract.taps)[::step]
     return np.stack([contract.scale_window(window) for window in windows]).reshape(
@@ -194,7 +194,7 @@ def read_windows(frozen: FrozenSet, contract: Contract, count: int | None = PARI
 
 
 def extreme_windows(contract: Contract) -> Mapping[str, NDArray[np.float32]]:
-    """Windows that no test set holds, by name: each (1, 3K, rows, cols) in network units."""
+    """Return windows outside every test set, by name: each (1, 3K, rows, cols) in network units."""
     full = np.full((contract.taps, 3, contract.rows, contract.cols), FULL_RANGE_COUNTS, dtype=np.float32)
     hot = np.zeros_like(full)
     hot[0, 2, 0, 0] = FULL_RANGE_COUNTS

@@ -1,8 +1,8 @@
-"""The network that a graph was made of, made again from what the graph itself keeps.
+"""Network of a graph, restored from the graph itself.
 
-A float32 graph holds the weights under the names that the network has for them, and beside its contract which network
-it is. So parity can be checked wherever the model is, without its checkpoint. Where batch normalisation was folded
-into the weights that is not so: the paper's networks need their checkpoint.
+A float32 graph has the weights under the network's own names, and next to its contract the name of the network. So
+parity can be checked without the checkpoint. Networks whose batch normalisation was folded into the weights, those of
+the paper, need their checkpoint.
 """
 
 import json
@@ -25,33 +25,33 @@ ORIGIN_KEY: Final = "tactile.origin"
 
 
 def contract_in(model: onnx.ModelProto) -> Contract:
-    """The contract that a graph holds.
+    """Return the contract of a graph.
 
     Raises:
-        ModelError: a key is missing, unreadable or out of range; the key is named.
+        ModelError: a key is missing, unreadable or out of range; the error names it.
     """
     return Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
 
 
 def in_float(path: Path) -> Path:
-    """Where the float32 graph lies of which NAME-int8.onnx is the integers; NAME.onnx is its own."""
+    """Return the path of the float32 graph of NAME-int8.onnx; for NAME.onnx its own."""
     return path.with_name(path.stem.removesuffix(INT8_SUFFIX) + path.suffix)
 
 
 def origin(report: Mapping[str, Any]) -> dict[str, str]:
-    """Metadata that tell which network a graph is, of what a checkpoint's report says.
+    """Return the metadata that identify a graph's network, from a checkpoint's report.
 
-    Training for integers makes other weights, and so another network.
+    Fine-tuning for int8 changes the weights, and so makes another network.
     """
     told = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
     return {ORIGIN_KEY: json.dumps(told, sort_keys=True)}
 
 
 def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
-    """What a graph says of its network.
+    """Return the metadata that identify a graph's network.
 
     Raises:
-        ExportError: it says nothing.
+        ExportError: the metadata are missing.
     """
     told = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
     if told is None:
@@ -60,10 +60,10 @@ def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
 
 
 def network_of(model: onnx.ModelProto) -> PatternNet:
-    """The network of a float32 graph, in evaluation mode.
+    """Return the network of a float32 graph, in evaluation mode.
 
     Raises:
-        ExportError: the graph does not say which it is, or does not hold its weights.
+        ExportError: the graph does not identify its network, or lacks its weights.
     """
     made = origin_of(model)
     net = build(made["network"], made["scale"], **made["options"])

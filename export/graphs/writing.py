@@ -1,4 +1,4 @@
-"""A model written: judged on the frozen test set, told what its deviations say, and said in a line."""
+"""Writer of models: evaluates them on the frozen test set, fits their confidence, and describes each in a line."""
 
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -20,15 +20,15 @@ from train.learning.expected_error_table import fit_confidence
 
 @dataclass(frozen=True, slots=True)
 class Writer:
-    """What all models of a checkpoint are written with.
+    """Writer for all models of a checkpoint.
 
     Errors are those of a batch of one, in the runtime's own session; a model of another scale than the frozen set's is
-    not judged.
+    not evaluated.
 
     Attributes:
-        folder: where they go.
+        folder: folder of the models.
         frozen: the test set.
-        validation: sets on which is found what deviations tell; without, the contract's confidence stays empty.
+        validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
         report: of the checkpoint.
     """
 
@@ -38,7 +38,7 @@ class Writer:
     report: Mapping[str, Any]
 
     def error(self, single: onnx.ModelProto, contract: Contract) -> dict[str, float]:
-        """Mean errors of a graph of a batch of one, all taps given; empty where it is not judged."""
+        """Return the mean errors of a graph of a batch of one with all taps; empty if it is not evaluated."""
         if contract.scale != self.frozen.scale:
             return {}
         return mean_error(judge_model(self._session("judged", single, replace(contract, batch=1)), self.frozen))
@@ -46,16 +46,16 @@ class Writer:
     def write(
         self, name: str, model: onnx.ModelProto, single: onnx.ModelProto, contract: Contract, facts: Sequence[str]
     ) -> str:
-        """Write NAME.onnx; returns the line that says what it is.
+        """Write NAME.onnx, and return the line that describes it.
 
         Args:
             name: of the model.
             model: its graph.
-            single: the same of a batch of one.
-            contract: its error and confidence not yet known; they are filled in.
-            facts: further ones to say.
+            single: the same graph for a batch of one.
+            contract: with empty error and confidence, which are filled in.
+            facts: further parts of the line.
         """
-        # What is judged is what is written, wherever the runtime can run it.
+        # The evaluated graph is the written one wherever the runtime can run it.
         session = self._session(name, model if contract.batch == ANY_BATCH else single, contract)
         said = [f"x{contract.scale}"]
         if contract.scale == self.frozen.scale:
@@ -71,7 +71,7 @@ class Writer:
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))
         content = self._bytes(model, contract)
-        Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # as the runtime will
+        Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
         write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
         return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*said, *facts])}"
 
@@ -83,7 +83,7 @@ class Writer:
             return ModelSession(draft)
 
     def _bytes(self, model: onnx.ModelProto, contract: Contract) -> bytes:
-        """The file's content, the same for the same model and contract."""
+        """Return the file's content, the same for the same model and contract."""
         del model.metadata_props[:]
         for key, value in (
             contract.to_metadata() | origin({**self.report, "training_sha256": contract.training_sha256})

@@ -1,4 +1,4 @@
-"""Networks trained a little more as their integers will compute, where rounding what is trained costs too much."""
+"""Fine-tuning of networks with the rounding of their quantised graphs, where quantisation alone costs too much."""
 
 import contextlib
 import copy
@@ -33,14 +33,14 @@ from train.networks.losses import RelativeError
 
 @dataclass(frozen=True, slots=True)
 class FineTuning:
-    """When and how networks are trained on for integers.
+    """Settings for the fine-tuning of networks for int8.
 
     Attributes:
         steps: optimizer steps.
-        validation: of no test and no training, by which it is decided and deviations are calibrated.
-        always: whether integers cost much or not: it goes on learning, too.
-        learning_rate: highest of the one cycle. In 3000 steps the bundled four-tap network gains .2 dB in integers and
-            .14 in float, so that nothing is lost to integers any more (docs/log.md).
+        validation: frozen set, apart from test and training, that decides about fine-tuning and calibrates deviations.
+        always: True to fine-tune whatever int8 costs, since it also continues the training.
+        learning_rate: highest of the one cycle. In 3000 steps the bundled four-tap network gains .2 dB in int8 and
+            .14 in float, which leaves no loss by quantisation (docs/log.md).
         batch: windows in a batch.
         seed: of the draws.
     """
@@ -53,11 +53,11 @@ class FineTuning:
     seed: int = 1
 
     def recipe(self, taps: int) -> Recipe:
-        """How a network of so many taps is trained on."""
+        """Return the recipe for fine-tuning a network of `taps` taps."""
         return Recipe(self.steps, self.batch, self.learning_rate, given=given_taps(taps))
 
     def sha256(self, training_sha256: str, data_sha256: str, *, every: bool) -> str:
-        """Hash of all that decides the weights of a network that was trained and then trained on."""
+        """Return the hash of all settings that determine the weights of a trained and then fine-tuned network."""
         own = [self.steps, self.learning_rate, self.batch, self.seed, every, self.validation.sha256()]
         return hashlib.sha256(json.dumps([training_sha256, data_sha256, *own]).encode()).hexdigest()
 
@@ -70,17 +70,17 @@ def fine_tuned(
     recipe: Recipe,
     seed: int = 1,
 ) -> PatternNet:
-    """A copy of a network, trained on while its convolutions compute as integers will.
+    """Return a copy of a network, trained further while its convolutions are rounded as in int8.
 
-    Ranges of values stay those of the quantised graph; scales of weights follow the weights. What comes back holds
-    plain weights, to be exported and quantised anew with ranges measured again, and then `recalibrated`.
+    Ranges of values stay those of the quantised graph; scales of weights follow the weights. The result has plain
+    weights, to be exported and quantised again with ranges measured again, and then `recalibrated`.
 
     Args:
         net: without batch normalisation, see `export.integers.rounding.folded`.
         model: its graph in float.
-        quantised_model: its graph in integers.
+        quantised_model: its graph in int8.
         sequences: training taps, of at least as many taps as it takes.
-        recipe: how.
+        recipe: hyperparameters.
         seed: of the draws.
 
     Raises:
@@ -102,13 +102,13 @@ def fine_tuned(
 
 
 def recalibrated(net: PatternNet, integers: onnx.ModelProto, validation: FrozenSet) -> PatternNet:
-    """A copy whose deviations, where it has any, tell the errors of its graph in integers.
+    """Return a copy whose deviations, if it has any, are calibrated to the errors of its quantised graph.
 
-    Those of the network are no measure: a background that is flat in float is cut to whole steps in integers.
+    The deviations of the float network do not fit: a background that is flat in float is cut to whole steps in int8.
 
     Args:
-        net: of these weights, in float.
-        integers: its graph.
+        net: network with the same weights, in float.
+        integers: its quantised graph.
         validation: of the network's scale.
     """
     other = copy.deepcopy(net)
@@ -120,14 +120,14 @@ def recalibrated(net: PatternNet, integers: onnx.ModelProto, validation: FrozenS
 
 @dataclass(frozen=True, slots=True)
 class Quantised:
-    """A network in integers, and what they cost.
+    """Quantised network, with the float network of the same weights.
 
     Attributes:
-        net: of these weights, in float.
+        net: network with the same weights, in float.
         model: its graph in float, of a batch of one.
-        integers: its graph in integers, of a batch of one.
-        trained_on: whether the weights are others than those given.
-        said: what was done and what it brought, in a few words; empty where nothing was.
+        integers: its graph in int8, of a batch of one.
+        trained_on: True if the weights were fine-tuned.
+        said: summary of the fine-tuning and its gain; empty without fine-tuning.
     """
 
     net: PatternNet
@@ -147,21 +147,21 @@ def quantised_well(
     *,
     every: bool = False,
 ) -> Quantised:
-    """A network in integers, trained on for them where they cost more than `most_loss_db` in validation, or always.
+    """Quantise a network; fine-tune it where int8 costs more than `most_loss_db` in validation, or always.
 
-    Weights that are no better for it are not taken.
+    Weights that are not better after fine-tuning are discarded.
 
     Args:
         net: without batch normalisation, see `export.integers.rounding.folded`.
         geometry: of the sensor.
         seen: of which ranges are taken, see `export.integers.int8.quantised`.
         sequences: training taps.
-        tuning: how it is trained on, or None for never.
-        most_loss_db: what integers may cost.
-        every: all convolutions in integers.
+        tuning: settings of the fine-tuning, or None for no fine-tuning.
+        most_loss_db: largest accepted loss by int8, in [dB].
+        every: quantise all convolutions.
 
     Raises:
-        ExportError: nothing of the graph can be done in integers.
+        ExportError: no node of the graph can be quantised.
         DivergedError: the learning rate is too high.
     """
     model = to_model(net, geometry)
@@ -186,6 +186,6 @@ def quantised_well(
 
 
 def graph_psnr_db(model: onnx.ModelProto, taps: int, validation: FrozenSet) -> float:
-    """Mean PSNR of a graph's patterns on a frozen set of its scale, in [dB]."""
+    """Return the mean PSNR of a graph's patterns on a frozen set of its scale, in [dB]."""
     patterns = GraphRun(model)(network_input(validation.windows(taps)).numpy())[0]
     return float(np.mean(psnr_db(patterns, validation.patterns(), validation.full_scale_mm)))

@@ -1,8 +1,8 @@
 """Graphs in 8-bit integers: unsigned activations, signed weights with a scale for each channel, float in and out.
 
-What is worth it is worth it where the time goes: the convolutions of the largest grid but for those that give the
-outputs. Those of smaller grids, which read the taxels, stay in float: they take a tenth of the time, and what they lose
-no later layer finds again (docs/log.md).
+Only layers that take most of the time are quantised: the convolutions of the largest grid except for those of the
+outputs. Those of smaller grids, which read the taxels, stay in float: they take a tenth of the time, and no later layer
+recovers their losses (docs/log.md).
 """
 
 import contextlib
@@ -31,24 +31,26 @@ from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
 
 _PERCENTILE: Final = 99.999
-"""Of a layer's values lie within its range; what lies beyond is cut. With the whole range the bundled models lose .03
-to .07 dB more: few values are that large, and all others pay for them with coarser steps."""
+"""Percentage of a layer's values within its range; larger values are cut.
+
+With the whole range the bundled models lose .03 to .07 dB more, because a few large values make all steps coarser.
+"""
 _PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
-"""Done in integers where any or all of what they take is."""
+"""Operations that are quantised if any or all of their inputs are."""
 
 
 _CALIBRATED_ON: Final = 512
 _FEWEST: Final = 32
 _SET_FORCE_N: Final = (0.3, 8.0)
-"""Of the taps that ranges are taken of: light ones count as much."""
+"""Force of the taps from which ranges are measured, in [N], so that light taps weigh as much as firm ones."""
 
 
 def calibration_batch(taps: Sequences | PressSet, contract: Contract) -> Batch:
-    """Windows, and what is known of their pads, drawn from training taps as training does, light contacts too.
+    """Draw windows with their pad inputs from training taps as in training, light contacts included.
 
     Raises:
         DatasetError: the sequences have fewer taps than the network takes.
-        ExportError: there are too few sequences for ranges to mean anything.
+        ExportError: there are too few sequences for meaningful ranges.
     """
     if len(taps) < _FEWEST:
         raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
@@ -73,15 +75,15 @@ class _Inputs(CalibrationDataReader):
 
 
 def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> onnx.ModelProto:
-    """The same graph with quantise and dequantise nodes around what may be done in integers.
+    """Return the graph with quantise and dequantise nodes around all nodes that may be quantised.
 
     Args:
         model: in float.
-        seen: of which the ranges are taken: light contacts among them.
-        every: all convolutions, not only those that are worth it.
+        seen: batch from which the ranges are measured, light contacts included.
+        every: quantise all convolutions, not only the expensive ones.
 
     Raises:
-        ExportError: nothing in the graph may be done in integers.
+        ExportError: no node of the graph may be quantised.
     """
     nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
     if not nodes:
@@ -110,14 +112,14 @@ def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> on
 
 
 def integer_nodes(model: onnx.ModelProto, *, every: bool = False) -> list[str]:
-    """Names of the nodes that are done in integers, in the graph's order; `every`: all convolutions among them."""
+    """Return the names of the nodes to quantise, in the graph's order; `every`: with all convolutions."""
     shapes = _shapes(model)
     made_by = {name: node for node in model.graph.node for name in node.output}
     convs = [node for node in model.graph.node if node.op_type == "Conv"]
     largest = max((_pixels(shapes, node) for node in convs), default=0)
     last = _last_convolutions(model, made_by)
     chosen = {node.name for node in convs if every or (_pixels(shapes, node) == largest and node.name not in last)}
-    for node in model.graph.node:  # every node stands behind those that it takes from
+    for node in model.graph.node:  # every node comes after those of its inputs
         takes = [made_by[name].name for name in node.input if name in made_by]
         if takes and _PASSING_ON.get(node.op_type, _never)(name in chosen for name in takes):
             chosen.add(node.name)
@@ -125,7 +127,7 @@ def integer_nodes(model: onnx.ModelProto, *, every: bool = False) -> list[str]:
 
 
 def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
-    """How many convolutions onnxruntime runs in integers once it has optimised a graph, and how many there are."""
+    """Return how many convolutions onnxruntime runs in int8 after optimising a graph, and their total number."""
     with tempfile.TemporaryDirectory() as drafts:
         path = Path(drafts) / "optimised.onnx"
         options = onnxruntime.SessionOptions()
@@ -141,7 +143,7 @@ def _never(_: Iterable[bool]) -> bool:
 
 
 def _last_convolutions(model: onnx.ModelProto, made_by: dict[str, NodeProto]) -> set[str]:
-    """Those from which an output is made without another convolution between."""
+    """Return the convolutions from which an output is computed without another convolution in between."""
     found, behind = set(), [value.name for value in model.graph.output]
     while behind:
         node = made_by.get(behind.pop())
@@ -169,7 +171,7 @@ def _pixels(shapes: dict[str, list[int]], node: NodeProto) -> int:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[Any]:
-    """The quantiser prints and warns of steps that are not for us to take."""
+    """Silence the quantiser's messages, which advise steps that do not apply here."""
     root, before = logging.getLogger(), logging.getLogger().level
     root.setLevel(logging.ERROR)
     try:

@@ -1,7 +1,8 @@
-"""What 8-bit integers will make of a network, in torch: weights and values rounded as its quantised graph rounds them.
+"""Rounding of a quantised graph emulated in torch: weights and values are rounded as the graph rounds them.
 
-Gradients pass as if nothing were rounded, but for what lies beyond a range. A convolution is found in the graph by the
-name of its weight, which the exporter keeps; batch normalisation is folded first, or the weights would be others.
+Gradients pass as if nothing were rounded, except for values outside a range. A convolution is identified in the graph
+by the name of its weight, which the exporter keeps; batch normalisation is folded first, because it changes the
+weights.
 """
 
 import contextlib
@@ -24,29 +25,29 @@ from train.networks.symmetric import SymmetricResidual, write_out
 _MOST_WEIGHT: Final = 127
 _MOST_VALUE: Final = 255
 _TINY: Final = 1e-30
-"""A channel without weights has a scale all the same."""
+"""Least weight of a channel, so that a channel of zeros has a scale as well."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Where the values of one tensor may lie: scale * (0..255 - zero_point)."""
+    """Grid of one tensor's values: scale * (0..255 - zero_point)."""
 
     scale: float
     zero_point: int
 
     def __call__(self, values: Tensor) -> Tensor:
-        """The values rounded, of any shape."""
+        """Round values of any shape to the grid."""
         return torch.fake_quantize_per_tensor_affine(values, self.scale, self.zero_point, 0, _MOST_VALUE)
 
 
 @dataclass(frozen=True, slots=True)
 class IntegerConvolution:
-    """How a graph rounds about one convolution; None where it does not.
+    """Rounding around one convolution of a graph; None where the graph does not round.
 
     Attributes:
-        taken: what the convolution takes.
-        given: what it gives, after the ReLU behind it if there is one.
-        added: what comes of adding to it, after the ReLU behind that.
+        taken: grid of its input.
+        given: grid of its output, after the ReLU that follows it if there is one.
+        added: grid of the sum with its output, after the ReLU that follows the sum.
     """
 
     taken: Grid
@@ -55,9 +56,9 @@ class IntegerConvolution:
 
 
 def folded(net: PatternNet) -> PatternNet:
-    """A copy that computes the same in evaluation mode, of ordinary convolutions alone.
+    """Return a copy that computes the same in evaluation mode with ordinary convolutions alone.
 
-    Symmetric ones are written out, and batch normalisation becomes part of the convolutions before it.
+    Symmetric convolutions are written out, and batch normalisation is folded into the convolutions before it.
 
     Raises:
         ExportError: a batch normalisation does not follow a convolution.
@@ -76,11 +77,11 @@ def folded(net: PatternNet) -> PatternNet:
 
 
 def integer_convolutions(model: onnx.ModelProto, quantised_model: onnx.ModelProto) -> dict[str, IntegerConvolution]:
-    """The convolutions that a quantised graph does in integers, by the name of their weight.
+    """Return the convolutions that a quantised graph runs in int8, by the name of their weight.
 
     Args:
-        model: in float.
-        quantised_model: made of it.
+        model: graph in float.
+        quantised_model: its quantised graph.
     """
     held = {weight.name: weight for weight in quantised_model.graph.initializer}
     grids, made_by, nodes = {}, {}, {node.name: node for node in quantised_model.graph.node}
@@ -93,11 +94,11 @@ def integer_convolutions(model: onnx.ModelProto, quantised_model: onnx.ModelProt
     for node in model.graph.node:
         if node.op_type != "Conv":
             continue
-        after = nodes[node.name]  # its output is the ReLU's where the quantiser made that a part of it
+        after = nodes[node.name]  # its output is the ReLU's if the quantiser has merged the two
         before, weight = (made_by.get(name) for name in after.input[:2])
         if before is None or weight is None or weight.op_type != "DequantizeLinear":
             continue
-        # Behind another quantise node: what this takes is the value that was rounded.
+        # After another quantise node, so the input of this one is the rounded value.
         taken = grids[made_by[before.input[0]].input[0]]
         sums = _sums_of(model, node)
         added = grids.get(nodes[sums[0].name].output[0]) if sums else None
@@ -110,7 +111,7 @@ def _sums_of(model: onnx.ModelProto, conv: NodeProto) -> list[NodeProto]:
 
 
 class _RoundedWeight(nn.Module):
-    """Weights (channels, ...) on the grid that the quantiser would choose for them: it goes with the largest."""
+    """Weights (channels, ...) rounded to the quantiser's grid, which follows the largest weight."""
 
     def forward(self, weight: Tensor) -> Tensor:
         zero_point = torch.zeros(len(weight), dtype=torch.int32, device=weight.device)
@@ -120,11 +121,11 @@ class _RoundedWeight(nn.Module):
 
 
 class _RoundedBias(nn.Module):
-    """Biases (channels,) on the grid of products, of a value's step and a weight's."""
+    """Biases (channels,) rounded to the grid of products, a value's step times a weight's."""
 
     def __init__(self, taken: Grid, weight: Tensor) -> None:
         super().__init__()
-        self._step = lambda: taken.scale * _scale(weight)  # the weight itself would become a parameter of this
+        self._step = lambda: taken.scale * _scale(weight)  # as an attribute, the weight would become a parameter
 
     def forward(self, bias: Tensor) -> Tensor:
         step = self._step().to(bias.device)
@@ -137,11 +138,11 @@ def _scale(weight: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def rounded(net: PatternNet, convolutions: Mapping[str, IntegerConvolution]) -> Iterator[None]:
-    """Within it the network computes as the quantised graph does, and can be trained so; after it, in float again.
+    """Run and train the network with the quantised graph's rounding inside the context, in float again after it.
 
     Args:
         net: without batch normalisation; its weights stay its own.
-        convolutions: of its graph.
+        convolutions: roundings of its graph, by weight.
 
     Raises:
         ExportError: the network has no convolution of such a name.
@@ -164,12 +165,12 @@ def rounded(net: PatternNet, convolutions: Mapping[str, IntegerConvolution]) -> 
             if grids.given:
                 undone.callback(module.register_forward_hook(_giving(grids.given)).remove)
         for name, module in modules.items():
-            # What goes straight on beside the convolutions is rounded too, and so is the sum.
+            # The identity path parallel to the convolutions is rounded too, and so is the sum.
             match module:
                 case Residual() | SymmetricResidual():
                     first, last = f"{name}.body.0", f"{name}.body.2"
                 case CompactNet() if "leave.0" in named and "traction" not in named:
-                    # The traction is made in float of the features that the pattern is made of in integers.
+                    # The traction is computed in float from features that are rounded for the pattern.
                     taking = _taking(named["leave.0"].taken)
                     undone.callback(module.traction.register_forward_pre_hook(taking).remove)
                     continue

@@ -1,1 +1,1 @@
-"""Numerical stability of all that computes: stiff and extreme cases, how much is off, and where it ends."""
+"""Numerical stability of all computations: stiff and extreme cases, their errors, and the limits."""

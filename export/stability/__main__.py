@@ -23,13 +23,13 @@ PARTS: Final = (
     *("layer_contact", "curved_contact", "finite_elements", "magnets", "psf"),
     *("networks", "inputs", "metrics", "counts"),
 )
-"""Modules here with `cases(quick)`; each is loaded when it is its turn, since one asks for an extra."""
+"""Modules of this package with `cases(quick)`; each is imported when needed, since one requires an extra."""
 _LEAST, _WORST = 1e-9, 1e2
-"""What lies beyond is drawn there."""
+"""Limits of the plot, to which values outside are moved."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.stability", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (all)")
     parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
@@ -76,7 +76,7 @@ def run(parts: tuple[str, ...], folder: Path, quick: bool = False) -> list[Case]
 
 
 def _name(parts: tuple[str, ...], quick: bool) -> str:
-    """Of the report: what is not whole does not take the whole one's place."""
+    """Return the report's name; a partial report does not replace the whole one."""
     return "-".join(["stability", *(parts if parts != PARTS else ()), *(["quick"] if quick else [])])
 
 
@@ -85,7 +85,7 @@ def _cases(part: str) -> Callable[[bool], Iterator[Case]]:
 
 
 def _plot_margins(report: Report, found: dict[str, list[Case]]) -> None:
-    """How near each row is to its bound: a dash each, the bound at 1; rows that are to be exact are left out."""
+    """Plot each row's value relative to its bound; rows that must be exact are left out."""
     shares: dict[str, list[float]] = {}
     for same in found.values():
         bounded = [(case.value, case.most) for case in same if case.value is not None and case.most]
@@ -133,7 +133,7 @@ def _pareto(report: Report, folder: Path, quick: bool) -> None:
 
 
 def _scatter(report: Report, rows: list[Row], by: str, axes_of: tuple[str, str], part: str) -> None:
-    """A dot a row, named where there is room, ringed where it is what we ship."""
+    """Plot one dot a row, with a name if there is room, and a ring around shipped settings."""
     with report.figure(part, size=(8, 4.5)) as figure:
         axes = figure.subplots()
         for name in dict.fromkeys(str(row[by]) for row in rows):

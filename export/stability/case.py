@@ -12,20 +12,20 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One part in one case at one severity.
+    """Result of one part in one case at one severity.
 
     Attributes:
-        part: which computes.
-        case: what is stiff or extreme.
-        severity: how much of it, with its unit.
-        what: is measured.
-        value: of that; None where a case is to be refused and nothing is measured.
-        most: that it may be, or None for a limit without.
+        part: part of the code that computes.
+        case: description of the stiff or extreme input.
+        severity: its amount, with its unit.
+        what: measured quantity.
+        value: its value; None if the case must be refused and nothing is measured.
+        most: upper bound, or None for a limit without one.
         run_ms: run time, in [ms].
-        guard: the error that refuses the case.
-        note: steps, iterations, or why the bound is what it is.
-        limit: the value tells where something ends, as the docs say.
-        least: that it has to be, of a limit or of how far a refused case has come.
+        guard: error that refuses the case.
+        note: steps, iterations, or the reason for the bound.
+        limit: True where the value shows a limit that the docs state.
+        least: lower bound, of a limit or of the progress before a refusal.
     """
 
     part: str
@@ -42,16 +42,16 @@ class Case:
 
     @property
     def holds(self) -> bool:
-        """Within its bounds, and there is one; or refused with nothing to measure."""
+        """True within its bounds, of which there is at least one, or if refused without a measurement."""
         if self.value is None:
             return bool(self.guard)
         if self.most is None and self.least is None:
             return False
         above, below = self.least is None or self.value >= self.least, self.most is None or self.value <= self.most
-        return above and below  # neither, if it is not a number
+        return above and below  # neither holds for NaN
 
     def cells(self) -> Row:
-        """As a table shows it."""
+        """Return the case as cells of a table."""
         verdict = "refused" if self.guard else "limit" if self.limit else "holds"
         return {
             "case": self.case,
@@ -67,7 +67,7 @@ class Case:
 
 
 def timed(work: Callable[[], _T]) -> tuple[_T, float]:
-    """What some work gives, and its run time in [ms]."""
+    """Return the result of some work, and its run time in [ms]."""
     start = time.perf_counter()
     given = work()
     return given, 1e3 * (time.perf_counter() - start)
@@ -76,7 +76,7 @@ def timed(work: Callable[[], _T]) -> tuple[_T, float]:
 def refused(
     part: str, case: str, severity: str, work: Callable[[], object], by: type[Exception], saying: str = ""
 ) -> Case:
-    """A case that is to end in a clear error, which says something: broken if it does not."""
+    """Return a case that must end in an error whose message contains a text; broken if it does not."""
     try:
         work()
     except by as error:

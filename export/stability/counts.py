@@ -23,15 +23,15 @@ PART: Final = "counts"
 RATE_HZ: Final = 100.0
 _NS: Final = 1_000_000_000
 _CONTACT_COUNTS: Final = ON_COUNTS / USPA44.taxel_count
-"""In every taxel alike make a contact."""
+"""Counts in every taxel that together make a contact."""
 _DRIFTS_S: Final = 240
 _PRESS: Final = np.array([-300, 200, 900], dtype=np.int32)[:, None, None]
 _SCANS: Final = 200
-"""Of a free pad, to be zeroed on."""
+"""Number of scans of a free pad for zeroing."""
 
 
 def cases(_quick: bool = False) -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases."""
     for rest in (0, 1, 443, 32768, 65092, 65534, 65535):
         yield _around(rest)
     for rest in (0, 1, 65534, 65535):
@@ -44,7 +44,7 @@ def cases(_quick: bool = False) -> Iterator[Case]:
 
 
 def _around(rest: int) -> Case:
-    """A press of known counts on a pad whose taxels rest there, stored in 16 bits."""
+    """Return the case of a press on a pad whose taxels rest at `rest`, stored in 16 bits."""
     baseline = Baseline.of("4", _even(rest).astype(np.float32), created_unix_s=0.0, scans=_SCANS, origin="file")
     raw = (_even(rest) + _PRESS) % 65536
     zeroed, run_ms = timed(lambda: deformation(raw, baseline))
@@ -53,28 +53,28 @@ def _around(rest: int) -> Case:
 
 
 def _resting(rest: int) -> Case:
-    """A free pad whose taxels rest there and wrap round by noise: it is idle all the time."""
+    """Return the case of a free pad whose taxels rest at `rest` and wrap around by noise: it must always be idle."""
     states = [result.state for result in _play([_even(rest)] * 2 * _SCANS)]
     lost = len(states) - states.index("idle") - states.count("idle")
     return Case(PART, "wrap-around", f"rest at {rest}, noise", "scans not taken", float(lost), 0.0)
 
 
 def _saturated(counts: int) -> Case:
-    """A chip at the end of its range says nothing of the pad: no pattern may be made of it."""
+    """Return the case of saturated chips, which carry no information: no pattern may be computed from them."""
     states = [result.state for result in _play([_even(38_600)] * _SCANS + [_even(counts)] * _SCANS, clip=True)]
     patterns = states[_SCANS + 10 :].count("contact")  # a taxel's last reading is kept for a few scans
     return Case(PART, "saturated", f"all taxels at {max(counts, 0)}", "patterns made of it", float(patterns), 0.0)
 
 
 def _drift(per_minute: float) -> Case:
-    """A free pad that drifts in all taxels alike, as fast as is followed: how near it comes to a contact."""
+    """Return the case of a free pad that drifts in all taxels within the tracked rate, as a share of a contact."""
     sums = [abs(result.force_counts or 0.0) for result in _drifting(per_minute)]
     severity = f"{per_minute:g} counts a minute"
     return Case(PART, "drift", severity, "% of a contact at most", 100 * max(sums) / ON_COUNTS, 50.0)
 
 
 def _fast_drift(per_minute: float) -> Case:
-    """The same faster than is followed: how long until that is taken for a contact."""
+    """Return the case of a drift above the tracked rate, as the time until it is taken for a contact."""
     touching = (number for number, result in enumerate(_drifting(per_minute)) if result.contact)
     after_s = (next(touching, np.inf) - _SCANS) / RATE_HZ
     unfollowed_s = _CONTACT_COUNTS / (per_minute / 60)
@@ -103,12 +103,12 @@ def _even(counts: int) -> NDArray[np.int32]:
 
 
 def _play(readings: Iterable[NDArray[np.int32]], infer: bool = True, clip: bool = False) -> Iterator[Result]:
-    """What the runtime makes of readings at the sensor's rate, from zeroing on; a count of noise, as if alive.
+    """Run the runtime on readings at the sensor's rate, starting with zeroing; one count of noise keeps taxels alive.
 
     Args:
         readings: raw, (3, rows, cols) each.
-        infer: make patterns.
-        clip: beyond the end of its range a chip stays there; else its 16 bits wrap round.
+        infer: compute patterns.
+        clip: saturate at the end of the range; else the 16 bits wrap around.
     """
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
     runtime = Runtime(ModelSession(find_model(DEFAULT_MODEL)), source="replay", estimator=estimator)

@@ -1,4 +1,4 @@
-"""Curved contact, depth by depth: spheres from half a millimetre to a metre, against Hertz where Hertz holds."""
+"""Curved contact, depth by depth: spheres from half a millimetre to a metre, compared with Hertz in its range."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from train.physics.elastic_layer import Layer
 PART: Final = "curved contact"
 _POISSON: Final = 0.45
 _HERTZ_HOLDS: Final = 1.06
-"""Where the layer makes a contact less stiff than this its area is told, too, of which no formula is known beyond."""
+"""Largest stiffening by the layer at which the contact area is compared; there is no formula for larger ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Ball:
-    """A sphere on a pad so thick and finely drawn that it is a half-space, or on the pad as it is."""
+    """Sphere on a pad so thick and finely sampled that it is a half-space, or on the default pad."""
 
     radius_mm: float
     indentation_mm: float
@@ -29,7 +29,7 @@ class _Ball:
 
     @property
     def contact_mm(self) -> float:
-        """Radius of the contact by Hertz."""
+        """Radius of the contact by Hertz, in [mm]."""
         return float(np.sqrt(self.radius_mm * self.indentation_mm))
 
 
@@ -42,7 +42,7 @@ _PAD: Final = tuple(_Ball(radius_mm, 0.3, 0.47, 4.5, size=42) for radius_mm in (
 
 
 def cases(_quick: bool = False) -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases."""
     for ball in _HERTZ:
         solver, depth_mm = _solver(ball), _depth_mm(ball)
         found, run_ms = timed(
@@ -71,7 +71,7 @@ def cases(_quick: bool = False) -> Iterator[Case]:
 
 
 def _bonded(share: float) -> float:
-    """How much stiffer a bonded layer is than a half-space, by the contact's radius over its thickness.
+    """Return the stiffness of a bonded layer over that of a half-space, by the contact's radius over its thickness.
 
     Source: Dimitriadis et al. 2002, Eq. 11 and 14.
     """
@@ -92,4 +92,4 @@ def _solver(ball: _Ball) -> ContactSolver:
 def _depth_mm(ball: _Ball) -> NDArray[np.float64]:
     along_mm = (np.arange(ball.size) - (ball.size - 1) / 2) * ball.cell_mm
     square = np.minimum(along_mm**2 + along_mm[:, None] ** 2, ball.radius_mm**2)
-    return square / (ball.radius_mm + np.sqrt(ball.radius_mm**2 - square))  # no difference of nearly equal numbers
+    return square / (ball.radius_mm + np.sqrt(ball.radius_mm**2 - square))  # without cancellation

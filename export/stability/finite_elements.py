@@ -1,4 +1,4 @@
-"""The referee's finite elements: near incompressibility, locking, strong compression, and finer meshes."""
+"""Finite-element reference: near incompressibility, locking, strong compression, and mesh refinement."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,33 +15,36 @@ from train.physics.fem_reference import FemPad, FemPresses, NoEquilibriumError
 
 PART: Final = "FEM referee"
 BULKS: Final = (10.0, 100.0, 1000.0, 10000.0)
-"""K/G."""
+"""Ratios K/G."""
 INDENTATION_MM: Final = 0.3
 RADIUS_MM: Final = 4.0
 LEFT: Final = 0.4
-"""Of the thickness, after the strongest compression."""
+"""Share of the thickness that remains after the strongest compression."""
 _LEFT_BY_LEAP: Final = 0.8
-"""One leap reaches it, two steps do not where K/G is large: the second starts from the first one's field grown in
-proportion, which changes volumes, and K makes much of that."""
+"""Share of the thickness that remains where K/G is large.
+
+One step reaches it, two steps do not: the second starts from the first one's field scaled up, which changes volumes,
+and a large K amplifies that.
+"""
 _LEFT_AFTER: Final = {0.01: 0.56, 0.05: 0.8, 0.1: 0.91}
-"""Share of the thickness to which presses in such steps come at least, where an error ends them."""
+"""Upper bound of the remaining share of the thickness, by step, for presses that end in an error."""
 _STEPS: Final = 5
 _OFF: Final = 1e3
-"""Depth where nothing is, in [mm]."""
+"""Depth outside the shape, in [mm]."""
 _RESIDUAL: Final = 1e-6
-"""At which a step is done."""
+"""Residual at which a step is done."""
 _BALANCE: Final = 1e-5
-"""The residual is a norm, this a sum: some nodes out of balance the same way make it larger."""
+"""Tolerance of the balance. The residual is a norm, this a sum: nodes out of balance in one direction add up."""
 _LIMIT: Final = 0.01
-"""G/K = 1e-3 and less is no longer felt."""
+"""Largest change of the force between G/K of 1e-3 and less, where incompressibility is reached."""
 _ORDER: Final = 0.8
-"""Edges of the punch and of the board bend the stress to infinity: smooth fields would give 2, these about 1."""
+"""Least order of convergence: 2 for smooth fields, about 1 with infinite stress at the punch's and board's edges."""
 _ERROR_PER_MM: Final = 0.06
-"""Of the force, for each [mm] of an element's width. The referee's finest has .47 mm."""
+"""Error of the force per [mm] of an element's width. The finest mesh of the reference has .47 mm."""
 
 
 class _Fineness(NamedTuple):
-    """What the cases are worked out on."""
+    """Meshes and steps of the cases."""
 
     punch: Mesh
     compression: Mesh
@@ -54,7 +57,7 @@ _QUICK: Final = _Fineness(Mesh(3, 2), Mesh(2, 2), (0.05, 0.1), (4, 8, 16))
 
 
 def cases(quick: bool = False) -> Iterator[Case]:
-    """All of them.
+    """Yield all cases.
 
     Args:
         quick: on coarser meshes and in fewer steps, for seconds instead of a minute.
@@ -73,7 +76,7 @@ def cases(quick: bool = False) -> Iterator[Case]:
 
 
 def _poisson(bulk: float) -> float:
-    """Poisson's ratio at a ratio K/G."""
+    """Return Poisson's ratio at a ratio K/G."""
     return (3 * bulk - 2) / (2 * (3 * bulk + 1))
 
 
@@ -82,7 +85,7 @@ def _bulk(poisson: float) -> float:
 
 
 def _incompressible(mesh: Mesh) -> Iterator[Case]:
-    """The flat punch, mixed and by displacement alone."""
+    """Yield the cases of a flat punch, in the mixed formulation and with displacement alone."""
     forces_n: list[float] = []
     for bulk in BULKS:
         mixed, run_ms = timed(lambda bulk=bulk: _punch(mesh, bulk, mixed=True))
@@ -109,7 +112,7 @@ def _punch(mesh: Mesh, bulk: float, mixed: bool) -> FemPresses:
 
 
 def _compress(mesh: Mesh, poisson: float, step: float, wanted: float) -> Case:
-    """How far the whole face goes down: to where it shall, or to where an error ends it."""
+    """Return the case of the whole face pressed down to the wanted thickness, or until an error."""
     layer = Layer(poisson=poisson)
     count = round((1 - wanted) / step)
     steps_mm = np.linspace(0, (1 - wanted) * layer.thickness_mm, count + 1)[1:]
@@ -124,7 +127,7 @@ def _compress(mesh: Mesh, poisson: float, step: float, wanted: float) -> Case:
 
 
 def _face(mesh: Mesh, layer: Layer, steps_mm: NDArray[np.floating]) -> tuple[FemPresses | NoEquilibriumError, float]:
-    """What comes of a press with the whole face, and how deep it went."""
+    """Return the result of a press with the whole face, and its depth."""
     pad = FemPad(*mesh, layer)
     try:
         return pad.press(np.zeros((pad.size, pad.size)), steps_mm), float(steps_mm[-1])
@@ -133,7 +136,7 @@ def _face(mesh: Mesh, layer: Layer, steps_mm: NDArray[np.floating]) -> tuple[Fem
 
 
 def _bulge(mesh: Mesh) -> Iterator[Case]:
-    """The sides bulge over the board's rim, below which the elements let them."""
+    """Yield the cases of sides that bulge over the board's rim, below which the elements do not support them."""
     layer = Layer(poisson=REFEREE_POISSON)
     shares = np.array([0.05, 0.1, 0.15, 0.2, 0.25, 0.3])
     pad = FemPad(*mesh, layer)
@@ -151,7 +154,7 @@ def _bulge(mesh: Mesh) -> Iterator[Case]:
 
 
 def _converge(cells: tuple[int, ...], case: str, half_width_mm: float) -> Iterator[Case]:
-    """Each mesh has the nodes of the one before, and the punch's edge lies on nodes of all."""
+    """Yield the cases of refined meshes; each has the nodes of the one before, and the punch's edge lies on nodes."""
     runs = [timed(lambda count=count: _square(count, half_width_mm)) for count in cells]
     forces_n = [float(found.force_n[-1]) for found, _ in runs]
     for i in range(2, len(cells)):
@@ -160,7 +163,7 @@ def _converge(cells: tuple[int, ...], case: str, half_width_mm: float) -> Iterat
         what, run_ms = "change of the force, to the change before", runs[i][1]
         note = f"order {-np.log2(abs(ratio)):.2f}; {_told(runs[i][0])}"
         yield Case(PART, case, severity, what, abs(ratio), 2**-_ORDER, run_ms, note=note)
-        # Richardson: where a geometric series of such changes ends.
+        # Richardson extrapolation: the limit of a geometric series of such changes.
         limit_n = forces_n[i] + (forces_n[i] - forces_n[i - 1]) * ratio / (1 - ratio)
         width_mm, apart = USPA44.width_mm / cells[i], abs(forces_n[i] / limit_n - 1)
         severity, what = f"{cells[i]} elements a side", "force, to the limit of fine meshes"
@@ -169,8 +172,8 @@ def _converge(cells: tuple[int, ...], case: str, half_width_mm: float) -> Iterat
 
 
 def _square(count: int, half_width_mm: float) -> FemPresses:
-    """A square punch on even elements, a quarter as many over the thickness as along a side."""
-    # Pixels at x1 and the rim, all in the same distance.
+    """Press a square punch on even elements, a quarter as many over the thickness as along a side."""
+    # Pixels at x1 and the rim, all at the same distance.
     even = replace(USPA44, rows=count - 1, cols=count - 1, pitch_mm=USPA44.width_mm / count)
     pad = FemPad(1, count // 4, Layer(poisson=REFEREE_POISSON), geometry=even)
     inside = np.abs(pad.nodes_mm) <= half_width_mm * (1 + 1e-9)

@@ -1,4 +1,4 @@
-"""What a model may not be given, and what no reading may do: refused before inference, never a pattern of it."""
+"""Invalid inputs of a model, refused before inference."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -16,7 +16,7 @@ PART: Final = "inputs"
 
 
 def cases(_quick: bool = False) -> Iterator[Case]:
-    """All of them, of a model in each arithmetic; what refuses them is the same for all."""
+    """Yield the cases of a model in each arithmetic; both share the code that refuses them."""
     for model in ("mtsr4", "mtsr4-int8"):
         session = ModelSession(find_model(model))
         good = np.ones((session.contract.taps, 3, session.contract.rows, session.contract.cols), dtype=np.float32)

@@ -20,15 +20,15 @@ RADIUS_MM: Final = 4.0
 POISSONS: Final = (0.0, 0.3, 0.45, 0.48, 0.49, 0.499, 0.4999)
 THICKNESSES_MM: Final = (0.1, 0.2, 0.5, 1.0, 2.0, 4.5, 10.0, 20.0, 50.0)
 _OFF: Final = 1e3
-"""Depth where nothing is, in [mm]."""
+"""Depth outside the shape, in [mm]."""
 _DOUBLE: Final = 1e-4
-"""Between float32 and float64: a residual of 1e-3 leaves more open."""
+"""Largest difference between float32 and float64; a residual of 1e-3 allows more."""
 _BALANCE: Final = 1e-3
-"""As the residual that is asked for."""
+"""Tolerance of the balance, equal to the requested residual."""
 
 
 def cases(quick: bool = False) -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases."""
     whole = Layer()
     for poisson in POISSONS[::3] if quick else POISSONS:
         yield from _press("Poisson's ratio", f"{poisson:g}", replace(whole, poisson=poisson), punch())
@@ -50,7 +50,7 @@ def cases(quick: bool = False) -> Iterator[Case]:
 def punch(
     radius_mm: float = RADIUS_MM, x_mm: float = 0.0, y_mm: float = 0.0, size: int = SIZE, cell_mm: float = CELL_MM
 ) -> NDArray[np.float64]:
-    """Depth image of a flat round punch, (size, size) in [mm]."""
+    """Return the depth image of a flat round punch, (size, size) in [mm]."""
     along_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
     return np.where(np.hypot(along_mm - x_mm, along_mm[:, None] - y_mm) <= radius_mm, 0.0, _OFF)
 
@@ -69,23 +69,23 @@ def _press(case: str, severity: str, layer: Layer, depth_mm: NDArray[np.float64]
 
 
 def _balance(found: ContactResult) -> float:
-    """How far the work of the pressure lies from force times indentation: where a flat face presses, they are equal."""
+    """Return the difference of the pressure's work from force times indentation, which are equal for a flat face."""
     work = float((found.pressure_mpa.astype(np.float64) * found.displacement_mm).sum() * found.solver.cell_mm**2)
     return abs(work / (float(found.force_n[0]) * INDENTATION_MM) - 1)
 
 
 def _against_a_wide_grid(layer: Layer, severity: str) -> Case:
-    """The pad's response is worked out on a grid that repeats itself: its copies must not be felt."""
+    """Return the case of the periodic grid of the pad's response, whose copies must have no effect."""
     solver = ContactSolver(layer, SIZE, CELL_MM, torch.float64)
     found, run_ms = timed(lambda: solver.solve(punch()[None], INDENTATION_MM))
-    wide = 24 * SIZE  # its own copies are farther off than any thickness asks for
+    wide = 24 * SIZE  # its copies are further away than any thickness requires
     true = ContactSolver(layer, wide, CELL_MM, torch.float64).solve(punch(size=wide)[None], INDENTATION_MM)
     apart = abs(float(found.force_n[0] / true.force_n[0]) - 1)
     return Case(PART, "thickness", severity, "force, to a grid 24 times as wide", apart, 1e-3, run_ms)
 
 
 def _waves() -> Iterator[Case]:
-    """Q h far beyond where sinh ends, and far below where differences do: finite, and the known limits."""
+    """Yield the cases of q h far above sinh's range and far below that of differences: finite, and at their limits."""
     layer = Layer()
     modulus = layer.shear_modulus_mpa / (1 - layer.poisson)
     for a in (1e-12, 1e-5, 1e-3, 1.0, 30.0, 710.0, 1e4, 1e8):

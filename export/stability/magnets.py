@@ -1,4 +1,4 @@
-"""The magnets' field: close to the chip, far tilted, pressed through it; dipole against the exact cylinder."""
+"""Field of the magnets: close to the chip, tilted, pressed through it; dipole compared with the exact cylinder."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,15 +12,15 @@ from train.physics.magnets import MOVEMENT, Magnet, MagnetArray, cylinder_mt, di
 
 PART: Final = "magnet reading"
 _NEAREST: Final = 0.75
-"""Diameters from the magnet's face to the chip at which a dipole is taken still."""
+"""Least distance from the magnet's face to the chip for a dipole, in diameters."""
 _DIPOLE: Final = 0.3
-"""What a dipole may be off by; where it is off by more it is refused. The reading's scale is calibrated away."""
+"""Largest accepted error of a dipole, above which it is refused. The reading's scale is calibrated away."""
 
 
 def cases(_quick: bool = False) -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases."""
     magnet = Magnet()
-    # The chip sees the magnet's centre at its gap; .2 mm is a magnet that all but touches it.
+    # Distances are from the magnet's centre to the chip; with .2 mm of clearance the magnet nearly touches it.
     for centre_mm in (2.0, 1.5, 1.0, 0.95, 0.7, 0.45):
         for tilt_deg in (0.0, 30.0, 60.0):
             yield _against_cylinder(magnet, centre_mm, tilt_deg)

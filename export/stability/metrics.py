@@ -1,4 +1,4 @@
-"""The metrics on maps that are equal, constant, zero, tiny and huge: defined, and the same at every amplitude."""
+"""Metrics on maps that are equal, constant, zero, tiny and huge: defined, and the same at every amplitude."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, Final
@@ -25,7 +25,7 @@ _OF_EQUALS: Final = {"PSNR": np.inf, "SSIM": 1.0, "SSIM global": 1.0, "RMSE": 0.
 
 
 def cases(_quick: bool = False) -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases."""
     for name, metric in METRICS.items():
         for severity, maps in (("equal", _MAP), ("equal and even", _EVEN), ("both zero", _ZERO)):
             value, run_ms = timed(lambda metric=metric, maps=maps: float(metric(maps, maps, 1.0)[0]))

@@ -1,4 +1,4 @@
-"""The networks in both arithmetics on windows that no training holds: finite, and as torch in float64."""
+"""Networks in both arithmetics on windows outside the training: finite, and equal to torch in float64."""
 
 import copy
 from collections.abc import Iterator
@@ -20,23 +20,23 @@ from train.networks.blocks import PatternNet
 
 PART: Final = "networks"
 FLOAT: Final = 1e-5
-"""float32 against float64, as a share of the largest value that the network gives."""
+"""Bound of float32 against float64, as a share of the network's largest value."""
 INT8: Final = {"zeros": 1e-3, "denormals": 1e-3, "a count in one taxel": 1e-3, "one hot taxel": 0.15}
-"""The same for integers; presses with some of the taps by INT8_PRESS, what is beyond any touch by INT8_BEYOND."""
+"""Bounds of int8; presses with fewer taps have INT8_PRESS, windows outside the training INT8_BEYOND."""
 INT8_PRESS: Final = 0.05
 INT8_BEYOND: Final = 0.75
-"""Ranges were taken of touches that happen: a bound against nonsense, not an accuracy."""
+"""Bound against nonsense rather than for accuracy, because ranges were measured on real contacts."""
 
 
 def cases(quick: bool = False) -> Iterator[Case]:
-    """All of them, of every bundled model."""
+    """Yield all cases of every bundled model."""
     for path in bundled_models()[:2] if quick else bundled_models():
         model = onnx.load(path)
         yield from of_graph(path.stem, model, network_of(onnx.load(in_float(path))), contract_in(model))
 
 
 def of_graph(name: str, model: onnx.ModelProto, net: PatternNet, contract: Contract) -> Iterator[Case]:
-    """One graph, against the network that it was made of."""
+    """Yield the cases of one graph, compared with its network."""
     run, double = GraphRun(model), copy.deepcopy(net).double()
     for severity, window in extreme_windows(contract).items():
         given, run_ms = timed(lambda window=window: run(window))
@@ -53,9 +53,9 @@ def of_graph(name: str, model: onnx.ModelProto, net: PatternNet, contract: Contr
 
 
 def _share(found: Difference, contract: Contract) -> float:
-    """Return how far an output is off; of integers, a deviation as a share of full scale at least, in [mm] both.
+    """Return an output's relative difference; in int8, a deviation's is relative to full scale at least.
 
-    At rest patterns are nothing and deviations some .0001 mm: a share of these would be of the integers' own steps.
+    At rest patterns are zero and deviations some .0001 mm: a share of these would be of the quantisation steps.
     """
     if contract.arithmetic == "float32" or found.output != DEVIATION_NAME:
         return found.relative
@@ -67,5 +67,5 @@ def _most(severity: str) -> float:
 
 
 def _felt(window: NDArray[np.float32]) -> NDArray[np.float32]:
-    """As the runtime feels it: a denormal is none."""
+    """Return a window as in the runtime, with denormals set to zero."""
     return np.where(np.abs(window) < np.finfo(np.float32).tiny, np.float32(0), window)

@@ -28,7 +28,7 @@ from train.surfaces.named_surfaces import SURFACES, surface_mesh
 
 SHIPPED: Final = "ships"
 _SHIPPED_GRID: Final = (42, 0.47)
-"""As train.physics.simulated_sensor has it: whole cells of a tenth of the pitch, .13 mm short of each rim."""
+"""Grid of train.physics.simulated_sensor: whole cells of a tenth of the pitch, .13 mm short of each rim."""
 SIZES: Final = (24, 42, 50, 100, 200)
 """Cells along the pad's 20 mm."""
 TOLERANCES: Final = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
@@ -43,7 +43,7 @@ _T = TypeVar("_T")
 
 
 def simulation(quick: bool = False) -> list[Row]:
-    """Readings of the 18 surfaces, one pose each, by grid, tolerance and precision, against the finest of each."""
+    """Return errors of readings of the 18 surfaces by grid, tolerance and precision, against the finest of each."""
     sizes = SIZES[:3] if quick else SIZES
     grids = [(size, USPA44.width_mm / size) for size in sizes]
     true, _ = _readings(*grids[-1], _FINEST_TOLERANCE, torch.float64)
@@ -59,7 +59,7 @@ def simulation(quick: bool = False) -> list[Row]:
 
 
 def truth(quick: bool = False) -> list[Row]:
-    """Patterns of the 18 surfaces made at a scale and brought to x10, against those made at x40."""
+    """Return errors of the 18 surfaces' patterns made at a scale and resampled to x10, against those made at x40."""
     scales = SCALES[2:4] if quick else SCALES
     true, _ = _patterns(_FINEST_SCALE)
     rows: list[Row] = []
@@ -81,7 +81,7 @@ def truth(quick: bool = False) -> list[Row]:
 
 
 def finite_elements(reports: Path) -> list[Row]:
-    """What fig7 found for the meshes, if it has run."""
+    """Return fig7's results for the meshes, if its report exists."""
     page = reports / "fig7.csv"
     if not page.exists():
         return []
@@ -103,7 +103,7 @@ def finite_elements(reports: Path) -> list[Row]:
 
 
 def networks(quick: bool = False) -> list[Row]:
-    """PSNR on the frozen test set and run time back to back, of the bundled models and the classical methods."""
+    """Return PSNR on the frozen test set and run time back to back, of bundled models and classical methods."""
     frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
     windows = 20 if quick else _TIMED_WINDOWS
     newest = frozen.newest.astype(np.float32)
@@ -144,7 +144,7 @@ def _poses() -> list[Pose]:
 
 
 def _readings(size: int, cell_mm: float, tolerance: float, dtype: torch.dtype) -> tuple[NDArray[np.float64], float]:
-    """Counts of one press of every surface, and the contact's run time for each in [ms], the fastest of a few runs."""
+    """Return counts of one press of every surface, and the contact's shortest run time for each in [ms]."""
     layer = Layer()
     seen = footprints([Relief(name, surface_mesh(name)) for name in SURFACES], _poses(), size, cell_mm)
     cover = seen.cover_on(size, cell_mm, np.arange(len(SURFACES)), _LEVEL_MM)
@@ -156,7 +156,7 @@ def _readings(size: int, cell_mm: float, tolerance: float, dtype: torch.dtype) -
 
 
 def _patterns(scale: int) -> tuple[NDArray[np.float32], float]:
-    """Truth of every surface at a scale, and its run time for each in [ms], the fastest of a few runs."""
+    """Return the truth of every surface at a scale, and its shortest run time for each in [ms]."""
     size, pixel_mm = USPA44.rows * scale, USPA44.pixel_pitch_mm(scale)
     coarse_mm = USPA44.pixel_pitch_mm(10)
     seen = footprints([Relief(name, surface_mesh(name)) for name in SURFACES], _poses(), 42, coarse_mm)
@@ -166,13 +166,13 @@ def _patterns(scale: int) -> tuple[NDArray[np.float32], float]:
 
 
 def _fastest(work: Callable[[], _T]) -> tuple[_T, float]:
-    """What some work on all surfaces gives, and its shortest run time for each of them, in [ms]."""
+    """Return the result of some work on all surfaces, and its shortest run time for each of them, in [ms]."""
     given, run_ms = zip(*(timed(work) for _ in range(_RUNS)), strict=True)
     return given[-1], min(run_ms) / len(SURFACES)
 
 
 def _percent(found: NDArray[np.floating], true: NDArray[np.floating]) -> float:
-    """RMS error in [%] of the truth's RMS."""
+    """Return the RMS error in [%] of the truth's RMS."""
     return 100 * float(np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2)))
 
 

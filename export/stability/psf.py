@@ -1,4 +1,4 @@
-"""The tactile PSF and its gradients: reach, strength and perceptual region over decades, all or nothing touched."""
+"""Tactile PSF and its gradients: reach, strength and perceptual region over decades, all or no pixels touching."""
 
 from collections.abc import Iterator
 from typing import Final, get_args
@@ -21,7 +21,7 @@ _DOUBLE: Final = 1e-5
 
 
 def cases(_quick: bool = False) -> Iterator[Case]:
-    """All of them."""
+    """Yield all cases."""
     square = torch.zeros(1, _SIDE_PX, _SIDE_PX)
     square[:, 12:28, 12:28] = 1
     for kernel in get_args(Kernel):
@@ -46,7 +46,7 @@ def cases(_quick: bool = False) -> Iterator[Case]:
 
 
 def _press(kernel: Kernel, plateau: Plateau, severity: str, depth: torch.Tensor, alpha: float, beta_mm: float) -> Case:
-    """Values and gradients finite, and what float64 gives."""
+    """Return the case of finite values and gradients, compared with float64."""
     found = {}
     run_ms = 0.0
     for dtype in (torch.float32, torch.float64):

@@ -112,7 +112,7 @@ def fit_mixture(
     Args:
         presses: of many pads; the newest press of each sequence is used.
         seed: of the nuisances and of the components' initial centres.
-        components: largest number; one is used for every two presses per channel.
+        components: largest number; each needs twice as many presses as there are channels.
         rounds: number of expectation-maximisation rounds.
 
     Raises:

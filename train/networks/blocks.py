@@ -1,4 +1,4 @@
-"""What several networks are built of."""
+"""Blocks shared by several networks."""
 
 from typing import Final
 
@@ -7,18 +7,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MM_PER_UNIT: Final = 0.02
-"""What an output of 1 stands for in the published networks, in [mm].
+"""Size of an output of 1 of the published networks, in [mm].
 
-They were made for patterns that reach 25, ours reach 0.5 mm: their first weights then give patterns of the same size
-beside the truth as there.
+They were made for patterns of up to 25, while those here reach 0.5 mm: with this unit their initial weights give
+patterns of the same size relative to the truth.
 """
 
 _NORM_START: Final = 0.1
-"""First scale and shift of batch normalisation, as in the authors' code."""
+"""Initial scale and shift of batch normalisation, as in the authors' code."""
 
 
 class PatternNet(nn.Module):
-    """Windows (n, 3K, rows, cols) in network units, newest tap first, to patterns (n, rows*scale, cols*scale) in [mm].
+    """Network from windows (n, 3K, rows, cols) in network units to patterns (n, rows*scale, cols*scale) in [mm].
+
+    The newest tap comes first in a window.
 
     Attributes:
         taps: K.
@@ -30,7 +32,7 @@ class PatternNet(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two 3 x 3 convolutions beside a straight path; no normalisation, so amplitudes pass."""
+    """Two 3 x 3 convolutions parallel to an identity path; without normalisation, so that amplitudes pass."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -39,15 +41,15 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same shape, (n, channels, H, W)."""
+        """Return maps of the same shape, (n, channels, H, W)."""
         return torch.relu(x + self.body(x))
 
 
 class MultiScaleResidual(nn.Module):
-    """3 x 3 and 5 x 5 paths, exchanged half-way, fused by a 1 x 1 convolution beside a straight path.
+    """3 x 3 and 5 x 5 paths, exchanged half-way, fused by a 1 x 1 convolution parallel to an identity path.
 
-    Source: Li et al. 2018 (MSRN), Fig. 2, with batch normalisation after each of the four convolutions as Wu and Liu
-    2024 have it.
+    Source: Li et al. 2018 (MSRN), Fig. 2, with batch normalisation after each of the four convolutions as in Wu and Liu
+    2024.
     """
 
     def __init__(self, channels: int) -> None:
@@ -59,16 +61,16 @@ class MultiScaleResidual(nn.Module):
         self.fuse = nn.Conv2d(4 * channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same shape, (n, channels, H, W)."""
+        """Return maps of the same shape, (n, channels, H, W)."""
         both = torch.cat([self.fine(x), self.coarse(x)], dim=1)
         both = torch.cat([self.fine_of_both(both), self.coarse_of_both(both)], dim=1)
         return torch.relu(x + self.fuse(both))
 
 
 def normed_conv(inputs: int, outputs: int, kernel: int, *, bias: bool = False) -> nn.Sequential:
-    """Convolution that keeps the size, batch normalisation, ReLU.
+    """Build a convolution that keeps the size, batch normalisation, and ReLU.
 
-    The norm makes a bias idle; the authors' blocks have one all the same, and parameters are counted with it.
+    Normalisation makes a bias redundant; the authors' blocks have one nevertheless, and parameters are counted with it.
     """
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=bias), nn.BatchNorm2d(outputs), nn.ReLU()
@@ -76,7 +78,7 @@ def normed_conv(inputs: int, outputs: int, kernel: int, *, bias: bool = False) -
 
 
 def initialise(net: nn.Module) -> None:
-    """Draw the first weights of a published network.
+    """Initialise the weights of a published network.
 
     Source: He et al. 2015, normal, by fan-out.
     """
@@ -89,15 +91,16 @@ def initialise(net: nn.Module) -> None:
 
 
 def upsample(window: Tensor, scale: int) -> Tensor:
-    """Bilinear, (n, C, rows, cols) to (n, C, rows*scale, cols*scale); aligned as that of the classical methods."""
+    """Interpolate bilinearly to (n, C, rows*scale, cols*scale), aligned as in the classical methods."""
     return F.interpolate(window, scale_factor=scale, mode="bilinear", align_corners=False)
 
 
 def to_pattern(output: Tensor, *, training: bool) -> Tensor:
-    """Patterns (n, H, W) in [mm] of a published network's last convolution, (n, 1, H, W).
+    """Convert a published network's last convolution, (n, 1, H, W), to patterns (n, H, W) in [mm].
 
-    Cut at zero in use but not in training. The published ones are cut in both: with no bias and only positive features
-    before it, the last convolution starts below zero everywhere for 3 of 16 seeds tried, and would then never learn.
+    Patterns are cut at zero in evaluation but not in training. The published ones are cut in both: without a bias and
+    with positive features only, the last convolution starts below zero everywhere for 3 of 16 seeds tried, and would
+    never learn.
     """
     pattern = output[:, 0].float() * MM_PER_UNIT
     return pattern if training else torch.relu(pattern)

@@ -1,9 +1,9 @@
-"""The compact network: a trunk at twice the taxel grid, grown to the pattern by pixel shuffle.
+"""Compact network: a trunk at twice the taxel grid, enlarged to the pattern by pixel shuffle.
 
-Against the seed's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force from
-the newest one, and leaves out the work at full resolution and batch normalisation, which cost 8 dB after
-1000 steps here (docs/log.md). It adds the uncertainty of each pixel, the traction on the pad, and what is known of the
-pad as an input; and it is exactly symmetric under quarter turns.
+Compared with the paper's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force
+from the newest one, and leaves out the layers at full resolution and batch normalisation, which cost 8 dB after 1000
+steps here (docs/log.md). It adds the uncertainty of each pixel, the traction on the pad, and the pad's constants as an
+input; and it is exactly symmetric under quarter turns.
 """
 
 from math import expm1, log, sqrt
@@ -19,40 +19,40 @@ from train.networks.losses import relative_rms_error, truth_size
 from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
 
 _QUIET_UNITS: Final = 0.02
-"""Amplitude in network units, added before a tap is divided by its own: noise and absent taps stay small."""
+"""Amplitude in network units, added to a tap's own before the division by it: noise and absent taps stay small."""
 
 _LEAST_DEVIATION: Final = 1e-4
-"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of what such a tap presses in."""
+"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of the indentation of such a tap."""
 
 _FIRST_UNCERTAINTY: Final = log(expm1(0.02))
-"""Offset before the softplus: before training a tap of amplitude 1 is believed to about 0.02 mm."""
+"""Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
 
 _LEAST_SHARE: Final = 1e-3
-"""Deviation added in the loss, as a share of the truth's RMS: a pixel that is right by chance decides nothing."""
+"""Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
 
 _TRACTION_KPA: Final = 30.0
-"""Traction of an output of 1 and a tap of amplitude 1."""
+"""Traction of an output of 1 and a tap of amplitude 1, in [kPa]."""
 
 _TRACTION_SHARE: Final = 0.2
 """Weight of the traction's relative error in the loss."""
 
 _LEAST_KPA: Final = 0.05
-"""RMS traction below which a truth counts as this large."""
+"""Least RMS traction of a truth, in [kPa]; smaller ones count as this."""
 
 TRACTION_SCALE: Final = 2
-"""Traction pixels per taxel pitch: 2.35 mm. A finer wave than twice that loses 97 % of itself in the layer."""
+"""Traction pixels per taxel pitch: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
 
 
 class CompactNet(PatternNet):
-    """Window of K taps to a pattern, the standard deviation of each of its pixels, and the traction on the pad.
+    """Network from a window of K taps to a pattern, the standard deviation of each pixel, and the traction on the pad.
 
     A tap enters the pattern branch divided by its own amplitude, and the newest tap's amplitude multiplies the
-    result: a flat contact's pattern is nearly linear in its force, so the trunk has to learn shapes alone, and no force
-    is out of its range. The amplitude itself enters as a bounded number, for what is not linear. An absent tap is all
-    zeros and stays so.
+    result: a flat contact's pattern is nearly linear in its force, so the trunk has to learn shapes only, and no force
+    is out of its range. The amplitude itself enters as a bounded number, for the nonlinear part. An absent tap is all
+    zeros, and stays zero.
 
-    The deviation is read off the features from which the pattern is made, and teaches them nothing: the pattern comes
-    out as if there were no deviation.
+    The deviation is computed from the features of the pattern, but its loss does not train them: the pattern is the
+    same as without a deviation.
 
     Args:
         taps: K.
@@ -64,7 +64,7 @@ class CompactNet(PatternNet):
             tap. At the same work quarter turns leave twice the free numbers, and training mirrors windows instead.
 
     Attributes:
-        deviation_scale: factor on the deviation, found after training by
+        deviation_scale: factor on the deviation, computed after training by
             `train.learning.interval_calibration.calibrate`.
 
     Raises:
@@ -92,7 +92,7 @@ class CompactNet(PatternNet):
             fields(self.group, channels // 2),
         )
         about, pixel = scalars(self.group, known + 1), scalars(self.group, 1).shuffled(grow)
-        # Two 3 x 3 convolutions see nearly all of 4 x 4 taxels: where taps are brought together, turned as they are.
+        # Two 3 x 3 convolutions cover nearly all of 4 x 4 taxels, so taps turned against each other are merged here.
         self.enter = SymmetricConv2d(vectors(self.group, taps) + about, merged, 3)
         self.merge = nn.Sequential(
             nn.ReLU(),
@@ -101,7 +101,7 @@ class CompactNet(PatternNet):
             SymmetricConv2d(merged, wide.shuffled(2), 1),
             nn.PixelShuffle(2),
         )
-        # What the whole pad shows, and what is known of it, scales and shifts every channel of the trunk's entrance.
+        # The mean over the pad and its constants scale and shift every channel at the trunk's entrance.
         self.context = nn.Sequential(
             SymmetricConv2d(merged + about, merged, 1), nn.ReLU(), SymmetricConv2d(merged, wide * 2, 1)
         )
@@ -131,14 +131,14 @@ class CompactNet(PatternNet):
         self.register_buffer("deviation_scale", torch.tensor(1.0))
 
     def forward(self, window: Tensor, pad: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
+        """Return patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
 
-        Patterns are cut at zero in use but not in training: a sub-pixel that is cut everywhere would never learn again.
-        Deviations are above zero always.
+        Patterns are cut at zero in evaluation but not in training: a sub-pixel that is cut everywhere would never learn
+        again. Deviations are always above zero.
 
         Args:
             window: (n, 3K, rows, cols) in network units.
-            pad: (n, known), what is known of the pads; None for nothing.
+            pad: (n, known), constants of the pads; None for no constants.
         """
         count, _, rows, cols = window.shape
         taps = window.view(count, self.taps, 3, rows, cols)
@@ -158,16 +158,16 @@ class CompactNet(PatternNet):
         features = torch.cat([self.trunk(merged), felt], dim=1)
         pattern = self.leave(features)[:, 0] * newest
         traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
-        # Not an exponential: on a window unlike all others it would know no bounds.
+        # Not an exponential, which would be unbounded on a window unlike all others.
         uncertainty = F.softplus(self.uncertainty(features.detach())[:, 0] + _FIRST_UNCERTAINTY)
         deviation = (uncertainty + _LEAST_DEVIATION) * newest * self.deviation_scale
         return (pattern if self.training else torch.relu(pattern)), deviation, traction
 
     def take_over(self, start: "CompactNet") -> None:
-        """Become the same function of the newest taps as another network, further taps ignored until trained.
+        """Copy another network's function of the newest taps; further taps are ignored until trained.
 
-        From fewer symmetries to more, what is not symmetric is lost. At another scale the layers that make pixels start
-        afresh.
+        From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers are initialised
+        again.
 
         Raises:
             ValueError: another width, or another number of inputs for the pad.
@@ -194,13 +194,13 @@ class CompactNet(PatternNet):
 
 
 class HeteroscedasticError:
-    """Objective of a network that gives a pattern and its deviation: see `heteroscedastic_loss`."""
+    """Objective of a network that predicts a pattern and its deviation: see `heteroscedastic_loss`."""
 
     def __init__(self, beta: float = 1.0) -> None:
         self._beta = beta
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
-        """Relative error of the patterns and of the tractions, and how badly the deviations state the patterns'."""
+        """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
         pattern, deviation, traction = net(batch.window, batch.pad)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern, self._beta)
         if batch.traction is not None:
@@ -209,25 +209,25 @@ class HeteroscedasticError:
         return loss
 
     def after_step(self) -> None:
-        """Nothing of its own to train."""
+        """Do nothing, because the objective has no network of its own."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing learnt."""
+        """Return an empty state."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing to load."""
+        """Load nothing."""
 
 
 def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta: float = 1.0) -> Tensor:
-    """Relative error of the patterns, and how badly the deviations tell it; all (n, H, W) in [mm].
+    """Return the relative error of the patterns plus the loss of the deviations; all inputs (n, H, W) in [mm].
 
-    The deviation is judged by a Laplace likelihood, as errors have long tails: with the error e
-    and b = deviation / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b^beta. That is least
-    where b is the mean error, whatever beta is. With 0, the likelihood alone, its slope over log b knows no bounds, and
-    most is asked of pixels that are right already; with 1 the slope is b - e, of the error's own size, and pixels in
-    the contact come out covered as well as those beside it (docs/log.md). The error is taken as given, so doubt never
-    buys a worse pattern.
+    The deviation is trained by a Laplace likelihood, because errors have long tails: with the error e and b = deviation
+    / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b^beta. Its minimum is where b is the
+    mean error, whatever beta is. With 0, the likelihood alone, its slope over log b is unbounded, and pixels that are
+    accurate already have the largest weight; with 1 the slope is b - e, of the error's own size, and pixels in the
+    contact are covered as well as those around it (docs/log.md). The error is a constant in this term, so a larger
+    uncertainty never allows a worse pattern.
 
     Source: Seitzer et al. 2022, Eq. 5, for a Laplace density.
     """

@@ -1,4 +1,4 @@
-"""What a network costs."""
+"""Cost of a network in parameters and multiply-accumulates."""
 
 from typing import Final
 
@@ -12,22 +12,22 @@ _TAXEL_AXES: Final = 3
 
 
 def parameters_count(net: nn.Module) -> int:
-    """Numbers that are learnt."""
+    """Return the number of trainable parameters."""
     return sum(parameter.numel() for parameter in net.parameters())
 
 
 def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
-    """Multiply-accumulates of one window in all convolutions and linear layers; norms and interpolation do not count.
+    """Count multiply-accumulates of one window in all convolutions and linear layers, without norms and interpolation.
 
     Args:
-        net: is left as it was.
-        rows: of taxels.
-        cols: of taxels.
+        net: left unchanged.
+        rows: rows of taxels.
+        cols: columns of taxels.
     """
     counted: list[int] = []
 
     def count(layer: nn.Conv2d | nn.Linear | SymmetricConv2d, _: object, output: torch.Tensor) -> None:
-        # Every output value is the sum of as many products as one row of the weights has numbers.
+        # Every output value is the sum of as many products as one row of the weights has entries.
         counted.append(output[0].numel() * layer.weight[0].numel())
 
     summing = [layer for layer in net.modules() if isinstance(layer, (nn.Conv2d, nn.Linear, SymmetricConv2d))]

@@ -12,7 +12,7 @@ from train.networks.wu_liu_2024 import MAX_TAPS, SeedNet
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 
 _SMALL: Final = {"channels": 32, "blocks": 4}
-"""A compact network of a quarter of the work, for a budget that the other does not fit."""
+"""Options of a compact network with a quarter of the work, for a smaller time budget."""
 
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
@@ -21,11 +21,11 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     **{f"compact-{name}": (CompactNet, {"taps": taps}) for name, taps in _TAPS.items()},
     **{f"small-{name}": (CompactNet, {"taps": taps} | _SMALL) for name, taps in _TAPS.items()},
 }
-"""Name to class and what the name says."""
+"""Class and fixed arguments of each network, by name."""
 
 
 def build(name: str, scale: int, **options: Any) -> PatternNet:
-    """A new network.
+    """Build a new network.
 
     Args:
         name: one of NETWORKS.
@@ -42,13 +42,13 @@ def build(name: str, scale: int, **options: Any) -> PatternNet:
 
 
 def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNet:
-    """A new network that starts from another's weights, in copies of its own.
+    """Build a new network that starts from copies of another's weights.
 
     An MTSR-K can start from an STSR, a compact network from one of any taps, and any from its own kind. At
-    another scale a compact network keeps its trunk, and what makes pixels of it starts anew.
+    another scale a compact network keeps its trunk, and its output layers are initialised again.
 
     Args:
-        start: whose weights.
+        start: network whose weights are copied.
         name: one of NETWORKS.
         scale: pattern pixels per taxel pitch.
         options: further arguments of its class.

@@ -1,4 +1,4 @@
-"""TactileSRCNN: the seed's network before it had a force branch and more than one tap.
+"""TactileSRCNN, the predecessor of the paper's network, with one tap and no force branch.
 
 Source: Wu, Liu and Zhang 2022 ([20] of Wu and Liu 2024). Parameters (4.36 M) and MACs (6.96 G at 40 x 40) of the later
 paper's table are those of three 3 x 3 convolutions, six multi-scale blocks and a last convolution; the 2022 code has a
@@ -12,7 +12,7 @@ from train.networks.wu_liu_2024 import BLOCKS, CHANNELS
 
 
 class TactileSRCNN(PatternNet):
-    """Window of one tap to pattern, everything batch-normalised.
+    """Network from a window of one tap to a pattern, with batch normalisation throughout.
 
     Args:
         scale: pattern pixels per taxel pitch.
@@ -36,5 +36,5 @@ class TactileSRCNN(PatternNet):
         initialise(self)
 
     def forward(self, window: Tensor) -> Tensor:
-        """Patterns (n, H, W) in [mm], of windows (n, 3, rows, cols) in network units."""
+        """Return patterns (n, H, W) in [mm] of windows (n, 3, rows, cols) in network units."""
         return to_pattern(self.net(upsample(window, self.scale)), training=self.training)

@@ -1,10 +1,10 @@
 """TactileSRGAN: TactileSRCNN trained against a discriminator.
 
-The paper gives no more than the name and that the generator is TactileSRCNN's. From the authors' code: a Wasserstein
-loss with gradient penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss
-beside the error. Ours: the discriminator's layers, which follow SRGAN's but judge patches and take any scale; no batch
-normalisation in it, since the penalty is of one pattern at a time (Gulrajani et al. 2017, Section 4); and that it sees
-patterns relative to their truth's size, as the error does.
+The paper states only the name, and that the generator is TactileSRCNN's. From the authors' code: a Wasserstein loss
+with gradient penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss added to
+the error. Chosen here: the discriminator's layers, which follow SRGAN's but score patches and take any scale; no batch
+normalisation in it, since the penalty is of one pattern at a time (Gulrajani et al. 2017, Section 4); and its input,
+patterns relative to their truth's size, as in the error.
 """
 
 from typing import Any, Final
@@ -22,11 +22,11 @@ _TINY: Final = 1e-12
 
 
 class TactileSRGAN(TactileSRCNN):
-    """The generator: TactileSRCNN by another training."""
+    """Generator: TactileSRCNN with another training."""
 
 
 class Discriminator(nn.Module):
-    """How true patterns look: a number without unit, higher for truer ones."""
+    """Discriminator: a score without unit, higher for patterns that look more like true ones."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,20 +41,20 @@ class Discriminator(nn.Module):
         self.net = nn.Sequential(*layers, nn.Conv2d(_CHANNELS[-1], 1, 1))
 
     def forward(self, patterns: Tensor) -> Tensor:
-        """(n,), mean over patches of patterns (n, H, W)."""
+        """Return the score (n,), the mean over patches of patterns (n, H, W)."""
         return self.net(patterns[:, None]).mean(dim=(1, 2, 3))
 
 
 class SrganObjective:
-    """Error of the patterns, and how false they look to a discriminator that is trained alongside.
+    """Error of the patterns, less the score of a discriminator that is trained alongside.
 
     Args:
         device: of the network.
-        adversarial_share: weight of the discriminator's view beside the error.
+        adversarial_share: weight of the discriminator's score relative to the error.
         penalty: weight of the discriminator's gradient penalty.
         critic_steps: steps of the discriminator to one of the network.
         learning_rate: of the discriminator's Adam.
-        seed: of the discriminator's weights and of where the penalty is taken.
+        seed: of the discriminator's weights and of the points where the penalty is evaluated.
 
     Source: Gulrajani et al. 2017, Algorithm 1.
     """
@@ -77,7 +77,7 @@ class SrganObjective:
         self._seen: tuple[Tensor, Tensor] | None = None
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
-        """Relative error, less a share of what the discriminator thinks of the patterns."""
+        """Return the relative error, less a share of the discriminator's score of the patterns."""
         patterns, truth = net(batch.window).float(), batch.pattern
         size = truth_size(truth)
         self._seen = (patterns.detach() / size, truth / size)
@@ -85,7 +85,7 @@ class SrganObjective:
         return relative_error(patterns, truth) - self._adversarial_share * self.critic(patterns / size).mean()
 
     def after_step(self) -> None:
-        """Train the discriminator on what `loss` saw last."""
+        """Train the discriminator on the last batch of `loss`."""
         if self._seen is None:
             return
         self.critic.requires_grad_(True)
@@ -97,16 +97,16 @@ class SrganObjective:
         self._seen = None
 
     def critic_loss(self, false: Tensor, true: Tensor) -> Tensor:
-        """What the discriminator descends, of patterns (n, H, W) relative to their truth's size."""
+        """Return the loss of the discriminator, from patterns (n, H, W) relative to their truth's size."""
         mix = torch.rand(len(true), 1, 1, generator=self._rng).to(true.device)
         between = (mix * true + (1 - mix) * false).requires_grad_(True)
         (slope,) = torch.autograd.grad(self.critic(between).sum(), between, create_graph=True)
-        steepness = (slope.square().sum(dim=(1, 2)) + _TINY).sqrt()  # a root has no slope at 0
+        steepness = (slope.square().sum(dim=(1, 2)) + _TINY).sqrt()  # keeps the slope of the root finite at 0
         penalty = (steepness - 1).square().mean()
         return self.critic(false).mean() - self.critic(true).mean() + self._penalty * penalty
 
     def state_dict(self) -> dict[str, Any]:
-        """Discriminator, its optimizer, and the state of the draws."""
+        """Return the states of the discriminator, its optimizer, and the random draws."""
         return {
             "critic": self.critic.state_dict(),
             "optimizer": self._optimizer.state_dict(),
@@ -114,14 +114,14 @@ class SrganObjective:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore a state."""
         self.critic.load_state_dict(state["critic"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._rng.set_state(state["rng"].cpu())
 
 
 def _average_gradients(net: nn.Module) -> None:
-    """Over the processes of a run, so that they keep one discriminator: DDP allows no gradient of a gradient."""
+    """Average gradients over the processes of a run, because DDP does not support the gradient of a gradient."""
     if not distributed.is_initialized():
         return
     for parameter in net.parameters():

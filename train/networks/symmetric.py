@@ -1,7 +1,7 @@
 """Convolutions that are exactly symmetric under quarter turns and mirror images of the pad.
 
-A contact that is turned or mirrored has the turned or mirrored pattern: a square pad knows no direction. Channels are
-grouped into fields, and a symmetry of the square moves them among each other, with a sign where they point somewhere
+A contact that is turned or mirrored has the turned or mirrored pattern: a square pad has no preferred direction.
+Channels are grouped into fields, and a symmetry of the square permutes them, with a sign for those with a direction
 (the shear x, y). A kernel that keeps this has one free number for each orbit of its entries, an eighth of them; the
 others are copies. Written out, it is an ordinary convolution, at the same cost.
 
@@ -33,7 +33,7 @@ _ELEMENTS: Final[dict[Group, tuple[tuple[int, bool], ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """Channels and how each symmetry moves them: channel i becomes sign[g, i] times channel index[g, i].
+    """Channels under symmetries: channel i becomes sign[g, i] times channel index[g, i].
 
     Attributes:
         group: the symmetries.
@@ -49,19 +49,19 @@ class Channels:
         return self.index.shape[1]
 
     def __add__(self, other: "Channels") -> "Channels":
-        """These channels and the others after them."""
+        """Return these channels followed by the others."""
         index = np.concatenate([self.index, other.index + len(self)], axis=1)
         return Channels(self.group, index, np.concatenate([self.sign, other.sign], axis=1))
 
     def __mul__(self, times: int) -> "Channels":
-        """The same channels several times, one set after the other."""
+        """Return the same channels `times` times, one set after the other."""
         total = self
         for _ in range(times - 1):
             total = total + self
         return total
 
     def shuffled(self, side: int) -> "Channels":
-        """The channels before a pixel shuffle, `side` x `side` pixels of each of these."""
+        """Return the channels before a pixel shuffle, `side` x `side` pixels of each of these."""
         pixels = _moved_places(self.group, side)
         index = self.index[:, :, None] * side * side + pixels[:, None, :]
         sign = np.repeat(self.sign, side * side, axis=1)
@@ -69,17 +69,17 @@ class Channels:
 
 
 def scalars(group: Group, count: int) -> Channels:
-    """Channels that no symmetry moves: pressure, deviation, what is known of the pad."""
+    """Return channels that no symmetry changes: pressure, deviation, constants of the pad."""
     elements = len(_ELEMENTS[group])
     return Channels(group, np.tile(np.arange(count), (elements, 1)), np.ones((elements, count), dtype=np.int64))
 
 
 def vectors(group: Group, count: int = 1) -> Channels:
-    """Channels x, y, z of so many vectors: x to the right and y down turn with the pad, z does not."""
+    """Return channels x, y, z of `count` vectors: x to the right and y down turn with the pad, z does not."""
     index, sign = [], []
     for turns, mirrored in _ELEMENTS[group]:
         place, signs = np.array([0, 1, 2]), np.array([-1 if mirrored else 1, 1, 1])
-        for _ in range(turns):  # a quarter turn makes x of y, and -y of x
+        for _ in range(turns):  # a quarter turn maps y to x, and x to -y
             place, signs = place[[1, 0, 2]], signs[[1, 0, 2]] * np.array([1, -1, 1])
         index.append(place)
         sign.append(signs)
@@ -87,7 +87,7 @@ def vectors(group: Group, count: int = 1) -> Channels:
 
 
 def fields(group: Group, channels: int) -> Channels:
-    """Hidden channels: groups of as many as there are symmetries, which permute them.
+    """Return hidden channels in groups of as many as there are symmetries, which permute them.
 
     Raises:
         ValueError: the channels do not divide into such groups.
@@ -97,19 +97,19 @@ def fields(group: Group, channels: int) -> Channels:
         raise ValueError(f"{channels} channels, expected a multiple of the {elements} symmetries of {group}")
     places = _moved_places(group, 3)
     place_of = {tuple(places[g]): g for g in range(elements)}
-    # Places move as (T_g f)[p] = f[places[g][p]]: T_g after T_h reads places[h] at places[g].
+    # Places move as (T_g f)[p] = f[places[g][p]], so T_g after T_h reads places[h] at places[g].
     product = np.array([[place_of[tuple(places[h][places[g]])] for h in range(elements)] for g in range(elements)])
-    inverse = product.argmin(axis=1)  # element 0 changes nothing
+    inverse = product.argmin(axis=1)  # element 0 is the identity
     index = product[inverse]
     return Channels(group, index, np.ones_like(index)) * (channels // elements)
 
 
 class SymmetricConv2d(nn.Module):
-    """A convolution that keeps the size and commutes with the symmetries; `kernel` is odd.
+    """Convolution that keeps the size and commutes with the symmetries; `kernel` is odd.
 
     Args:
-        enter: the channels it takes.
-        leave: the channels it gives.
+        enter: input channels.
+        leave: output channels.
         kernel: side of the kernel.
     """
 
@@ -125,12 +125,12 @@ class SymmetricConv2d(nn.Module):
         self._orbits("weight", moved.reshape(len(moved), -1), signs.reshape(len(signs), -1), shape)
         self._orbits("bias", leave.index, leave.sign, (len(leave),))
         self._padding = kernel // 2
-        bound = 1 / (len(enter) * kernel**2) ** 0.5  # as torch draws those of nn.Conv2d
+        bound = 1 / (len(enter) * kernel**2) ** 0.5  # the bound of torch's initialisation of nn.Conv2d
         for free in (self.weight_free, self.bias_free):
             nn.init.uniform_(free, -bound, bound)
 
     def _orbits(self, name: str, moved: NDArray[np.int64], signs: NDArray[np.int64], shape: tuple[int, ...]) -> None:
-        """Register one free number for each orbit of entries, and each entry's place among them and sign."""
+        """Register one free number for each orbit of entries, and each entry's orbit and sign."""
         first = moved.argmin(axis=0)
         lowest = np.take_along_axis(moved, first[None], axis=0)[0]
         sign = np.take_along_axis(signs, first[None], axis=0)[0]
@@ -151,23 +151,23 @@ class SymmetricConv2d(nn.Module):
 
     @property
     def weight(self) -> Tensor:
-        """The kernel written out, (leave, enter, kernel, kernel)."""
+        """Kernel written out, (leave, enter, kernel, kernel)."""
         return self.weight_free.index_select(0, self._weight_orbit).view_as(self._weight_sign) * self._weight_sign
 
     @property
     def bias(self) -> Tensor:
-        """The bias written out, (leave,)."""
+        """Bias written out, (leave,)."""
         return self.bias_free.index_select(0, self._bias_orbit).view_as(self._bias_sign) * self._bias_sign
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (n, enter, H, W) to (n, leave, H, W)."""
+        """Map (n, enter, H, W) to (n, leave, H, W)."""
         # Channels last takes an eighth less time to train (2 cores, batch 64).
         weight = self.weight.contiguous(memory_format=torch.channels_last)
         return F.conv2d(x, weight, self.bias, padding=self._padding)
 
     @torch.no_grad()
     def assign(self, weight: Tensor, bias: Tensor) -> None:
-        """Take the symmetric part of a kernel (leave, enter, kernel, kernel) and a bias (leave,)."""
+        """Set the symmetric part of a kernel (leave, enter, kernel, kernel) and a bias (leave,)."""
         for name, values in (("weight", weight), ("bias", bias)):
             orbit, sign = getattr(self, f"_{name}_orbit"), getattr(self, f"_{name}_sign").flatten()
             free = getattr(self, f"{name}_free")
@@ -175,7 +175,7 @@ class SymmetricConv2d(nn.Module):
             free.copy_(total / torch.bincount(orbit, minlength=len(free)))
 
     def written_out(self) -> nn.Conv2d:
-        """The same as an ordinary convolution, with weights of its own."""
+        """Return the equivalent ordinary convolution, with its own weights."""
         leave, enter, kernel, _ = self._weight_sign.shape
         plain = nn.Conv2d(enter, leave, kernel, padding=self._padding)
         plain.load_state_dict({"weight": self.weight, "bias": self.bias})
@@ -183,7 +183,7 @@ class SymmetricConv2d(nn.Module):
 
 
 class SymmetricResidual(nn.Module):
-    """Two 3 x 3 convolutions beside a straight path; no normalisation, so amplitudes pass."""
+    """Two 3 x 3 convolutions parallel to an identity path; without normalisation, so that amplitudes pass."""
 
     def __init__(self, channels: Channels) -> None:
         super().__init__()
@@ -192,12 +192,12 @@ class SymmetricResidual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same shape, (n, channels, H, W)."""
+        """Return maps of the same shape, (n, channels, H, W)."""
         return torch.relu(x + self.body(x))
 
 
 def write_out(net: nn.Module) -> nn.Module:
-    """Replace every symmetric convolution of a network, in place, by the ordinary one that it stands for."""
+    """Replace every symmetric convolution of a network, in place, by the equivalent ordinary one."""
     for name, part in net.named_children():
         if isinstance(part, SymmetricConv2d):
             setattr(net, name, part.written_out())
@@ -207,7 +207,7 @@ def write_out(net: nn.Module) -> nn.Module:
 
 
 def symmetries(group: Group) -> list[Callable[[NDArray[np.generic]], NDArray[np.generic]]]:
-    """Each symmetry as what it does to the last two axes of an array."""
+    """Return each symmetry as a function on the last two axes of an array."""
     return [
         lambda maps, turns=turns, mirrored=mirrored: _move(maps, turns, mirrored)
         for turns, mirrored in _ELEMENTS[group]
@@ -220,6 +220,6 @@ def _move(maps: NDArray[np.generic], turns: int, mirrored: bool) -> NDArray[np.g
 
 @lru_cache
 def _moved_places(group: Group, side: int) -> NDArray[np.int64]:
-    """Where each pixel of a `side` x `side` map comes from, (symmetries, side * side)."""
+    """Return the source of each pixel of a `side` x `side` map under each symmetry, (symmetries, side * side)."""
     places = np.arange(side * side).reshape(side, side)
     return np.array([_move(places, *element).ravel() for element in _ELEMENTS[group]], dtype=np.int64)

@@ -1,9 +1,9 @@
-"""The tactile PSF learnt from taps: a network reads alpha, beta and gamma off a scan.
+"""The tactile PSF learned from taps: a network estimates alpha, beta and gamma from a scan.
 
 Depth and PSF give the HR pattern, the pattern degraded to the taxels gives the scan's z again, and the difference
-trains the network: no HR truth is needed. Alpha comes out in the scan's unit per area, since only the product of
-alpha and the taxels' sensitivity can be seen in a scan. k_scale, one constant per sensor, turns that into [mm]; where
-indentations are known it is the least-squares factor that brings the plateaus to them.
+trains the network: no HR truth is needed. Alpha has the scan's unit per area, since only the product of alpha and the
+taxels' sensitivity is visible in a scan. k_scale, one constant per sensor, converts that into [mm]; where indentations
+are available it is the least-squares factor from the plateaus to them.
 
 Source: Wu and Liu 2024, Section IV-C, Eq. 4-10 and Fig. 4.
 """
@@ -24,19 +24,21 @@ from train.physics.tpsf import Kernel, Plateau, tpsf
 Gamma = Literal["sensor", "sample"]
 Form = Literal["paper", "code"]
 COUNTS_PER_UNIT: Final = 100.0
-"""What the network reads and is judged by: counts / 100."""
+"""Counts per unit of the network's input and loss."""
 _WIDTHS: Final = (256, 1024, 256)
 _SMALLEST: Final = 1e-6
-"""Added to every length: softplus of a very negative number is 0, and nothing divides by that."""
+"""Least length: softplus of a very negative number is 0, and the lengths are divisors."""
 _GAMMA_START: Final = 0.8
 _GAMMA_HASTE: Final = 20.0
-"""Learning rate of the lone gamma over the network's. At the same rate it stays where it starts: a thousand weights
-move alpha and beta to make up for it."""
+"""Learning rate of the single gamma over the network's.
+
+At the same rate it stays at its initial value, because a thousand weights of alpha and beta compensate for it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class PsfParameters:
-    """What the network reads off n scans.
+    """Parameters that the network estimates from n scans.
 
     Attributes:
         alpha: (n,) intensity, >= 0, in [counts / 100 / mm^4]: a taxel weighs its pattern over an area, and the
@@ -51,14 +53,14 @@ class PsfParameters:
 
 
 class PsfNet(nn.Module):
-    """Scan -> alpha, beta, gamma: 48 -> 256 -> 1024 -> 256 -> 3, ReLU, softplus.
+    """Network from a scan to alpha, beta, gamma: 48 -> 256 -> 1024 -> 256 -> 3, ReLU, softplus.
 
     Args:
         geometry: the taxels.
         kernel: form of the PSF, see `train.physics.tpsf.spread`.
         plateau: see `train.physics.tpsf.tpsf`.
-        gamma: "sensor": one number, learnt beside the network (whose last layer has then two outputs);
-            "sample": read off every scan.
+        gamma: "sensor": one number, trained with the network (whose last layer then has two outputs); "sample":
+            estimated from every scan.
         form: of the degradation, see `degrade`.
 
     Attributes:
@@ -93,14 +95,14 @@ class PsfNet(nn.Module):
         self.register_buffer("k_scale", torch.tensor(1.0))
 
     def forward(self, counts: Tensor) -> PsfParameters:
-        """Read scans (n, 3, rows, cols) in zeroed counts."""
+        """Return the parameters of scans (n, 3, rows, cols) in zeroed counts."""
         raw = self.layers(counts.flatten(1) / COUNTS_PER_UNIT)
         raw_gamma = raw[:, 2] if self.gamma is None else self.gamma
         alpha, beta_mm, gamma = (nn.functional.softplus(value) for value in (raw[:, 0], raw[:, 1], raw_gamma))
         return PsfParameters(alpha, beta_mm + _SMALLEST, gamma + _SMALLEST)
 
     def pattern(self, read: PsfParameters, depth: Tensor) -> Tensor:
-        """HR patterns (n, H, W) of depth images (n, H, W) in 0..1; in [mm] once k_scale is set.
+        """Return HR patterns (n, H, W) of depth images (n, H, W) in 0..1; in [mm] once k_scale is set.
 
         Source: Wu and Liu 2024, Eq. 5-6.
         """
@@ -108,15 +110,15 @@ class PsfNet(nn.Module):
         return self.k_scale * tpsf(depth, read.alpha, read.beta_mm, pixel_mm, self.kernel, self.plateau)
 
     def degraded(self, read: PsfParameters, depth: Tensor) -> Tensor:
-        """Z readings (n, rows, cols) that the patterns would give, in [counts / 100]."""
+        """Return the z readings (n, rows, cols) of the patterns, in [counts / 100]."""
         pattern = self.pattern(read, depth) / self.k_scale
         return degrade(pattern, read.gamma, self.geometry, self.form)
 
     def loss(self, counts: Tensor, depth: Tensor) -> Tensor:
-        """Squared error of the z readings, summed over the taxels, mean over the scans.
+        """Return the squared error of the z readings, summed over the taxels, mean over the scans.
 
-        A reading counts as far as it is positive. Beside a contact the pad heaps up and z turns negative; nothing in
-        the model can, and in trying to, beta would vanish.
+        Only the positive part of a reading counts. Next to a contact the pad bulges and z is negative; the model cannot
+        reproduce that, and in fitting it beta would vanish.
 
         Source: Wu and Liu 2024, Eq. 9-10.
         """
@@ -125,18 +127,18 @@ class PsfNet(nn.Module):
 
     @torch.no_grad()
     def set_k_scale(self, counts: Tensor, depth: Tensor, indentation_mm: Tensor) -> None:
-        """Bring the highest point of each pattern to its indentation (n,), least squares over the scans."""
+        """Set k_scale by least squares of each pattern's highest point to its indentation (n,)."""
         plateau = (self.pattern(self(counts), depth) / self.k_scale).amax(dim=(1, 2))
         self.k_scale.copy_((plateau @ indentation_mm) / (plateau @ plateau).clamp_min(_SMALLEST))
 
 
 def pressed(counts: Tensor) -> Tensor:
-    """What of the z readings tells of pressing in: (n, rows, cols) of (n, 3, rows, cols), in [counts / 100]."""
+    """Return the positive part of the z readings, (n, rows, cols) of (n, 3, rows, cols), in [counts / 100]."""
     return counts[:, 2].clamp_min(0.0) / COUNTS_PER_UNIT
 
 
 def degrade(pattern: Tensor, gamma: Tensor, geometry: SensorGeometry = USPA44, form: Form = "paper") -> Tensor:
-    """Weigh HR patterns (n, H, W) into taxels (n, rows, cols); the pattern's unit times [mm^2].
+    """Integrate HR patterns (n, H, W) with each taxel's weights, (n, rows, cols); the pattern's unit times [mm^2].
 
     Eq. 7's sum over pixels is taken as an integral, so that a pattern reads alike at every scale.
 
@@ -144,8 +146,8 @@ def degrade(pattern: Tensor, gamma: Tensor, geometry: SensorGeometry = USPA44, f
         pattern: (n, H, W).
         gamma: (), or (n,) for one each; > 0.
         geometry: the taxels.
-        form: "paper": weights exp(-d/gamma^2), each taxel's divided by their largest; "code", as the authors' code
-            has it: exp(-d^2/gamma), all taxels' together stretched to 0..1. d in [mm].
+        form: "paper": weights exp(-d/gamma^2), each taxel's divided by their largest; "code", as in the authors'
+            code: exp(-d^2/gamma), all taxels' together stretched to 0..1. d in [mm].
 
     Raises:
         ValueError: the form is unknown.
@@ -155,8 +157,8 @@ def degrade(pattern: Tensor, gamma: Tensor, geometry: SensorGeometry = USPA44, f
     height, width = pattern.shape[1:]
     distance_mm = _distances_mm(geometry, height, width)
     gamma = gamma[..., None, None]
-    # Distances count from the nearest pixel: the division by the largest weight is then done, and never 0/0. Their
-    # differences are taken in float64, since a small gamma asks for their last digits.
+    # Distances count from the nearest pixel, which replaces the division by the largest weight and avoids 0/0. Their
+    # differences are computed in float64, since a small gamma depends on their last digits.
     if form == "paper":
         beyond_mm = distance_mm - distance_mm.amin(dim=1, keepdim=True)
         weights = torch.exp(-beyond_mm.to(pattern) / gamma**2)
@@ -175,7 +177,7 @@ def degrade(pattern: Tensor, gamma: Tensor, geometry: SensorGeometry = USPA44, f
 
 @lru_cache
 def _distances_mm(geometry: SensorGeometry, height: int, width: int) -> Tensor:
-    """From each taxel to each pixel, (taxels, H * W) in [mm]."""
+    """Return the distance of each taxel to each pixel, (taxels, H * W) in [mm]."""
     down_mm = ((torch.arange(height) + 0.5) / height - 0.5) * geometry.rows * geometry.pitch_mm
     right_mm = ((torch.arange(width) + 0.5) / width - 0.5) * geometry.cols * geometry.pitch_mm
     pixels_mm = torch.cartesian_prod(down_mm, right_mm).flip(1)
@@ -193,13 +195,13 @@ def fit_psf_net(
     rate: float = 1e-3,
     seed: int = 0,
 ) -> list[float]:
-    """Train the network on scans and the depth images they came from; returns the loss of every epoch.
+    """Train the network on scans and their depth images, and return the loss of every epoch.
 
     Args:
-        net: the network; its weights are drawn anew from the seed.
+        net: the network; its weights are initialised again from the seed.
         counts: (n, 3, rows, cols) zeroed.
         depth: (n, H, W) in 0..1, 1 the surface's top.
-        indentation_mm: (n,), in [mm], where known: sets k_scale.
+        indentation_mm: (n,), in [mm], or None; sets k_scale.
         epochs: passes over the scans.
         batch: scans in a step.
         rate: Adam's learning rate; it falls to nothing on a half cosine.

@@ -1,6 +1,7 @@
-"""The network to beat: STSR and MTSR-K as published.
+"""STSR and MTSR-K as published, the networks to compare with.
 
-Source: Wu and Liu 2024, Section V and Fig. 8; channels and biases as the parameter counts of the authors' code ask.
+Source: Wu and Liu 2024, Section V and Fig. 8; channels and biases follow from the parameter counts of the authors'
+code.
 """
 
 from typing import Final
@@ -24,10 +25,10 @@ MAX_TAPS: Final = 7
 
 
 class SeedNet(PatternNet):
-    """Window of K taps to pattern: STSR with one tap, MTSR-K with more.
+    """Network from a window of K taps to a pattern: STSR with one tap, MTSR-K with more.
 
-    All work is done at the pattern's size. Taps are interpolated, pass a stem each and are brought together; the newest
-    tap also passes a branch without batch normalisation, which would lose the force.
+    All layers work at the pattern's size. Taps are interpolated, each passes its stem, and they are merged; the newest
+    tap also passes a branch without batch normalisation, which would remove the force.
 
     Args:
         taps: K, 1 to 7.
@@ -58,7 +59,7 @@ class SeedNet(PatternNet):
         initialise(self)
 
     def forward(self, window: Tensor) -> Tensor:
-        """Patterns (n, H, W) in [mm], of windows (n, 3K, rows, cols) in network units, newest tap first."""
+        """Return patterns (n, H, W) in [mm] of windows (n, 3K, rows, cols) in network units, newest tap first."""
         taps = upsample(window, self.scale).split(3, dim=1)
         shapes = [stem(tap) for stem, tap in zip(self.stems, taps, strict=True)]
         pattern = self.trunk(self.merge(torch.cat(shapes, dim=1)))
@@ -67,10 +68,10 @@ class SeedNet(PatternNet):
 
     @classmethod
     def from_stsr(cls, stsr: "SeedNet", taps: int) -> "SeedNet":
-        """An MTSR-K that computes what an STSR computes, until it is trained: all of it can be.
+        """Return an MTSR-K that computes the same as an STSR until it is trained.
 
-        Every stem starts as the STSR's. Where stems are brought together the earlier taps have no weight yet: these
-        weights learn from the first step on, the stems before them from the second.
+        Every stem starts as the STSR's. In the merging layer the earlier taps have zero weights: these weights learn
+        from the first step on, the stems before them from the second.
 
         Raises:
             ValueError: `stsr` takes more than one tap, or `taps` is out of range.

@@ -1,11 +1,11 @@
-"""Contact of a rigid surface with the pad: which cells touch, and at what pressure.
+"""Contact of a rigid surface with the pad: contact area and pressure.
 
-Pressure >= 0, gap >= 0, and one of them zero in every cell (Polonsky and Keer 1999: conjugate gradients on
-the touching cells, which change from step to step). Displacement from pressure is a convolution, done by FFT
-on a padded grid. Only the bounding box of the cells that a press can reach is worked on: the kernel is the whole
-pad's, cut to the box, so a box gives what the whole pad gives. Poses of like boxes are solved side by side.
+Pressure >= 0, gap >= 0, and one of them zero in every cell (Polonsky and Keer 1999: conjugate gradients on the touching
+cells, which change from step to step). Displacement from pressure is a convolution, done by FFT on a padded grid. Only
+the bounding box of the cells that a press can reach is computed: the kernel is the whole pad's, cut to the box, so the
+result is that of the whole pad. Poses with boxes of one shape are solved in a batch.
 
-A cell that a surface's edge runs through carries as much as it is covered: readings then change steadily while the
+The load of a cell at a surface's edge is proportional to its covered share: readings then change continuously while the
 surface moves, where whole cells alone make them jump by 1 to 2 % (docs/log.md).
 """
 
@@ -23,11 +23,15 @@ from train.physics.side_correction import FreeSides, SideGive
 
 _MAX_STEPS: Final = 200
 _DIES_WITHIN: Final = 8
-"""Thicknesses. The kernel is worked out on a grid that repeats itself after twice the pad, or after so many: the force
-on a punch is then off by 5e-4. On twice the pad it was off by .8 % at 10 mm and by 9 % at 50 mm."""
+"""Least period of the kernel's grid, in thicknesses, which limits the error of a punch's force to 5e-4.
+
+On a period of twice the pad the error was .8 % for a layer of 10 mm and 9 % for one of 50 mm.
+"""
 REACH: Final = 1.5
-"""Cells this many indentations deep may touch: the pad bulges out beside a contact, by 0.39 of the indentation at
-most over the 18 surfaces."""
+"""Depth in indentations up to which cells may touch.
+
+The pad bulges next to a contact, by at most 0.39 of the indentation over the 18 surfaces.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +40,9 @@ class ContactResult:
 
     Attributes:
         pressure_mpa: (n, size, size), in [MPa].
-        steps: conjugate-gradient steps taken, of the slowest pose.
+        steps: conjugate-gradient steps of the slowest pose.
         residual: (n,) root mean square gap where pressure acts or surfaces overlap, as a share of the indentation.
-        solver: whose solution it is.
+        solver: solver of the poses.
     """
 
     pressure_mpa: NDArray[np.float32]
@@ -48,7 +52,7 @@ class ContactResult:
 
     @property
     def displacement_mm(self) -> NDArray[np.float32]:
-        """Surface displacement downwards on the whole pad, (n, size, size) in [mm]; worked out when asked for."""
+        """Surface displacement downwards on the whole pad, (n, size, size) in [mm]; computed on every access."""
         return self.solver.displacement_mm(self.pressure_mpa)
 
     @property
@@ -58,17 +62,17 @@ class ContactResult:
 
 
 class ContactSolver:
-    """Solves poses on a square grid over one pad.
+    """Solver of poses on a square grid over one pad.
 
     Args:
         layer: the pad.
         size: cells along a side.
-        cell_mm: their size, in [mm].
+        cell_mm: cell size, in [mm].
         dtype: torch.float32 or torch.float64.
         boxed: work on boxes; else on the whole pad, for comparison.
-        compliance: surface displacement per pressure at wave numbers, in [mm/MPa], where something gives way beside the
-            layer; the layer's alone if None.
-        sides: the pad's free sides; without, it goes on for ever.
+        compliance: surface displacement per pressure at wave numbers, in [mm/MPa], for a pad with a cover; the layer's
+            alone if None.
+        sides: the pad's free sides; None for an infinite layer.
     """
 
     def __init__(
@@ -96,11 +100,11 @@ class ContactSolver:
 
     @property
     def cell_compliance_mm_per_mpa(self) -> float:
-        """How far a cell sinks under its own pressure alone, in [mm/MPa]."""
+        """Displacement of a cell under its own pressure alone, in [mm/MPa]."""
         return float(self._kernel[0, 0])
 
     def displacement_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Surface displacement downwards under pressures (n, size, size), in [mm]."""
+        """Return the surface displacement downwards under pressures (n, size, size), in [mm]."""
         pressure = torch.as_tensor(pressure_mpa, dtype=self._dtype)
         return self._respond(pressure, torch.zeros(()), self._side_give).numpy().astype(np.float32)
 
@@ -112,17 +116,17 @@ class ContactSolver:
         start_mpa: NDArray[np.floating] | None = None,
         cover: NDArray[np.floating] | None = None,
     ) -> ContactResult:
-        """Press surfaces of the given depths into the pad.
+        """Press surfaces into the pad, with depth images as input.
 
         For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
 
         Args:
-            depth_mm: (n, size, size), how far each cell lies below the point of first contact, in [mm].
-            indentation_mm: how deep that point is pressed in, one for all or (n,), > 0, in [mm].
+            depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
+            indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
             tolerance: residual at which a pose is done.
-            start_mpa: pressures to start from, (n, size, size), if anything is known of them.
-            cover: share of each cell that the surface is over, (n, size, size), above 0 wherever a cell is reached; all
-                whole if None. Pressures are then means over cells.
+            start_mpa: pressures to start from, (n, size, size), or None.
+            cover: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
+                everywhere if None. Pressures are then means over cells.
 
         Raises:
             ValueError: shapes or values do not fit, or no cell of a pose is reached.
@@ -160,7 +164,7 @@ class ContactSolver:
         return ContactResult(pressure_mpa, steps, residual, self)
 
     def _give(self, cover: torch.Tensor) -> torch.Tensor:
-        """How much further a cell sinks under its own pressure because a share of it alone carries that, in [mm/MPa].
+        """Return the additional displacement of a cell under its own pressure due to partial cover, in [mm/MPa].
 
         The pressure on the covered share is 1 / cover times the cell's mean.
         """
@@ -175,7 +179,7 @@ class ContactSolver:
         give: torch.Tensor | None,
         sides: SideGive | None,
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """Pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1)."""
+        """Return pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1)."""
         reachable = depth < REACH * press
         wanted = torch.where(reachable, press - depth, 0.0)
         if give is None:
@@ -217,11 +221,11 @@ class ContactSolver:
             length = _total(gap_touching * direction) / _total(response * direction).clamp_min(1e-30)
             stepped = pressure - length * direction
             pressure = stepped.clamp_min(0.0)
-            # A cell that lifted off although it would sink in comes back; the search then starts afresh.
+            # A cell without pressure that would overlap the surface returns to the contact; the search then restarts.
             returning = (pressure <= 0) & (gap < 0) & reachable
             pressure = torch.where(returning, -length.abs() * gap, pressure)
             keep = (~returning.flatten(1).any(dim=1)).to(self._dtype)[:, None, None]
-            # Where no cell lifted off or came back the step was straight, and so is the gap's.
+            # Where no cell was cut off or returned, the step was linear, and so is the gap's.
             bent = (returning | (stepped < 0)).flatten(1).any(dim=1)
             gap = torch.where(reachable, gap - length * response, 0.0)
             if bool(bent.any()):
@@ -230,12 +234,12 @@ class ContactSolver:
         return result, residual, steps
 
     def _respond(self, pressure: torch.Tensor, give: torch.Tensor, sides: SideGive | None) -> torch.Tensor:
-        """Displacement with what single cells give and what free sides add."""
+        """Return the displacement including the partial cells' compliance and the free sides."""
         displacement = self._displace(pressure) + give * pressure
         return displacement if sides is None else displacement + sides.displacement_mm(pressure)
 
     def _displace(self, pressure: torch.Tensor) -> torch.Tensor:
-        """Displacement within boxes (n, height, width) under pressures in them."""
+        """Return the displacement within boxes (n, height, width) under pressures in them."""
         height, width = pressure.shape[1:]
         padded = (2 * height, 2 * width)
         if (height, width) not in self._spectra:
@@ -247,23 +251,23 @@ class ContactSolver:
 
 
 def period_cells(layer: Layer, size: int, cell_mm: float) -> int:
-    """Cells after which the grid repeats itself that kernels of a pad are worked out on."""
+    """Return the period of the grid on which the kernels of a pad are computed, in cells."""
     return 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
 
 
 def box_sides(size: int) -> list[int]:
-    """Sides of boxes on a pad: powers of two, where the FFT is at its best, and few, so that many poses share one."""
+    """Return sides of boxes on a pad: powers of two, which suit the FFT, and few, so that many poses share one."""
     return [side for side in (8, 16, 32, 64, 128, 256) if side < size]
 
 
 def boxes(
     within: NDArray[np.bool_], sides: list[int]
 ) -> list[tuple[tuple[int, int], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
-    """Poses by shape of their bounding box: (shape, their indices, first row and first column of each one's box).
+    """Group poses by shape of their bounding box: (shape, their indices, first row and first column of each box).
 
     Args:
         within: (n, size, size), the cells that a box must hold.
-        sides: what a box may measure, rising; the last is the pad's.
+        sides: allowed sides of boxes, rising; the last is the pad's.
     """
     size = within.shape[-1]
     shapes, starts = [], []

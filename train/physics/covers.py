@@ -1,4 +1,4 @@
-"""What gives way beside the pad: a soft object, or a cloth or glove over the pad."""
+"""Compliant covers: a soft object, or a cloth or glove over the pad."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,11 +12,11 @@ from train.physics.elastic_layer import Layer, surface_compliance
 
 @dataclass(frozen=True, slots=True)
 class Cover:
-    """What lies between the rigid shape and the pad, or gives way instead of it.
+    """Compliance of the object, and a cloth between it and the pad.
 
     Attributes:
         soft_mpa: shear modulus of a soft object, thick and incompressible; 0 for a rigid one.
-        cloth_mm: thickness of a cloth or glove over the pad; 0 for none.
+        cloth_mm: thickness of a cloth or glove over the pad; 0 for no cloth.
         cloth_mpa: its modulus under even pressure.
     """
 
@@ -25,7 +25,7 @@ class Cover:
     cloth_mpa: float = 1.0
 
     def compliance(self, layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far pad and cover give way together per pressure at wave numbers, in [mm/MPa]."""
+        """Return the joint compliance of pad and cover at wave numbers, in [mm/MPa]."""
         compliance = surface_compliance(layer, q_per_mm)
         if self.cloth_mm:
             compliance = compliance * self._spread(q_per_mm) ** 2 + self.cloth_mm / self.cloth_mpa
@@ -34,7 +34,7 @@ class Cover:
         return compliance
 
     def passed_on(self, pressure: NDArray[np.float32], cell_mm: float) -> NDArray[np.float32]:
-        """Pressure on the pad (size, size) under a cloth that spreads the one on its upper side."""
+        """Return the pressure on the pad (size, size) under a cloth that spreads the pressure on its upper side."""
         if not self.cloth_mm:
             return pressure
         size = len(pressure)
@@ -46,7 +46,7 @@ class Cover:
         return np.maximum(spread[:size, :size], 0).astype(np.float32)
 
     def _spread(self, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Share of a pressure wave that comes through a cloth: (1 + q t) exp(-q t).
+        """Return the share of a pressure wave that a cloth transmits: (1 + q t) exp(-q t).
 
         Source: Johnson 1985, Eq. 2.23, the pressure at a depth in a half-space.
         """

@@ -1,9 +1,9 @@
-"""Patterns of curved surfaces: several planes at different heights, each with a PSF of its own.
+"""Patterns of curved surfaces: several planes at different heights, each with its own PSF.
 
-Where the surface touches, the pad follows it. Around the contact each plane spreads what it presses in, the deeper the
-wider. A flat surface is one plane, and its pattern is `train.physics.tpsf.tpsf_pattern`'s.
+In the contact the pad follows the surface. Outside it, each plane spreads its indentation, and deeper planes spread
+further. A flat surface is one plane, with the pattern of `train.physics.tpsf.tpsf_pattern`.
 
-Source: Wu and Liu 2024, Section VII, as future work; nothing of it is worked out there.
+Source: Wu and Liu 2024, Section VII, which names this as future work without a method.
 """
 
 from typing import Final
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from train.physics.tpsf import BETA_MM, Kernel, spread
 
 PLANES: Final = 4
-"""Twice as many change the error by less than 0.1 % of the indentation."""
+"""Largest number of planes; twice as many change the error by less than 0.1 % of the indentation."""
 EDGE_BETA_MM: Final = 0.6
-"""Reach of a plane that just touches; fits the surface of the default layer under spheres and cylinders, see tests."""
+"""Reach of a plane that just touches, fitted to the default layer under spheres and cylinders, see tests."""
 
 
 def heights_pattern(
@@ -30,18 +30,18 @@ def heights_pattern(
     edge_beta_mm: float = EDGE_BETA_MM,
     kernel: Kernel = "gaussian",
 ) -> NDArray[np.float32]:
-    """Surface deformation under rigid surfaces of any shape, (n, H, W) in [mm].
+    """Return the surface deformation under rigid surfaces of any shape, (n, H, W) in [mm].
 
-    The planes cut the indentation into equal slices; a depth image has as many as it touches pixels in, and only
-    those cost time. A plane pressed in by a share s of the indentation has an alpha that would lift the whole contact
-    to that height, and a beta between edge_beta_mm, at s = 0, and beta_mm, at s = 1.
+    The planes divide the indentation into equal slices; only planes with touching pixels are computed. A plane at a
+    share s of the indentation has an alpha that would lift the whole contact to that height, and a beta between
+    edge_beta_mm, at s = 0, and beta_mm, at s = 1.
 
     Args:
-        depth_mm: (n, H, W), how far each pixel lies below the highest point, in [mm].
+        depth_mm: (n, H, W), depth of each pixel below the highest point, in [mm].
         touching: (n, H, W), the area that the surface touches.
         indentation_mm: (n,), of the highest point, in [mm].
         pixel_mm: pixel size, in [mm].
-        planes: the most planes, at least 1.
+        planes: largest number of planes, at least 1.
         beta_mm: reach of the kernel of a plane at the top, > 0, in [mm].
         edge_beta_mm: reach of the kernel of a plane that just touches, > 0, in [mm].
         kernel: see `train.physics.tpsf.spread`.

@@ -1,8 +1,8 @@
-"""A bonded elastic layer: what pressure on its surface does at the surface and inside. In Fourier space.
+"""Bonded elastic layer in Fourier space: displacement at the surface and inside under pressure on the surface.
 
-The pad is a soft layer of thickness h on a rigid board. A pressure wave p exp(i q x) on its free surface
-moves the material by u_z = W(q, z) p and u_x = i U(q, z) p along the wave. Everything is written with
-decaying exponentials alone, so that no q h overflows. Lengths in [mm], stresses in [MPa].
+The pad is a soft layer of thickness h on a rigid board. A pressure wave p exp(i q x) on its free surface moves the
+material by u_z = W(q, z) p and u_x = i U(q, z) p along the wave. All formulas use decaying exponentials only, so that
+no q h overflows. Lengths in [mm], stresses in [MPa].
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,11 @@ class Layer:
     thickness_mm: float = 4.5
     shear_modulus_mpa: float = 0.12
     poisson: float = 0.45
-    """Effective: a 20 mm pad is free at its sides. Nearer to 0.5 the sum of z is not in proportion to the force (28 to
-    990 counts per newton over the 18 surfaces at 0.49, 670 to 1310 here), which on real skins it is to R^2 = .9997."""
+    """Effective value, because a 20 mm pad is free at its sides.
+
+    Nearer to 0.5 the sum of z is not proportional to the force (28 to 990 counts per newton over the 18 surfaces at
+    0.49, 670 to 1310 here), while on real skins it is, to R^2 = .9997.
+    """
 
     def __post_init__(self) -> None:
         if not 0 <= self.poisson < 0.5:
@@ -35,7 +38,7 @@ class Layer:
 
 
 def surface_compliance(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Surface displacement per pressure, u_z(q) = (1-nu)/(G q) S(qh), in [mm/MPa], positive downwards.
+    """Return the surface displacement per pressure, u_z(q) = (1-nu)/(G q) S(qh), in [mm/MPa], positive downwards.
 
     S = [(3-4nu) sinh 2a - 2a] / [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2], a = qh; here both halves are
     multiplied by 2 exp(-2a). At q = 0 the limit u = p h (1-2nu) / (2 G (1-nu)).
@@ -60,10 +63,10 @@ def surface_compliance(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[n
 def inner_displacement(
     layer: Layer, q_per_mm: NDArray[np.float64], height_mm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement inside the layer per surface pressure: (W, U), in [mm/MPa].
+    """Return the displacement inside the layer per surface pressure: (W, U), in [mm/MPa].
 
-    W is positive downwards; the in-plane part is u_x = i U exp(i q x), along the wave.
-    Each wave solves four boundary conditions: u = 0 on the board, sigma_zz = -p and sigma_xz = 0 on top.
+    W is positive downwards; the in-plane part is u_x = i U exp(i q x), along the wave. Each wave solves four boundary
+    conditions: u = 0 on the board, sigma_zz = -p and sigma_xz = 0 on top.
 
     Args:
         layer: the pad.
@@ -77,7 +80,9 @@ def inner_displacement(
 def inner_waves(
     layer: Layer, q_per_mm: NDArray[np.float64], height_mm: float, normal_mpa: float, shear_mpa: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement (w, u) inside the layer of a wave u_z = w exp(i q x) upwards, u_x = i u exp(i q x), in [mm].
+    """Return the displacement (w, u) inside the layer of a wave u_z = w exp(i q x), u_x = i u exp(i q x), in [mm].
+
+    w is positive upwards.
 
     Args:
         layer: the pad.
@@ -106,7 +111,7 @@ def inner_waves(
 
 @dataclass(frozen=True, slots=True)
 class _Waves:
-    """The four elementary waves at one height, each (n, 4): in-plane u, normal w, and their slopes in z."""
+    """Four elementary waves at one height, each (n, 4): in-plane u, normal w, and their slopes in z."""
 
     u: NDArray[np.float64]
     w: NDArray[np.float64]
@@ -115,10 +120,10 @@ class _Waves:
 
 
 def _waves(layer: Layer, q: NDArray[np.float64], z_mm: float) -> _Waves:
-    """Solutions (a + b q z) exp(+-q z) of Navier's equations, in units in which their amplitudes are alike.
+    """Return the solutions (a + b q z) exp(+-q z) of Navier's equations, scaled to similar amplitudes.
 
-    For u = (a + b q z) exp(q z) equilibrium asks w = (a - b (3-4nu) + b q z) exp(q z);
-    for u = (a + b q z) exp(-q z), w = (-a - b (3-4nu) - b q z) exp(-q z).
+    For u = (a + b q z) exp(q z) equilibrium requires w = (a - b (3-4nu) + b q z) exp(q z); for u = (a + b q z) exp(-q
+    z), it requires w = (-a - b (3-4nu) - b q z) exp(-q z).
     """
     kappa = 3 - 4 * layer.poisson
     rising = np.exp(q * (z_mm - layer.thickness_mm))

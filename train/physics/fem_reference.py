@@ -1,11 +1,11 @@
-"""The referee: the pad as a Mooney-Rivlin solid under a rigid surface, by finite elements at large strain.
+"""Finite-element reference: the pad as a Mooney-Rivlin solid under a rigid surface, at large strain.
 
 Hexahedra in the mixed formulation (displacement, pressure and volume ratio, the latter two constant in each cell
-and condensed), so that nothing locks as the rubber becomes incompressible. Contact is frictionless and of small
-slope: a node that touches stays at the height that the surface has above the node's place before the press, and is
-free in the plane. Which nodes touch is found by an active set: none may be pulled, none may be sunk in.
+and condensed) avoid locking as the rubber becomes incompressible. Contact is frictionless and of small slope: a
+touching node stays at the surface's height above the node's initial place, and is free in the plane. An active set
+determines the touching nodes: no node may be pulled, and none may overlap the surface.
 
-Needs FElupe, which is GPL and therefore an extra of its own; nothing but this module imports it.
+FElupe is required, which is GPL and therefore a separate extra; only this module imports it.
 """
 
 from dataclasses import dataclass
@@ -30,25 +30,25 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError(f"the FEM referee needs felupe (GPL): {how_to_install('fem')}", name="felupe") from error
 
 _RESIDUAL: Final = 1e-6
-"""Forces out of balance, as a share of the reactions, at which a step is done."""
+"""Out-of-balance forces at which a step is done, as a share of the reactions."""
 _MAX_NEWTON: Final = 12
 _MAX_SETS: Final = 20
 _SLACK: Final = 1e-4
-"""Pull and overlap that count as none: shares of the mean push of a touching node, and of the indentation."""
+"""Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
 _SOLVER_RESIDUAL: Final = 1e-6
 _SOLVER_STEPS: Final = 30
 _REMEDY: Final = "press in other steps: smaller ones or, near a Poisson's ratio of .5, larger"
-"""A step starts from the last one's field grown in proportion, which near incompressibility is not always near."""
+"""Advice in errors. A step starts from the last field scaled up, a poor start near incompressibility."""
 
 
 class NoEquilibriumError(TrainError, ArithmeticError):
-    """The elements found no equilibrium; the message names step and indentation.
+    """Failure of the elements to converge; the message names step and indentation.
 
     Attributes:
         reached_mm: indentation of the last equilibrium before, in [mm]; 0 if there was none.
     """
 
-    def __init__(self, message: str, reached_mm: float = 0.0) -> None:  # a default, or it could not be unpickled
+    def __init__(self, message: str, reached_mm: float = 0.0) -> None:  # a default, because unpickling passes no value
         super().__init__(message)
         self.reached_mm = reached_mm
 
@@ -59,9 +59,9 @@ class FemPresses:
 
     Attributes:
         indentation_mm: (s,), in [mm].
-        push_n: (s, size, size), what each node is pushed down with, in [N]; 0 where nothing touches.
-        board_n: (s,), what the board holds up the pad with, in [N]: all pushes, as far as forces are in balance.
-        below_board_mm: (s,), how far the bulging sides reach below the board, in [mm]. Nothing holds them up: where it
+        push_n: (s, size, size), force down on each node, in [N]; 0 without contact.
+        board_n: (s,), force of the board on the pad, in [N]: the sum of all pushes, up to the residual.
+        below_board_mm: (s,), depth of the bulging sides below the board, in [mm]. Nothing supports them: where it
             is more than 0 the pad is softer than it should be.
         displacement_mm: (s, size, size), of the surface's nodes, downwards, in [mm]; row = y, column = x.
         touching: (s, size, size), the nodes that touch.
@@ -82,12 +82,12 @@ class FemPresses:
 
     @property
     def force_n(self) -> NDArray[np.float64]:
-        """(s,), contact force in [N]."""
+        """Contact force (s,), in [N]."""
         return self.push_n.sum(axis=(1, 2))
 
 
 class FemPad:
-    """The pad, bonded to its board, its sides free.
+    """Pad bonded to its board, with free sides.
 
     Args:
         scale: nodes per taxel pitch: they lie on the pixels of the pattern at this scale, and on the pad's rim.
@@ -95,11 +95,11 @@ class FemPad:
         layer: thickness, and the material at small strain.
         c2_share: C2 / (C1 + C2).
         geometry: of a square sensor.
-        mixed: the formulation. Displacement alone locks as the rubber becomes incompressible: it is here to show that.
+        mixed: use the mixed formulation. Without it the elements lock near incompressibility, which a test shows.
 
     Attributes:
-        nodes_mm: (size,), where the nodes lie along a side, from the centre, in [mm].
-        cell_mm: distance of two of them, but for the last before the rim, in [mm].
+        nodes_mm: (size,), places of the nodes along a side, from the centre, in [mm].
+        cell_mm: distance of neighbouring nodes, except for the last before the rim, in [mm].
     """
 
     def __init__(
@@ -122,15 +122,15 @@ class FemPad:
 
     @property
     def size(self) -> int:
-        """Nodes along a side."""
+        """Number of nodes along a side."""
         return len(self.nodes_mm)
 
     def press(self, depth_mm: NDArray[np.floating], indentation_mm: NDArray[np.floating]) -> FemPresses:
-        """Press a surface in, each step from the last one's equilibrium.
+        """Press a surface in, each step starting from the last one's equilibrium.
 
         Args:
-            depth_mm: (size, size), how far the surface lies below its highest point over each node, in [mm]; the
-                image of size x size cells of cell_mm serves, for its rim is the pad's to a fraction of a cell.
+            depth_mm: (size, size), depth of the surface below its highest point over each node, in [mm]; the
+                image of size x size cells of cell_mm fits, because its rim is the pad's up to a fraction of a cell.
             indentation_mm: (s,), rising, in [mm].
 
         Raises:
@@ -147,7 +147,7 @@ class FemPad:
         return FemPresses(steps_mm, *map(np.array, zip(*found, strict=True)))
 
     def pattern(self, displacement_mm: NDArray[np.floating], scale: int = 10) -> NDArray[np.float32]:
-        """Node displacements (s, size, size) at the pixels of the pattern at x`scale`, linear between nodes."""
+        """Interpolate node displacements (s, size, size) linearly to the pixels of the pattern at x`scale`."""
         rows, cols = self._geometry.pattern_shape(scale)
         pixel_mm = self._geometry.pixel_pitch_mm(scale)
         y_mm, x_mm = ((np.arange(count) - (count - 1) / 2) * pixel_mm for count in (rows, cols))
@@ -164,7 +164,7 @@ class FemPad:
 
 
 class _Press:
-    """One press under way: the equilibrium so far, and what touches."""
+    """State of a press: the current equilibrium and its touching nodes."""
 
     def __init__(self, region: Any, rubber: MooneyRivlin, size: int, mixed: bool) -> None:
         self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
@@ -178,11 +178,11 @@ class _Press:
         self._board = np.arange(size**2)
 
     def advance(self, indentation_mm: float, wanted_mm: NDArray[np.floating], name: str) -> tuple[Any, ...]:
-        """Go on to where the surface lies at `wanted_mm` below the pad's face, (size, size)."""
+        """Advance to the surface at `wanted_mm` below the pad's face, (size, size)."""
         start = perf_counter()
         moved = self._field[0].values
         if self._indentation_mm:
-            # Nearly linear: the last step's field, grown in proportion, is nearly the next one's.
+            # Nearly linear: the last step's field, scaled up, is close to the next one's.
             moved *= indentation_mm / self._indentation_mm
         down_mm = self._down_mm()
         self._touch(self._touching | (wanted_mm > down_mm))
@@ -222,7 +222,7 @@ class _Press:
         self._touching = touching
 
     def _balance(self, wanted_mm: NDArray[np.floating], name: str) -> Any:
-        """Newton's iterations with the touching nodes held at their height."""
+        """Run Newton's iterations with the touching nodes held at their height."""
         pressed = self._top[self._touching.ravel()]
         held = np.full(self._field[0].values.shape, np.nan)
         held[self._board] = 0.0
@@ -250,10 +250,10 @@ class _Press:
 def rest_tangent(
     x_mm: NDArray[np.floating], y_mm: NDArray[np.floating], z_mm: NDArray[np.floating], layer: Layer
 ) -> csr_matrix:
-    """Stiffness of a block at small strain, nothing held, in [N/mm].
+    """Return the stiffness of a block at small strain without boundary conditions, in [N/mm].
 
     Args:
-        x_mm: nodes along x, rising; with those of y and z they make a grid, x running fastest, (x, y, z) in each node.
+        x_mm: nodes along x, rising; with those of y and z they make a grid, x changing fastest, (x, y, z) in each node.
         y_mm: nodes along y.
         z_mm: nodes along z.
         layer: the material.
@@ -263,7 +263,7 @@ def rest_tangent(
 
 
 def _body(field: Any, rubber: MooneyRivlin, mixed: bool) -> Any:
-    """The pad's elements: they bring the volumetric part themselves if mixed, and take it from the rubber if not."""
+    """Return the pad's elements; the mixed ones include the volumetric part, the others take it from the rubber."""
     if mixed:
         material = felupe.Material(
             stress=lambda x: [rubber.stress(x[0]), x[-1]],
@@ -278,13 +278,13 @@ def _body(field: Any, rubber: MooneyRivlin, mixed: bool) -> Any:
 
 
 class _TangentSolver:
-    """Conjugate gradients behind the last factors: a tangent changes little from step to step."""
+    """Conjugate gradients preconditioned by the last factors, because a tangent changes little from step to step."""
 
     def __init__(self) -> None:
         self._factors: SuperLU | None = None
 
     def forget(self) -> None:
-        """Other nodes touch: the system is another one."""
+        """Discard the factors, because other nodes touch."""
         self._factors = None
 
     def __call__(self, tangent: csr_matrix, load: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -294,7 +294,7 @@ class _TangentSolver:
             if not unfinished:
                 return solution
         try:
-            # Ordered for a symmetric matrix and never pivoted: half the fill and the time of the default.
+            # Ordered for a symmetric matrix and without pivoting: half the fill and the time of the default.
             options = {"SymmetricMode": True}
             factors = splu(tangent.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         except RuntimeError as error:
@@ -304,7 +304,7 @@ class _TangentSolver:
 
 
 def _nodes_mm(geometry: SensorGeometry, scale: int) -> NDArray[np.float64]:
-    """Pixels of the pattern, on to the pad's rim in the same steps, the last of them half a step or more."""
+    """Return the pixels of the pattern, continued to the pad's rim in the same steps, the last at least half a step."""
     cell_mm = geometry.pixel_pitch_mm(scale)
     pixels = geometry.cols * scale
     margin = int((geometry.width_mm / cell_mm - pixels) // 2)

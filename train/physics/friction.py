@@ -1,18 +1,18 @@
-"""Friction between a rigid surface and the pad: where the contact sticks, where it slips, at what traction.
+"""Friction between a rigid surface and the pad: sticking and slipping areas, and traction.
 
-Given are the pressure and how far the surface has slid and turned since it came down. A cell in contact sticks, and
+Inputs are the pressure, and the slide and turn of the surface since first contact. A cell in contact sticks, and
 moves with the surface, or slips, and bears the traction mu p against its slip (Coulomb; Cattaneo 1938 and Mindlin
-1949 for spheres). One step of monotone loading: pressure first, then slide and twist together, with no memory.
+1949 for spheres). One step of monotone loading: pressure first, then slide and twist together, without history.
 
 That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's
 compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
 2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.physics.contact.
 
-Pressure alone spreads the surface too; on request friction holds that as well, as if every cell had been in contact
-from the start, which is exact for flat surfaces. What traction does to pressure is left out (Goodman 1962). That is
-exact in the limit of a thick layer of nu = .5; a bonded layer's surface rises before a slide and sinks behind it, by a
-quarter of the slide at most at nu = .45, and the pressure under a wide contact would lean by some tens of per cent.
-Slopes of the surface are taken as small.
+Pressure alone spreads the surface too; optionally friction resists that as well, as if every cell had been in contact
+from the start, which is exact for flat surfaces. The effect of traction on pressure is left out (Goodman 1962). That is
+exact in the limit of a thick layer of nu = .5; a bonded layer's surface rises ahead of a slide and sinks at its back,
+by a quarter of the slide at most at nu = .45, and the pressure under a wide contact would lean by some tens of per
+cent. Slopes of the surface are taken as small.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from train.physics.tangential_layer import surface_spread, surface_tensor
 
 _MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4
-"""Energies back that a step may not exceed: this method is fast because it does not fall at every step."""
+"""Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
 _STICKS: Final = 1 - 1e-4
 """Share of mu p below which a cell sticks."""
 
@@ -40,8 +40,8 @@ class FrictionResult:
     Attributes:
         traction_mpa: on the pad, to the right and back, (n, 2, size, size), in [MPa].
         stick: (n, size, size), the cells in contact that do not slip.
-        residual: (n,) root mean square, over the contact, of the movement that cells are short of sticking or of
-            slipping against their traction, as a share of the surface's movement.
+        residual: (n,) root mean square error over the contact of the movement, which should vanish where cells
+            stick, and oppose the traction where they slip, as a share of the surface's movement.
         force_n: (n, 2), to the right and back, in [N].
         moment_nmm: (n,), about the pad's centre, from right to back, in [N mm].
         steps: of the slowest pose.
@@ -56,12 +56,12 @@ class FrictionResult:
 
 
 class FrictionSolver:
-    """Solves poses on a square grid over one pad.
+    """Solver of poses on a square grid over one pad.
 
     Args:
         layer: the pad.
         size: cells along a side.
-        cell_mm: their size, in [mm].
+        cell_mm: cell size, in [mm].
         dtype: torch.float32 or torch.float64.
         boxed: work on boxes; else on the whole pad, for comparison.
     """
@@ -78,19 +78,19 @@ class FrictionSolver:
         self._layer = layer
 
     def spread_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float64]:
-        """How pressures (n, size, size) alone would move the surface to the right and back, (n, 2, size, size)."""
+        """Return the movement (n, 2, size, size), to the right and back, under pressures (n, size, size), in [mm]."""
         period = period_cells(self._layer, self.size, self.cell_mm)
         q_x, q_y = _waves(period, self.cell_mm)
         q = np.hypot(q_x, q_y)
         along = np.divide(1j * surface_spread(self._layer, q), q, out=np.zeros(q.shape, dtype=complex), where=q > 0)
-        # The highest wave is its own mirror image: an odd transfer has none of it.
+        # The highest wave is its own mirror image, so an odd transfer is zero there.
         right, back = along * q_x, along * q_y
         right[:, -1] = back[period // 2] = 0.0
         wave = np.fft.rfft2(pressure_mpa, s=(period, period))[:, None] * np.stack([right, back])
         return np.fft.irfft2(wave, s=(period, period))[..., : self.size, : self.size]
 
     def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Surface displacement to the right and back, (n, 2, size, size) in [mm], under tractions of that shape."""
+        """Return the surface displacement (n, 2, size, size) under tractions of that shape, in [mm]."""
         return self._displace(torch.as_tensor(traction_mpa, dtype=self._dtype)).numpy().astype(np.float32)
 
     def solve(
@@ -102,7 +102,7 @@ class FrictionSolver:
         tolerance: float = 1e-3,
         holds_spread: bool = False,
     ) -> FrictionResult:
-        """Slide and turn surfaces that touch with the given pressures.
+        """Slide and turn surfaces that touch with these pressures.
 
         Args:
             pressure_mpa: (n, size, size), in contact where it is above 0, in [MPa].
@@ -110,9 +110,9 @@ class FrictionSolver:
             twist_rad: (n,), of the surface about the pad's centre, from right to back.
             friction: (n,), coefficients mu, >= 0.
             tolerance: residual at which a pose is done.
-            holds_spread: friction also holds what the pressure would spread. Then the magnets' in-plane movement
-                under pressure counts in full (train.physics.taxel_response.Skin, in_plane_share 1): these tractions
-                hold it back.
+            holds_spread: friction also resists the spread by pressure. Then the magnets' in-plane movement under
+                pressure counts in full (train.physics.taxel_response.Skin, in_plane_share 1), because these tractions
+                oppose it.
 
         Raises:
             ValueError: shapes or values do not fit.
@@ -172,13 +172,13 @@ class FrictionSolver:
     def _projected_gradients(
         self, limit: torch.Tensor, moved: torch.Tensor, tolerance: float
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """Tractions (n, 2, height, width), residuals and steps, of limits (n, 1, height, width) and movements."""
+        """Return tractions (n, 2, height, width), residuals and steps; limits are (n, 1, height, width)."""
         touching = limit > 0
         wanted = torch.where(touching, moved, 0.0)
         cells = touching.sum(dim=(1, 2, 3)).clamp_min(1)
         scale = torch.sqrt(_dot(wanted, wanted)[:, 0, 0, 0] / cells).clamp_min(1e-30)
-        cell = float(self._kernels[0, 0, 0])  # [mm/MPa]: how far a cell gives way to its own traction
-        # As if the contact moved as one: what an even traction moves is about g, then.
+        cell = float(self._kernels[0, 0, 0])  # [mm/MPa]: displacement of a cell under its own traction
+        # The start takes the contact as moving together, with a response close to that of an even traction.
         response = self._displace(wanted)
         length = _dot(wanted, wanted) / _dot(wanted, response).clamp_min(1e-30)
         traction = _project(length * wanted, limit)
@@ -208,7 +208,7 @@ class FrictionSolver:
             descent = _dot(direction, slip)
             before = _dot(traction, slip - wanted) / 2
             whole = before + descent + curve / 2
-            # A whole step, unless it climbs above all of the last energies: then the best one on its way.
+            # A whole step, unless it exceeds all of the last energies; then the minimum along it.
             share = torch.where(whole <= energies.amax(dim=1, keepdim=True), 1.0, (-descent / curve).clamp(0.0, 1.0))
             traction = traction + share * direction
             slip = slip + share * response
@@ -217,7 +217,7 @@ class FrictionSolver:
         return result, residual, steps
 
     def _displace(self, traction: torch.Tensor) -> torch.Tensor:
-        """Displacement within boxes (n, 2, height, width) under tractions in them."""
+        """Return the displacement within boxes (n, 2, height, width) under tractions in them."""
         height, width = traction.shape[2:]
         padded = (2 * height, 2 * width)
         if (height, width) not in self._spectra:
@@ -233,16 +233,16 @@ class FrictionSolver:
 
 
 def _kernels(layer: Layer, period: int, cell_mm: float) -> NDArray[np.float64]:
-    """Displacement around one cell under its traction, (3, period, period) in [mm/MPa]: xx, yy and xy."""
+    """Return the displacement around one cell under its traction, (3, period, period) in [mm/MPa]: xx, yy and xy."""
     q_x, q_y = _waves(period, cell_mm)
     xx, yy, xy = surface_tensor(layer, q_x, q_y)
-    # The highest wave is its own mirror image: an odd transfer has none of it.
+    # The highest wave is its own mirror image, so an odd transfer is zero there.
     xy[period // 2] = xy[:, -1] = 0.0
     return np.fft.irfft2(np.stack([xx, yy, xy]), s=(period, period))
 
 
 def _waves(period: int, cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Wave numbers to the right (1, m) and back (period, 1), in [1/mm]."""
+    """Return wave numbers to the right (1, m) and back (period, 1), in [1/mm]."""
     q_x, q_y = np.fft.rfftfreq(period, cell_mm), np.fft.fftfreq(period, cell_mm)
     return 2 * np.pi * np.asarray(q_x, dtype=np.float64)[None, :], 2 * np.pi * np.asarray(q_y, dtype=np.float64)[
         :, None
@@ -250,7 +250,7 @@ def _waves(period: int, cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def _project(traction: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:
-    """The nearest tractions that friction can bear."""
+    """Return the nearest tractions that friction can bear."""
     size = torch.sqrt(traction[:, :1] ** 2 + traction[:, 1:] ** 2)
     return traction * (limit / torch.maximum(size, limit).clamp_min(1e-30))
 

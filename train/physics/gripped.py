@@ -1,11 +1,11 @@
 """Presses of any shape onto one pad, at one moment: pressure, traction, readings, and truth.
 
-A tap of `train.physics.simulated_sensor` follows a press from first touch to its end; here each press is one moment,
-with a pad of its own, a tilt, a tangential load and a twist. Shapes are heights at any place (`train.families`), looked
-at on a grid of SAMPLES x SAMPLES places a cell, from which follow each cell's depth and how much of it is covered.
+A tap of `train.physics.simulated_sensor` follows a press from first contact to its end; here each press is one
+moment, with its own pad, tilt, tangential load and twist. Shapes are heights at any place (`train.families`), sampled
+on a grid of SAMPLES x SAMPLES places a cell, which give each cell's depth and covered share.
 
-A soft object gives way as a thick layer of its own; a cloth or glove on the pad gives way and spreads what it carries.
-Friction is solved after the pressure, which it leaves as it is (Goodman 1962).
+A soft object deforms like a thick layer; a cloth or glove on the pad deforms and spreads the load. Friction is solved
+after the pressure, which it leaves unchanged (Goodman 1962).
 """
 
 from collections.abc import Sequence
@@ -29,20 +29,20 @@ from train.physics.taxel_response import Skin
 from train.physics.touched import carrying, pressed_in, which_of
 
 SAMPLES: Final = 4
-"""Places along a cell's side at which a shape is looked at."""
+"""Places along a cell's side at which a shape is sampled."""
 MOST_FORCE_N: Final = 40.0
-"""Largest force on the pad."""
+"""Largest force on the pad, in [N]."""
 SCALE: Final = 10
 TRACTION_SCALE: Final = 2
-"""Traction pixels per taxel pitch: the layer passes 3 % of a wave as short as two of them, so finer is not measured."""
+"""Traction pixels per taxel pitch: the layer passes 3 % of a wave of two such pixels, so finer is not measurable."""
 _CELLS_PER_PITCH: Final = 10
 _LIGHTER: Final = 0.9
-"""Depth is lowered by this power of the force's excess; force grows faster than depth."""
+"""Power of the force's excess by which depth is lowered; force grows faster than depth."""
 _MOST_TRIES: Final = 6
 
 
 class PressError(TrainError, ValueError):
-    """A press that the pad's linear layer does not hold for."""
+    """Press outside the range in which the pad's layer is linear."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Presses:
     Attributes:
         counts: (n, 3, rows, cols), zeroed and clean.
         patterns: (n, H, W) at SCALE, in [mm].
-        touching: (n, H, W), where the pad is touched.
+        touching: (n, H, W), contact area on the pad.
         traction_kpa: (n, 3, h, w) at TRACTION_SCALE, x to the right, y down the rows, z into the pad, in [kPa].
         force_n: (n, 3), in [N].
         twist_nmm: (n,), about the pad's centre from x towards y, in [N mm].
@@ -75,7 +75,7 @@ class GrippedPad:
         pad: its constants.
 
     Attributes:
-        places_mm: x (1, m) and y (m, 1) on the pad at which shapes are looked at, in [mm].
+        places_mm: x (1, m) and y (m, 1) on the pad at which shapes are sampled, in [mm].
     """
 
     def __init__(self, pad: Pad) -> None:
@@ -112,19 +112,19 @@ class GrippedPad:
         covers: Sequence[Cover] | None = None,
         most_force_n: float = MOST_FORCE_N,
     ) -> Presses:
-        """Press shapes onto the pad; one that would take more force than allowed is pressed less deep.
+        """Press shapes onto the pad; a press that would exceed the largest force is made less deep.
 
         Args:
-            heights_mm: (n, m, m) at `places_mm`, higher parts meet the pad first, in [mm].
+            heights_mm: (n, m, m) at `places_mm`, in [mm]; higher parts touch the pad first.
             indentation_mm: (n,), of the highest part from first contact, above 0, in [mm].
-            slide_mm: (n, 2), how far the shape is moved to the right and down the rows after it touches, in [mm].
-            twist_rad: (n,), how far it is turned about the pad's centre from x towards y.
+            slide_mm: (n, 2), movement of the shape to the right and down the rows after contact, in [mm].
+            twist_rad: (n,), turn about the pad's centre from x towards y.
             friction: (n,), Coulomb's coefficient.
             covers: one for each press; all bare if None.
             most_force_n: largest normal force, in [N].
 
         Raises:
-            PressError: an indentation is beyond what the layer is linear to, or nothing lies under the pad.
+            PressError: an indentation is outside the layer's linear range, or nothing lies under the pad.
         """
         within = (indentation_mm > 0) & (indentation_mm <= MAX_INDENTATION_MM)
         if not within.all():
@@ -156,7 +156,7 @@ class GrippedPad:
         indentation_mm: NDArray[np.float64],
         most_force_n: float,
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Pressures on the shape, and the indentations at which no force is larger than allowed."""
+        """Return pressures on the shape, and the indentations at which no force exceeds the limit."""
         solver = self._solver(cover)
         indentation_mm = np.maximum(indentation_mm, cells_mm.min(axis=(1, 2)) + 1e-3)
         pressure = np.empty_like(cells_mm)
@@ -208,7 +208,7 @@ class GrippedPad:
         )
 
     def _coarse(self, loads: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Means of loads (n, 3, size, size) on the traction's grid; what acts beyond it is the outermost pixels'."""
+        """Return means of loads (n, 3, size, size) on the traction's grid, whose outer pixels include loads outside."""
         count = USPA44.rows * TRACTION_SCALE
         side = self._pattern_cells // count
         owner = np.clip((np.arange(self.size) - (self.size - self._pattern_cells) // 2) // side, 0, count - 1)

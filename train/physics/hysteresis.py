@@ -1,6 +1,6 @@
-"""Hysteresis: a share of every reading lags behind, as in a spring beside one Maxwell element.
+"""Hysteresis: a share of every reading lags, as in a spring parallel to one Maxwell element.
 
-Two ways to the same readings: step by step over any course of time, and in closed form for any moment of a press.
+Two routes to the same readings: step by step over any course of time, and in closed form for any moment of a press.
 """
 
 from typing import Final
@@ -15,26 +15,26 @@ _RELAXATION_S: Final = (0.2, 5.0)
 
 
 class NuisanceError(TrainError, ValueError):
-    """Nuisances that cannot be, or readings that they cannot act on."""
+    """Invalid nuisances, or readings that they cannot act on."""
 
 
 def maxwell(
     readings: NDArray[np.floating], time_s: NDArray[np.floating], share: float, relaxation_s: float
 ) -> NDArray[np.float64]:
-    """Hysteresis over any course of time: (1 - share) c + share q, with dq/dt = (c - q) / relaxation_s.
+    """Apply hysteresis over any course of time: (1 - share) c + share q, with dq/dt = (c - q) / relaxation_s.
 
-    The update is exact for readings that go along straight lines, so stable for any step; q starts in equilibrium.
+    The update is exact for readings linear in time, and so stable for any step; q starts in equilibrium.
 
     Args:
         readings: c, (t, ...).
         time_s: of the readings, (t,), ascending, in [s].
-        share: that lags, 0 to 1.
+        share: lagging share, 0 to 1.
         relaxation_s: above 0, in [s].
 
     Raises:
-        NuisanceError: one of these cannot be.
+        NuisanceError: one of these is out of range.
 
-    Source: the standard linear solid, a spring beside one Maxwell element.
+    Source: the standard linear solid, a spring parallel to one Maxwell element.
     """
     step_s = np.diff(time_s)
     if len(time_s) != len(readings) or not len(time_s) or not (step_s > 0).all():
@@ -57,16 +57,16 @@ def frame_weights(
     share: NDArray[np.float64],
     relaxation_s: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """`maxwell` in closed form: how much each frame of a press counts in a reading at any moment of it.
+    """Return the weight of each frame of a press in a reading at any moment of it, `maxwell` in closed form.
 
-    Readings between frames go along straight lines: a sum of ramps that start at the frames, so a frame's weight is
-    the second difference of the answers to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).
+    Readings are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second
+    difference of the responses to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).
 
     Args:
         frame: moments of n sensors' K taps, (n, K, m), in frames since the pad was free.
         frames: of a press; the first one is a step after the pad was free.
         step_s: time from frame to frame, (n, K), in [s].
-        share: that lags, (n,).
+        share: lagging share, (n,).
         relaxation_s: (n,), above 0 where a share lags, in [s].
 
     Returns:
@@ -80,7 +80,7 @@ def frame_weights(
 
 
 def draw_lag(rng: np.random.Generator, largest: float, n: int) -> NDArray[np.float64]:
-    """Share that lags, up to `largest`, and relaxation time in [s] of n sensors, (2, n)."""
+    """Return the lagging share, up to `largest`, and the relaxation time in [s] of n sensors, (2, n)."""
     share = rng.uniform(min(_LEAST_SHARE, largest), largest, n)
     low, high = np.log(_RELAXATION_S)
     return np.stack([share, np.exp(rng.uniform(low, high, n))])

@@ -1,12 +1,12 @@
-"""Response of the magnets to pressure and traction on the pad's surface: Fourier sums, straight at the magnets' places.
+"""Response of the magnets to pressure and traction on the pad's surface: Fourier sums at the magnets' places.
 
-The domain is four pads wide, and magnets lie between cells. A magnet is stiff and turns with the pad around it as a
-spheroid of its aspect a = thickness / diameter does: its axis leans by (1 + L)/2 du_x/dz - (1 - L)/2 du_z/dx, with
-L = (a^2 - 1)/(a^2 + 1). A flat disc (L = -1) follows the slope of its plane, a sphere (L = 0) half the curl, a needle
-(L = 1) the material along it. A transfer is even or odd in each axis, so that a quarter
-of its waves, with real sines and cosines, stands for all: a tenth of the products of whole complex waves.
+The domain is four pads wide, and magnets lie between cells. A magnet is stiff and turns with the pad around it like a
+spheroid of its aspect a = thickness / diameter: its axis leans by (1 + L)/2 du_x/dz - (1 - L)/2 du_z/dx, with L = (a^2
+- 1)/(a^2 + 1). A flat disc (L = -1) follows the slope of its plane, a sphere (L = 0) half the curl, a needle (L = 1)
+the material along it. A transfer is even or odd in each axis, so that a quarter of its waves, with real sines and
+cosines, is enough: a tenth of the products of whole complex waves.
 
-Source: Jeffery 1922, the turning of a spheroid in Stokes flow, whose equations an incompressible solid shares.
+Source: Jeffery 1922, the turning of a spheroid in Stokes flow, whose equations are those of an incompressible solid.
 """
 
 from typing import Final
@@ -27,13 +27,13 @@ _ODD: Final = 1
 
 _Array = NDArray[np.float64]
 _Transfer = tuple[int, int, _Array]
-"""Whether it is even or odd in x and in y, and the amplitudes (q_y, q_x) of its quarter of waves."""
+"""Parity in x and in y, even or odd, and the amplitudes (q_y, q_x) of a transfer's quarter of waves."""
 
 
 def pressure_response(
     geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet
 ) -> NDArray[np.float64]:
-    """MOVEMENT of each magnet per pressure in each cell, (taxels, 5, cells) in [mm/MPa] and [1/MPa].
+    """Return the MOVEMENT of each magnet per pressure in each cell, (taxels, 5, cells) in [mm/MPa] and [1/MPa].
 
     Args:
         geometry: the taxels.
@@ -61,7 +61,9 @@ def pressure_response(
 def traction_response(
     geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet
 ) -> NDArray[np.float64]:
-    """MOVEMENT of each magnet per tangential traction in each cell, (taxels, 5, 2, cells) in [mm/MPa] and [1/MPa].
+    """Return the MOVEMENT of each magnet per tangential traction in each cell, (taxels, 5, 2, cells).
+
+    Units are [mm/MPa] and [1/MPa].
 
     The third axis is the traction's: to the right, back.
 
@@ -90,7 +92,7 @@ def traction_response(
         (_EVEN, _EVEN, lean_across + lean * q_x**2),
         (_ODD, _ODD, -lean * q_x * q_y),
     )
-    # Under traction back the same, with x and y changed over.
+    # Under traction back the response is the same, with x and y exchanged.
     changed = [(y, x, amplitude.T) for x, y, amplitude in under_right]
     under_back = (changed[1], changed[0], changed[2], changed[4], changed[3])
     both = [transfer for pair in zip(under_right, under_back, strict=True) for transfer in pair]
@@ -99,18 +101,18 @@ def traction_response(
 
 
 def _quarter(size: int, cell_mm: float) -> tuple[_Array, _Array, _Array]:
-    """Wave numbers 0 to the highest: to the right (1, m), back (m, 1), and their length (m, m), in [1/mm]."""
+    """Return wave numbers 0 to the highest: to the right (1, m), back (m, 1), and their length (m, m), in [1/mm]."""
     q = 2 * np.pi * np.asarray(np.fft.rfftfreq(_PADS_WIDE * size, cell_mm), dtype=np.float64)
     return q[None, :], q[:, None], np.hypot(q[None, :], q[:, None])
 
 
 def _per_wave(part: _Array, q: _Array) -> _Array:
-    """Its share per wave number, 0 for the wave that is even and has no direction."""
+    """Divide a part by the wave number, 0 for the wave that is even and has no direction."""
     return np.divide(part, q, out=np.zeros_like(part), where=q > 0)
 
 
 def _sums(geometry: SensorGeometry, size: int, cell_mm: float, transfers: list[_Transfer]) -> _Array:
-    """Responses (taxels, transfers, cells) of the magnets to the cells."""
+    """Return responses (taxels, transfers, cells) of the magnets to the cells."""
     q = _quarter(size, cell_mm)[0][0]
     # All waves but the first and the last of an axis stand for two, of q and of -q.
     twice = np.full_like(q, 2.0)

@@ -1,8 +1,8 @@
-"""The magnets of the pad over the Hall chips of the board: how far the magnets moved, to what the chips see.
+"""Magnets of the pad over the Hall chips of the board: from the magnets' movement to the field at the chips.
 
-Every magnet is seen by every chip, so cross-talk between taxels is in the sum and needs no model of its own.
+Every chip senses every magnet, so cross-talk between taxels is in the sum and needs no model of its own.
 Magnets are axial, north up: pressed down, z rises; moved to +x, x rises. A dipole is fast and, at the distances of
-this pad, near; the exact cylinder is there to say how near. x to the right, y down the rows, z up.
+this pad, accurate enough; the exact cylinder shows its error. x to the right, y down the rows, z up.
 """
 
 from collections.abc import Callable
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import SensorGeometry
 
 MOVEMENT: Final = ("right_mm", "back_mm", "down_mm", "lean_x", "lean_y")
-"""How a magnet moved: along x and y, towards the board, and the slopes dx/dz and dy/dz of its axis."""
+"""Components of a magnet's movement: along x and y, towards the board, and the slopes dx/dz and dy/dz of its axis."""
 _DOWN: Final = MOVEMENT.index("down_mm")
 
 
 @dataclass(frozen=True, slots=True)
 class Magnet:
-    """A small axial magnet in the pad and the chip under it; no data sheet names them, so the sizes are plausible ones.
+    """Small axial magnet in the pad and the chip under it; no data sheet states them, so the sizes are plausible ones.
 
     Attributes:
         diameter_mm: of the cylinder.
@@ -48,12 +48,12 @@ class Magnet:
 
     @property
     def gap_mm(self) -> float:
-        """From the magnet's centre to the chip, at rest."""
+        """Distance from the magnet's centre to the chip at rest, in [mm]."""
         return self.height_mm - self.chip_height_mm
 
     @property
     def clearance_mm(self) -> float:
-        """From the magnet's lower face to the chip, at rest: it can go no further down."""
+        """Distance from the magnet's lower face to the chip at rest, in [mm], its largest possible movement down."""
         return self.gap_mm - self.thickness_mm / 2
 
     @property
@@ -64,21 +64,21 @@ class Magnet:
 
     @property
     def strength_mt_mm3(self) -> float:
-        """Strength k of the far field: on the axis B = 2 k / distance^3."""
+        """Strength k of the far field, in [mT mm^3]: on the axis B = 2 k / distance^3."""
         volume_mm3 = np.pi / 4 * self.diameter_mm**2 * self.thickness_mm
         return 1e3 * self.remanence_t * volume_mm3 / (4 * np.pi)
 
 
 Vectors = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
-"""x, y and z, of shapes that broadcast."""
+"""Components x, y and z, of shapes that broadcast."""
 
 
 def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
-    """Flux density of magnets taken as dipoles, B = k (3 (m r) r / r^5 - m / r^3), in [mT].
+    """Return the flux density of magnets taken as dipoles, B = k (3 (m r) r / r^5 - m / r^3), in [mT].
 
     Args:
         magnet: its size and material; k is its strength.
-        away_mm: from the magnet's centre to where the field is asked for, in [mm].
+        away_mm: vector from the magnet's centre to the evaluation point, in [mm].
         axis: unit vectors m from south to north.
 
     Source: Jackson, Classical Electrodynamics, Eq. 5.56.
@@ -91,16 +91,16 @@ def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
 
 
 def cylinder_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
-    """Flux density of cylinders magnetised along their axis, exact inside and out, in [mT].
+    """Return the flux density of cylinders magnetised along their axis, exact inside and out, in [mT].
 
     Args:
         magnet: its size and material.
-        away_mm: from the magnet's centre to where the field is asked for, in [mm].
+        away_mm: vector from the magnet's centre to the evaluation point, in [mm].
         axis: unit vectors from south to north.
 
-    Source: Derby and Olbert 2010, as magpylib.core has it.
+    Source: Derby and Olbert 2010, as implemented in magpylib.core.
     """
-    # Only the referee needs it, and it takes longer to load than a tap takes to read.
+    # Imported here, because only the reference needs it, and loading it takes longer than reading a tap.
     from magpylib.core import magnet_cylinder_axial_Bfield
 
     (x, y, z), (m_x, m_y, m_z) = away_mm, axis
@@ -113,7 +113,7 @@ def cylinder_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
         ratio, (aside / radius_mm).ravel().astype(float), (along / radius_mm).ravel().astype(float)
     )
     forward = 1e3 * magnet.remanence_t * forward.reshape(along.shape)
-    # On the axis nothing points outward, whichever way that is.
+    # The field has no outward part on the axis, where the direction outward is undefined.
     outward = 1e3 * magnet.remanence_t * outward.reshape(along.shape) / np.maximum(aside, 1e-12)
     b_x, b_y, b_z = (outward * o + forward * m for o, m in zip(off, axis, strict=True))
     return b_x, b_y, b_z
@@ -126,8 +126,10 @@ FIELDS: Final[dict[str, Callable[[Magnet, Vectors, Vectors], Vectors]]] = {
 
 
 _DIPOLE_CLEARANCE: Final = 0.75
-"""Diameters from a magnet's face to the chip below which a dipole is off by more than 30 %; at the default magnet's
-rest 7 %, pressed by .5 mm 12 % (reports/stability.md)."""
+"""Clearance, in diameters of the magnet, below which a dipole is off by more than 30 %.
+
+At the default magnet's rest it is off by 7 %, pressed by .5 mm by 12 % (reports/stability.md).
+"""
 
 
 class MagnetArray:
@@ -135,10 +137,10 @@ class MagnetArray:
 
     Args:
         geometry: the taxels.
-        magnet: what each of them holds.
+        magnet: the same in every taxel.
         field: a name in FIELDS.
-        rest: where each magnet sits and how it leans at rest, as a movement, (taxels, 5); None for all alike.
-        moments: of each magnet as a share of the nominal one, (taxels,); None for all alike.
+        rest: place and lean of each magnet at rest, as a movement, (taxels, 5); None for no deviation.
+        moments: of each magnet as a share of the nominal one, (taxels,); None for nominal moments.
 
     Raises:
         ValueError: no field of that name, or a magnet is too near to its chip for a dipole.
@@ -166,7 +168,7 @@ class MagnetArray:
         self._apart_mm = (centres_mm[:, :, None] - centres_mm[:, None, :]).astype(np.float32)
 
     def change_mt(self, movement: NDArray[np.floating]) -> NDArray[np.floating]:
-        """What the movement of the magnets changes at the chips; none changes exactly nothing.
+        """Return the change of the field at the chips by the magnets' movement; exactly zero without movement.
 
         Args:
             movement: (..., taxels, 5), each magnet's MOVEMENT.
@@ -195,7 +197,7 @@ class MagnetArray:
             )
 
     def flux_mt(self, movement: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Flux density of all magnets at each chip, (..., taxels, 3) in [mT], for movements (..., taxels, 5)."""
+        """Return the flux density of all magnets at each chip, (..., taxels, 3) in [mT], from (..., taxels, 5)."""
         right, back, down, lean_x, lean_y = np.moveaxis(movement, -1, 0)[..., None, :]
         upright = 1 / np.sqrt(1 + lean_x**2 + lean_y**2)
         gap_mm = down.dtype.type(self.magnet.gap_mm)

@@ -1,9 +1,8 @@
-"""The Mooney-Rivlin solid: energy, stress and stiffness of its distortional and volumetric parts, in closed form.
+"""Mooney-Rivlin solid: energy, stress and stiffness of its distortional and volumetric parts, in closed form.
 
-psi(F) = C1 (I1 J^(-2/3) - 3) + C2 (I2 J^(-4/3) - 3), with I1, I2 the invariants of C = F^T F and J = det F: the shape
-alone is paid for. Change of volume, K (J - 1)^2 / 2, is a part of its own: the mixed elements see it cell by cell, and
-bring it themselves.
-Arrays are (3, 3, ...) as finite-element codes have them: the tensor's axes first, the points behind.
+psi(F) = C1 (I1 J^(-2/3) - 3) + C2 (I2 J^(-4/3) - 3), with I1, I2 the invariants of C = F^T F and J = det F, depends on
+the shape alone. The energy of volume changes, K (J - 1)^2 / 2, is a separate part, which the mixed elements supply
+themselves, cell by cell. Arrays are (3, 3, ...) as in finite-element codes: the tensor's axes first, the points last.
 
 Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (the split).
 """
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from train.physics.elastic_layer import Layer
 
 C2_SHARE: Final = 0.2
-"""Of C1 + C2. At small strain their sum alone counts; silicones are fitted with shares of 0 to about 0.3."""
+"""Share of C2 in C1 + C2. At small strain only the sum counts; silicones are fitted with shares of 0 to about 0.3."""
 
 Tensors = NDArray[np.floating]
 
@@ -38,7 +37,7 @@ class MooneyRivlin:
 
     @classmethod
     def of_layer(cls, layer: Layer, c2_share: float = C2_SHARE) -> "MooneyRivlin":
-        """The solid that at small strain is the layer's: G = 2 (C1 + C2), K/G = 2 (1+nu) / (3 (1-2nu)).
+        """Return the solid that equals the layer at small strain: G = 2 (C1 + C2), K/G = 2 (1+nu) / (3 (1-2nu)).
 
         Raises:
             ValueError: c2_share is not within 0..1.
@@ -50,12 +49,12 @@ class MooneyRivlin:
         return cls((1 - c2_share) * shear / 2, c2_share * shear / 2, bulk)
 
     def energy(self, gradient: Tensors) -> Tensors:
-        """Distortional energy per undeformed volume, (...) in [MPa], of deformation gradients F (3, 3, ...)."""
+        """Return the distortional energy per undeformed volume, (...) in [MPa], of gradients F (3, 3, ...)."""
         _, volume, i1, i2 = _invariants(gradient)
         return self.c1_mpa * (i1 * volume ** (-2 / 3) - 3) + self.c2_mpa * (i2 * volume ** (-4 / 3) - 3)
 
     def stress(self, gradient: Tensors) -> Tensors:
-        """First Piola-Kirchhoff stress d psi / dF, (3, 3, ...) in [MPa]."""
+        """Return the first Piola-Kirchhoff stress d psi / dF, (3, 3, ...) in [MPa]."""
         _, volume, i1, i2 = _invariants(gradient)
         inverse = _inverse_transposed(gradient)
         slope1, slope2 = _slopes(gradient)
@@ -64,7 +63,7 @@ class MooneyRivlin:
         return self.c1_mpa * first + self.c2_mpa * second
 
     def stiffness(self, gradient: Tensors) -> Tensors:
-        """Its slope d^2 psi / dF dF, (3, 3, 3, 3, ...) in [MPa]."""
+        """Return the stiffness d^2 psi / dF dF, (3, 3, 3, 3, ...) in [MPa]."""
         cauchy, volume, i1, i2 = _invariants(gradient)
         inverse = _inverse_transposed(gradient)
         slope1, slope2 = _slopes(gradient)
@@ -80,16 +79,16 @@ class MooneyRivlin:
         return self.c1_mpa * first + self.c2_mpa * second
 
     def volumetric_energy(self, gradient: Tensors) -> Tensors:
-        """U = K (J - 1)^2 / 2 per undeformed volume, (...) in [MPa], of deformation gradients F (3, 3, ...)."""
+        """Return U = K (J - 1)^2 / 2 per undeformed volume, (...) in [MPa], of deformation gradients F (3, 3, ...)."""
         return self.bulk_mpa / 2 * (_volume(gradient) - 1) ** 2
 
     def volumetric_stress(self, gradient: Tensors) -> Tensors:
-        """First Piola-Kirchhoff stress dU / dF, (3, 3, ...) in [MPa]."""
+        """Return the first Piola-Kirchhoff stress dU / dF, (3, 3, ...) in [MPa]."""
         volume = _volume(gradient)
         return self.bulk_mpa * (volume - 1) * volume * _inverse_transposed(gradient)
 
     def volumetric_stiffness(self, gradient: Tensors) -> Tensors:
-        """Its slope d^2 U / dF dF, (3, 3, 3, 3, ...) in [MPa]."""
+        """Return the stiffness d^2 U / dF dF, (3, 3, 3, 3, ...) in [MPa]."""
         volume = _volume(gradient)
         inverse = _inverse_transposed(gradient)
         pair = _outer(inverse, inverse)
@@ -97,12 +96,12 @@ class MooneyRivlin:
 
 
 def _volume(gradient: Tensors) -> Tensors:
-    """J."""
+    """Return J."""
     return np.linalg.det(np.moveaxis(gradient, (0, 1), (-2, -1)))
 
 
 def _invariants(gradient: Tensors) -> tuple[Tensors, Tensors, Tensors, Tensors]:
-    """C, J, I1 and I2."""
+    """Return C, J, I1 and I2."""
     cauchy = np.einsum("ki...,kj...->ij...", gradient, gradient)
     volume = _volume(gradient)
     i1 = np.einsum("ii...->...", cauchy)
@@ -110,7 +109,7 @@ def _invariants(gradient: Tensors) -> tuple[Tensors, Tensors, Tensors, Tensors]:
 
 
 def _slopes(gradient: Tensors) -> tuple[Tensors, Tensors]:
-    """Derivatives of I1 and I2 by F."""
+    """Return the derivatives of I1 and I2 by F."""
     cauchy, _, i1, _ = _invariants(gradient)
     return 2 * gradient, 2 * (i1 * gradient - np.einsum("ik...,kj...->ij...", gradient, cauchy))
 
@@ -122,7 +121,7 @@ def _inverse_transposed(gradient: Tensors) -> Tensors:
 def _curvature(
     inverse: Tensors, volume: Tensors, power: float, invariant: Tensors, slope: Tensors, curve: Tensors
 ) -> Tensors:
-    """Second derivative of J^-power I by F, from I's own slope and curve and from dJ/dF = J F^-T."""
+    """Return the second derivative of J^-power I by F, from I's own slope and curve and from dJ/dF = J F^-T."""
     mixed = _outer(slope, inverse)
     pair = _outer(inverse, inverse)
     by_volume = power * invariant * (power * pair + np.swapaxes(pair, 1, 3))

@@ -1,4 +1,4 @@
-"""Pads: every constant of a simulated sensor, drawn for each; and what a network may know of them."""
+"""Pads: constants of a simulated sensor, drawn for each, and their form as inputs of a network."""
 
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
@@ -13,15 +13,18 @@ from train.physics.side_correction import FreeSides
 from train.physics.taxel_response import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
 
 _UNEVEN_MM: Final = 0.015
-"""Largest RMS of a pad's own unevenness: a moulded silicone face."""
+"""Largest RMS of a pad's own unevenness, for a moulded silicone face, in [mm]."""
 _UNEVEN_WAVES: Final = 8
 _TILT_RAD: Final = 0.05
-"""Standard deviation of a magnet's lean: three degrees of a part of a millimetre set by a machine."""
+"""Standard deviation of a magnet's lean: three degrees, for a part of a millimetre placed by a machine."""
 _SEAT_MM: Final = 0.02
-"""Standard deviation of one magnet's height about the pad's: with its moment it makes a gain of .04, and with the
-chips' of .075 the 15 % either way that is seen on devices; .05 mm would make a tenth by itself."""
+"""Standard deviation of one magnet's height about the pad's, in [mm].
+
+With the moment it makes a gain of .04, and with the chips' .075 the 15 % either way that is seen on devices; .05 mm
+would make a tenth alone.
+"""
 _MOMENT: Final = 0.015
-"""Standard deviation of one magnet's moment, of one batch."""
+"""Standard deviation of one magnet's moment, relative to the nominal one, within one batch."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +39,9 @@ class Pad:
         magnet_height_mm: of the magnets' centres above the board.
         counts_per_newton: summed z under an even load.
         pitch_mm: distance of neighbouring taxels.
-        free_sides: how far the pad's free sides give way, 0 for an infinite layer, 1 for finite elements' pad.
+        free_sides: compliance of the pad's free sides, 0 for an infinite layer, 1 for the finite elements' pad.
         uneven_mm: RMS of the pad's own unevenness.
-        seed: of the unevenness and of what differs from magnet to magnet; None for a perfect pad.
+        seed: of the unevenness and of the differences between magnets; None for a perfect pad.
     """
 
     thickness_mm: float = 4.5
@@ -54,25 +57,25 @@ class Pad:
 
     @property
     def layer(self) -> Layer:
-        """The soft layer."""
+        """Soft layer of the pad."""
         return Layer(self.thickness_mm, self.shear_modulus_mpa, self.poisson)
 
     @property
     def sides(self) -> FreeSides | None:
-        """The pad's free sides, None where they do not give way."""
+        """Free sides of the pad, None for an infinite layer."""
         return FreeSides(self.free_sides) if self.free_sides else None
 
     @property
     def magnet(self) -> Magnet:
-        """The magnet of every taxel, before what differs from one to the next."""
+        """Nominal magnet of every taxel."""
         return Magnet(height_mm=self.magnet_height_mm)
 
     def geometry(self, nominal: SensorGeometry = USPA44) -> SensorGeometry:
-        """The taxels, as they really sit."""
+        """Return the geometry with the pad's true pitch."""
         return replace(nominal, pitch_mm=self.pitch_mm)
 
     def rest(self, taxels: int) -> NDArray[np.float64]:
-        """Movement of each magnet that stands for where it sits and how it leans at rest, (taxels, 5)."""
+        """Return the place and lean of each magnet at rest, as a movement, (taxels, 5)."""
         away = np.zeros((taxels, 5))
         if self.seed is not None:
             draws = np.random.default_rng([self.seed, 1]).standard_normal((taxels, 3)).clip(-2, 2)
@@ -80,13 +83,13 @@ class Pad:
         return away
 
     def moments(self, taxels: int) -> NDArray[np.float64]:
-        """Each magnet's moment as a share of the nominal one, (taxels,)."""
+        """Return each magnet's moment as a share of the nominal one, (taxels,)."""
         if self.seed is None:
             return np.ones(taxels)
         return 1 + _MOMENT * np.random.default_rng([self.seed, 2]).standard_normal(taxels).clip(-2, 2)
 
     def uneven(self, x_mm: NDArray[np.floating], y_mm: NDArray[np.floating]) -> NDArray[np.float32]:
-        """How far the pad's own face lies below its mean at places on it, in [mm]."""
+        """Return the depth of the pad's face below its mean at places on it, in [mm]."""
         down = np.zeros(np.broadcast_shapes(x_mm.shape, y_mm.shape), dtype=np.float32)
         if self.seed is None or not self.uneven_mm:
             return down
@@ -99,12 +102,12 @@ class Pad:
         return down
 
     def facts(self) -> dict[str, Any]:
-        """The constants, as JSON holds them."""
+        """Return the constants as a dict for JSON."""
         return asdict(self)
 
 
 NOMINAL: Final = Pad()
-"""The pad of the first frozen set."""
+"""Pad of the first frozen set."""
 
 RANGES: Final[dict[str, tuple[float, float]]] = {
     "thickness_mm": (3.6, 5.4),
@@ -116,7 +119,7 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "pitch_mm": (4.6, 5.0),
     "free_sides": (0.0, 0.6),
 }
-"""Bounds of what is drawn uniformly; each with its reason in docs/train.md."""
+"""Bounds of the constants that are drawn uniformly; docs/train.md has the reason for each."""
 
 INPUTS: Final = (
     "thickness_mm",
@@ -126,14 +129,14 @@ INPUTS: Final = (
     "magnet_height_mm",
     "counts_per_newton",
 )
-"""The constants that a network takes, where they are known."""
+"""Constants that a network takes as optional inputs."""
 
 KNOWN: Final = 2 * len(INPUTS) + 1
-"""Numbers that say what is known of a pad: values, whether each is known, and whether the gains are."""
+"""Number of pad inputs of a network: values, a flag for each of them, and a flag for the gains."""
 
 
 def draw_pad(rng: np.random.Generator, spread: float = 1.0) -> Pad:
-    """A pad of its own: each constant within its range, drawn together towards the nominal pad by `spread` below 1."""
+    """Draw a pad with each constant within its range; a `spread` below 1 moves all towards the nominal pad."""
     drawn = {}
     for name, (low, high) in RANGES.items():
         nominal = getattr(NOMINAL, name)
@@ -142,12 +145,12 @@ def draw_pad(rng: np.random.Generator, spread: float = 1.0) -> Pad:
 
 
 def input_scale() -> list[tuple[str, float, float]]:
-    """Name, centre and spread of each constant that a network takes; a value v enters as (v - centre) / spread."""
+    """Return name, centre and spread of each input constant; a value v enters as (v - centre) / spread."""
     return [(name, getattr(NOMINAL, name), (RANGES[name][1] - RANGES[name][0]) / 2) for name in INPUTS]
 
 
 def constants(pad: Pad) -> NDArray[np.float32]:
-    """The constants that a network takes, each over its spread, (len(INPUTS),)."""
+    """Return the constants that a network takes, each over its spread, (len(INPUTS),)."""
     return np.array(
         [(getattr(pad, name) - centre) / spread for name, centre, spread in input_scale()], dtype=np.float32
     )
@@ -156,12 +159,12 @@ def constants(pad: Pad) -> NDArray[np.float32]:
 def known_numbers(
     scaled: NDArray[np.float32], known: NDArray[np.bool_], gains_known: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """The input (n, KNOWN) that says what is known of n pads; all zeros where nothing is.
+    """Return the pad inputs (n, KNOWN) of a network; all zeros without any constant.
 
     Args:
         scaled: constants over their spread, (n, len(INPUTS)).
-        known: which of them are known, same shape.
-        gains_known: (n,), whether readings were divided by the sensor's gains.
+        known: flags of the constants to pass on, same shape.
+        gains_known: (n,), True where readings were divided by the sensor's gains.
     """
     flags = known.astype(np.float32)
     return np.concatenate([scaled * flags, flags, gains_known.astype(np.float32)[:, None]], axis=1)

@@ -1,7 +1,7 @@
-"""Patterns at another scale: a pixel is the mean over its area, so edges stay where they are and volume is kept.
+"""Patterns at another scale: a pixel is the mean over its area, so edges stay in place and volume is kept.
 
-Averaging over the pixel is the anti-aliasing. Against torch's and scikit-image's resizing it keeps the mean of any
-map exactly, at ratios that are not whole numbers too.
+Averaging over the pixel is the anti-aliasing. Unlike torch's and scikit-image's resizing it keeps the mean of any map
+exactly, also at ratios that are not integers.
 """
 
 from functools import lru_cache
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 def resample(
     patterns: NDArray[np.floating] | NDArray[np.bool_], from_scale: float, to_scale: float
 ) -> NDArray[np.float32]:
-    """Maps (n, H, W) drawn at `from_scale` pixels per pitch, at `to_scale`: (n, H', W'), in the same unit.
+    """Resample maps (n, H, W) from `from_scale` to `to_scale` pixels per pitch: (n, H', W'), in the same unit.
 
-    Towards a finer scale a pixel is repeated: nothing is added to what the coarse map knows.
+    Towards a finer scale a pixel is repeated: no detail is added.
 
     Args:
         patterns: (n, H, W); of a mask, the share of each pixel that is set.
         from_scale: pixels per pitch of the maps.
-        to_scale: pixels per pitch wanted; it must leave a whole number of pixels.
+        to_scale: pixels per pitch of the result; it must give a whole number of pixels.
 
     Raises:
         ValueError: shapes or scales do not fit.
@@ -35,18 +35,18 @@ def resample(
 
 
 def resample_touching(touching: NDArray[np.bool_], from_scale: float, to_scale: float) -> NDArray[np.bool_]:
-    """Masks (n, H, W) at another scale: a pixel touches if at least half of its area does.
+    """Resample masks (n, H, W): a pixel touches if at least half of its area does.
 
     Raises:
         ValueError: shapes or scales do not fit.
     """
-    # Shares are sums of rounded thirds and the like: half an area may come out a rounding below 0.5.
+    # Shares are sums of rounded fractions: half an area may come out slightly below 0.5.
     return resample(touching, from_scale, to_scale) >= 0.5 - 1e-5
 
 
 @lru_cache
 def _shares(length: int, from_scale: float, to_scale: float) -> NDArray[np.float32]:
-    """Share of each old pixel in each new one along a line, (new, old); rows sum to 1."""
+    """Return the share of each old pixel in each new one along a line, (new, old); rows sum to 1."""
     if not (from_scale > 0 and to_scale > 0):
         raise ValueError(f"scales {from_scale} and {to_scale}, expected positive numbers of pixels per pitch")
     ratio = to_scale / from_scale

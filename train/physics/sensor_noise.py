@@ -1,9 +1,9 @@
-"""What real sensors add to the physics: named, seeded, each with a stream of its own, each to be switched off.
+"""Nuisances that real sensors add to the physics: named, seeded with independent streams, each can be switched off.
 
-The order is that of the signal's way. The pad lags (hysteresis), neighbours show through (cross-talk), the chip has
-its gain; a warming pad and the earth's field add to it; then noise, the end of the range, taxels that stick or are
-dead, scans torn on the bus, and rounding to whole counts. Cross-talk comes before gain: it is field, and the chip
-amplifies it with the rest.
+The order is that of the signal's path. The pad lags (hysteresis), neighbours are visible (cross-talk), the chip has its
+gain; a warming pad and the earth's field add to it; then noise, the end of the range, taxels that stick or are dead,
+scans torn on the bus, and rounding to whole counts. Cross-talk comes before gain, because it is a field, which the chip
+amplifies with the rest.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,9 +22,9 @@ from train.surfaces.depth_image import Pose
 Seed = int | Sequence[int] | np.random.SeedSequence
 
 LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
-"""Largest readings known: the data sheet's range of x and y, and z seen in a grasp."""
+"""Largest readings: the data sheet's range of x and y, and z observed in a grasp."""
 TAP_S: Final = (0.2, 2.5)
-"""Bounds of a press' duration: a quick robot, and the press of the paper's Fig. 15."""
+"""Bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15."""
 
 _OFF: Final = {"saturation_counts": (inf, inf, inf)}
 _DRIFT_OF_AXIS: Final = np.array([1 / 8, 1 / 8, 1.0])
@@ -35,31 +35,31 @@ _REST_SPREAD_COUNTS: Final = 300.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nuisances:
-    """How strong each nuisance is, as seen on devices in the field; 0 is off, for saturation infinity.
+    """Strength of each nuisance, with defaults observed on devices in the field; 0 is off, for saturation infinity.
 
-    What every sensor has is on. Spreads are cut at two standard deviations. One sensor reads all taps of a window.
+    Nuisances of every sensor are on. Spreads are cut at two standard deviations. One sensor reads all taps of a window.
 
     Attributes:
-        pose_error_mm: standard deviation of a tap's x and y: a sensor on a hand-mounted gripper. The paper's robot
+        pose_error_mm: standard deviation of a tap's x and y, for a sensor on a hand-mounted gripper. The paper's robot
             repeats to .03 mm.
         pose_error_deg: the same of its angle.
-        hysteresis: largest share of a reading that lags behind (one Maxwell element), per sensor between .01 and
-            this: data sheet 1.1 %, skins in the field up to 11 %.
-        cross_talk: largest share of a reading that shows in its four neighbours beyond what the nominal magnets do,
-            per sensor: 5 % is what half a millimetre of magnet height makes, by the dipole's law.
-        gain_spread: standard deviation of a chip axis' gain about 1, per sensor: +-15 % seen.
+        hysteresis: largest share of a reading that lags (one Maxwell element), per sensor between .01 and this: data
+            sheet 1.1 %, skins in the field up to 11 %.
+        cross_talk: largest share of a reading that shows in its four neighbours in addition to that of the nominal
+            magnets, per sensor: 5 % corresponds to half a millimetre of magnet height, by the dipole's law.
+        gain_spread: standard deviation of a chip axis' gain about 1, per sensor: +-15 % observed.
         thermal_drift_counts: standard deviation of z's drift since the last zeroing; x and y an eighth of it; common
             to all taxels but for a quarter (the rests of one sensor moved by 8 to 32 counts, 25 in the mean). Warming
-            up is 120 counts per 3.5 K; a drift of 94 reads as a contact, and two deviations stay below it: who zeroes
-            again after warming up, and whenever a free pad shows a contact, sees no more.
-        earth_field_counts: length of the earth's field, which stands still in space while the pad turns; zeroed at
+            up is 120 counts per 3.5 K; a drift of 94 reads as a contact, and two deviations stay below it: users who
+            zero again after warming up, and whenever a free pad shows a contact, see no more.
+        earth_field_counts: length of the earth's field, which is constant in space while the pad turns; zeroed at
             another attitude. The rests of one sensor differed by 25 counts in two attitudes, sqrt(2) times the field.
         noise_counts: standard deviation of a reading at rest: 1.7 to 2.6 measured.
         saturation_counts: largest |reading| of x, y, z.
-        stuck_taxels: chance of a taxel to hold a constant from somewhere in its range, per sensor.
-        dead_taxels: chance of a taxel to read its rest level whatever happens, per sensor: about 5 %.
-        torn_scans: chance of a scan to be torn: a run of taxels, in order of their CAN ids, keeps the reading of the
-            frame before. A third of the rows of real recordings.
+        stuck_taxels: probability that a taxel holds a constant from its range, per sensor.
+        dead_taxels: probability that a taxel always reads its rest level, per sensor: about 5 %.
+        torn_scans: probability that a scan is torn: a run of taxels, in order of their CAN ids, keeps the reading of
+            the frame before. A third of the rows of real recordings.
     """
 
     pose_error_mm: float = 0.2
@@ -89,12 +89,12 @@ class Nuisances:
 
     @classmethod
     def none(cls) -> Self:
-        """All switched off: readings are only rounded."""
+        """Return the nuisances with all switched off: readings are only rounded."""
         return cls().without(*NAMES)
 
     @classmethod
     def only(cls, *names: str) -> Self:
-        """The named ones as they are by default, all others off.
+        """Return the nuisances with the named ones at their defaults, all others off.
 
         Raises:
             NuisanceError: a name is unknown, or off by default and so needs a strength.
@@ -106,7 +106,7 @@ class Nuisances:
         return default.without(*(name for name in NAMES if name not in names))
 
     def without(self, *names: str) -> Self:
-        """These, with the named ones off.
+        """Return these nuisances with the named ones off.
 
         Raises:
             NuisanceError: a name is unknown.
@@ -115,7 +115,7 @@ class Nuisances:
 
 
 NAMES: Final = tuple(field.name for field in fields(Nuisances))
-"""All nuisances in the order in which they act."""
+"""Names of all nuisances in the order in which they act."""
 
 _LARGEST: Final = {
     "hysteresis": 1.0,
@@ -141,13 +141,13 @@ def apply_nuisances(
     tap_s: ArrayLike | None = None,
     angle_deg: ArrayLike = 0.0,
 ) -> NDArray[np.float32]:
-    """What n sensors read in every frame of their K taps.
+    """Return the readings of n sensors in every frame of their K taps.
 
     Args:
         clean: (n, K, F, 3, rows, cols) zeroed counts, newest tap first; frames evenly spaced in time, the first one
             a step after the pad was free.
         nuisances: of these sensors.
-        seed: every nuisance draws from a stream of its own under it: switching one off changes no other.
+        seed: every nuisance draws from an independent stream of it, so switching one off changes no other.
         tap_s: durations, broadcast to (n, K), in [s]; None draws them between the bounds of TAP_S.
         angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.surfaces.depth_image.Pose.
 
@@ -170,11 +170,11 @@ def read_windows(
     tap_s: ArrayLike | None = None,
     angle_deg: ArrayLike = 0.0,
 ) -> NDArray[np.float32]:
-    """What n sensors read in one scan of each of their K taps, at any moment of the press.
+    """Return the readings of n sensors in one scan of each of their K taps, at any moment of the press.
 
     Args:
-        clean: as in `apply_nuisances`; between frames readings go along straight lines.
-        share: how much of each press is over, 0 to 1, broadcast to (n, K).
+        clean: as in `apply_nuisances`; readings are interpolated linearly between frames.
+        share: completed share of each press, 0 to 1, broadcast to (n, K).
         nuisances: as in `apply_nuisances`.
         seed: as in `apply_nuisances`.
         tap_s: as in `apply_nuisances`, of the whole press.
@@ -194,7 +194,7 @@ def read_windows(
 
 
 def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nuisances) -> list[Pose]:
-    """Where a sensor sent to these poses really taps."""
+    """Return the true poses of a sensor that was commanded to these poses."""
     off = _cut_normal(rng, (len(poses), 3))
     off *= (nuisances.pose_error_mm, nuisances.pose_error_mm, nuisances.pose_error_deg)
     return [
@@ -204,7 +204,7 @@ def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nui
 
 
 def draw_rest(rng: np.random.Generator, geometry: SensorGeometry) -> NDArray[np.float32]:
-    """Rest level of one sensor, (3, rows, cols) in raw counts: differs per axis and per taxel, as on real ones."""
+    """Draw the rest level of one sensor, (3, rows, cols) in raw counts, different for each axis and taxel."""
     spread = rng.standard_normal(geometry.scan_shape) * _REST_SPREAD_COUNTS
     return (np.array(_REST_COUNTS)[:, None, None] + spread).astype(np.float32)
 
@@ -217,7 +217,7 @@ def _read(
     tap_s: ArrayLike | None,
     angle_deg: ArrayLike,
 ) -> NDArray[np.float32]:
-    """Readings (n, K, m, 3, rows, cols) at the moments `frame` (n, K, m), in frames since the pad was free."""
+    """Return readings (n, K, m, 3, rows, cols) at the moments `frame` (n, K, m), in frames since the pad was free."""
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     n, taps, frames, *scan = clean.shape
 
@@ -226,7 +226,7 @@ def _read(
         return np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=key))
 
     torn = nuisances.torn_scans > 0
-    if torn:  # what its taxels may keep: the frame before the first one asked for
+    if torn:  # torn scans may keep readings of the frame before the first one
         frame = np.concatenate([np.maximum(frame[..., :1] - 1, 0), frame], axis=-1)
     lag = np.zeros((2, n))
     if nuisances.hysteresis:
@@ -251,7 +251,7 @@ def _read(
     if nuisances.noise_counts:
         shape = (n, taps, frame.shape[2] - torn, *scan)
         noise = stream("noise_counts").standard_normal(shape, dtype=np.float32)
-        if torn:  # drawn apart, so that torn scans leave the noise of the others as it is
+        if torn:  # drawn separately, so that torn scans leave the noise of the other frames unchanged
             before = stream("noise_before").standard_normal((n, taps, 1, *scan), dtype=np.float32)
             noise = np.concatenate([before, noise], axis=2)
         counts += np.float32(nuisances.noise_counts) * noise
@@ -270,13 +270,16 @@ def _read(
 
 
 def _draw_drift(rng: np.random.Generator, n: int, scan: Sequence[int]) -> NDArray[np.float32]:
-    """(n, 3, rows, cols) in deviations of z."""
+    """Draw drifts (n, 3, rows, cols) in deviations of z."""
     common = _cut_normal(rng, (n, len(AXES), 1, 1)) * _DRIFT_OF_AXIS[:, None, None]
     return (common * (1 + _DRIFT_OF_TAXEL * _cut_normal(rng, (n, *scan)))).astype(np.float32)
 
 
 def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Change of a field of length 1 since zeroing at any attitude, (n, K, 3) in the pad's axes; `turn` in [rad]."""
+    """Return the change of a field of length 1 since zeroing at any attitude, (n, K, 3) in the pad's axes.
+
+    The pad's turn in each tap is `turn`, in [rad].
+    """
     field, zeroed = rng.standard_normal((2, len(turn), 3))
     field /= np.linalg.norm(field, axis=-1, keepdims=True)
     zeroed /= np.linalg.norm(zeroed, axis=-1, keepdims=True)
@@ -291,15 +294,15 @@ def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[
 def _draw_stuck(
     rng: np.random.Generator, chance: float, n: int, scan: Sequence[int]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which taxels stick, (n, 1, rows, cols), and the constants they hold, (n, 3, rows, cols)."""
+    """Draw the stuck taxels, (n, 1, rows, cols), and the constants they hold, (n, 3, rows, cols)."""
     stuck = rng.random((n, 1, *scan[1:])) < chance
     high = np.array(LARGEST_COUNTS)[:, None, None]
-    low = high * np.array([-1.0, -1.0, 0.0])[:, None, None]  # pressed, z only rises
+    low = high * np.array([-1.0, -1.0, 0.0])[:, None, None]  # under pressure, z only rises
     return stuck, rng.uniform(low, high, (n, *scan)).astype(np.float32)
 
 
 def _draw_torn(rng: np.random.Generator, chance: float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Readings of the frame before, (n, K, m, 1, rows, cols): a run of ids, which come round and round."""
+    """Draw the stale readings of torn scans, (n, K, m, 1, rows, cols): a cyclic run of ids."""
     *scans, _, rows, cols = shape
     torn = rng.random(scans) < chance
     first = rng.integers(rows * cols, size=scans)
@@ -315,7 +318,7 @@ def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.
 
 
 def _neighbours(rows: int, cols: int) -> NDArray[np.float32]:
-    """Share of a taxel's outflow that reaches another, (taxels, taxels): a quarter over each edge."""
+    """Return the share of a taxel's outflow that reaches another, (taxels, taxels): a quarter over each edge."""
     row, col = np.divmod(np.arange(rows * cols), cols)
     return ((abs(row[:, None] - row) + abs(col[:, None] - col)) == 1).astype(np.float32) / 4
 

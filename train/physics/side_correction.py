@@ -1,12 +1,12 @@
-"""Free sides of a pad, which the infinite layer has not: near them it gives way further, and lets more material out.
+"""Free sides of a pad, absent from the infinite layer: near them the pad is softer and bulges outwards.
 
-A side sees a load by how much of it lies near, falling with the distance d' from the side, spread along it by a bell
-curve. What it adds at distance d falls alike, so that the addition is symmetric and never negative:
+The effect of a load on a side falls with the load's distance d' from the side, and spreads along the side by a bell
+curve. The added displacement falls with distance d alike, so that the addition is symmetric and never negative:
 
     u(d, y) += amplitude / (G h) sum_sides sum_k a_k exp(-(d + d') / (h b_k)) exp(-(y - y')^2 / (2 (h c_k)^2)) F(d', y')
 
 The magnets' movement gains a term of the same kind, with its own lengths. All constants are fitted to finite elements
-of a frictionless 20 mm pad at four Poisson ratios (reports/free_sides.md); the same ones serve all four.
+of a frictionless 20 mm pad at four Poisson ratios (reports/free_sides.md), with the same values for all four.
 Amplitude 0 is the infinite layer. Lengths in [mm], forces in [N].
 """
 
@@ -22,7 +22,7 @@ from train.physics.magnets import MOVEMENT
 
 
 class Give(NamedTuple):
-    """One term of the surface's: factor on 1 / (G h), and lengths in thicknesses."""
+    """One term of the surface's compliance: factor on 1 / (G h), and lengths in thicknesses."""
 
     factor: float
     reach: float
@@ -30,13 +30,13 @@ class Give(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """The magnets' term of one direction: factor on 1 / (G h), and lengths in thicknesses.
+    """Term of the magnets' movement in one direction: factor on 1 / (G h), and lengths in thicknesses.
 
     Attributes:
-        factor: of a slope it is on 1 / (G h^2).
-        inward: over which it falls from the side to the magnet.
-        reach: over which it falls from the side to the load.
-        spread: along the side.
+        factor: for a slope it is on 1 / (G h^2).
+        inward: decay length from the side to the magnet.
+        reach: decay length from the side to the load.
+        spread: width along the side.
     """
 
     factor: float
@@ -56,12 +56,12 @@ class FreeSides:
     """Four free sides of a square pad.
 
     Attributes:
-        amplitude: 1 as the finite elements have it, 0 none.
+        amplitude: 1 as in the finite elements, 0 for an infinite layer.
         width_mm: of the pad, from side to side.
-        gives: of the surface.
-        down: of the magnets, towards the board.
-        out: of the magnets, towards the side.
-        lean: of the magnets' axes, their tops towards the side.
+        gives: terms of the surface.
+        down: term of the magnets, towards the board.
+        out: term of the magnets, towards the side.
+        lean: term of the magnets' axes, their tops towards the side.
     """
 
     amplitude: float = 1.0
@@ -76,11 +76,11 @@ class FreeSides:
             raise ValueError(f"amplitude is {self.amplitude}, expected 0 or more: below 0 a pad could push back")
 
     def profiles(self, layer: Layer, cells_mm: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Shares of the added compliance across and along a pair of sides.
+        """Return shares of the added compliance across and along a pair of sides.
 
         Args:
             layer: the pad.
-            cells_mm: (size,), cells' places from the centre.
+            cells_mm: (size,), places of the cells from the centre.
 
         Returns:
             across (terms, 2, size), lower side first, and along (terms, size, size) in [mm/N]: a force at (x', y') adds
@@ -95,7 +95,7 @@ class FreeSides:
     def movement(
         self, layer: Layer, cells_mm: NDArray[np.floating], magnets_mm: NDArray[np.floating]
     ) -> NDArray[np.float64]:
-        """What the sides add to the magnets' MOVEMENT, (taxels, 5, size, size) in [mm/N] and [1/N].
+        """Return the MOVEMENT of the magnets that the sides add, (taxels, 5, size, size) in [mm/N] and [1/N].
 
         Args:
             layer: the pad.
@@ -130,12 +130,12 @@ class FreeSides:
         return added
 
     def _fall(self, places_mm: NDArray[np.floating], length_mm: float) -> NDArray[np.float64]:
-        """Exponentials (2, ...) from either side inwards."""
+        """Return exponentials (2, ...) that decay from either side inwards."""
         return np.exp(-(self.width_mm / 2 + np.stack([places_mm, -places_mm])) / length_mm)
 
 
 class SideGive:
-    """The surface's part, ready for boxes of a grid: a few small matrix products a step of the contact's solver.
+    """Compliance of the surface on boxes of a grid: a few small matrix products in a step of the contact solver.
 
     Args:
         across: (n, terms, 2, width) and (n, terms, 2, height), the profiles at the boxes' columns and rows.
@@ -150,13 +150,13 @@ class SideGive:
     def of(
         cls, sides: FreeSides, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32
     ) -> "SideGive":
-        """The whole grid's."""
+        """Return the compliance of the whole grid."""
         across, along = sides.profiles(layer, (np.arange(size) - (size - 1) / 2) * cell_mm)
         falls, bells = torch.as_tensor(across[None], dtype=dtype), torch.as_tensor(along * cell_mm**2, dtype=dtype)
         return cls((falls, falls), (bells, bells))
 
     def boxes(self, top: NDArray[np.integer], left: NDArray[np.integer], shape: tuple[int, int]) -> "SideGive":
-        """The part of boxes of one shape that begin at these rows and columns, (n,)."""
+        """Return the part for boxes of one shape that begin at these rows and columns, (n,)."""
         columns, rows = (
             fall[0][:, :, torch.as_tensor(first[:, None] + np.arange(count))].permute(2, 0, 1, 3)
             for fall, first, count in zip(self._across, (left, top), shape[::-1], strict=True)
@@ -165,17 +165,17 @@ class SideGive:
         return SideGive((columns, rows), (beside, below))
 
     def __getitem__(self, which: torch.Tensor) -> "SideGive":
-        """Some of the boxes."""
+        """Return the part for some of the boxes."""
         return SideGive((self._across[0][which], self._across[1][which]), self._along)
 
     def displacement_mm(self, pressure_mpa: torch.Tensor) -> torch.Tensor:
-        """What the sides add to the displacement under pressures (n, height, width)."""
+        """Return the displacement that the sides add under pressures (n, height, width)."""
         by_x = self._pair(pressure_mpa, self._across[0], self._along[0])
         return by_x + self._pair(pressure_mpa.mT, self._across[1], self._along[1]).mT
 
     @staticmethod
     def _pair(pressure: torch.Tensor, across: torch.Tensor, along: torch.Tensor) -> torch.Tensor:
-        """Of the two sides at the ends of the last axis."""
+        """Return the displacement from the two sides at the ends of the last axis."""
         terms, sides = across.shape[1:3]
         fall = across.expand(len(pressure), -1, -1, -1).flatten(1, 2)  # (n, terms sides, width)
         seen = (fall @ pressure.mT).unflatten(1, (terms, sides))  # (n, terms, sides, height)

@@ -1,7 +1,7 @@
-"""Taps on the simulated sensor: poses of the pad on surfaces to clean readings and truth.
+"""Taps on the simulated sensor: from poses of the pad on surfaces to clean readings and truth.
 
 On a flat surface pressure is linear in the indentation: one solution serves all frames of a tap. On a curved one the
-contact grows: each frame is solved, after the depth has been found at which the tap reaches its force.
+contact grows: each frame is solved, after a search for the depth at which the tap reaches its force.
 """
 
 from dataclasses import dataclass, replace
@@ -21,20 +21,20 @@ from train.surfaces.depth_image import NOTHING_MM, Footprints, Pose, Relief, foo
 from train.surfaces.named_surfaces import is_flat, surface_mesh
 
 MAX_INDENTATION_MM: Final = 0.5
-"""A tap ends here if its set force is not reached: beyond a tenth of the layer it is no longer linear."""
+"""Largest indentation, in [mm], where a tap ends below its set force: beyond a tenth of the layer it is not linear."""
 FRAMES: Final = 16
 """Frames of a tap; frame i is at (i + 1) / FRAMES of its last indentation."""
 FINE_SCALE: Final = 20
-"""Pattern pixels per pitch at which truth is made."""
+"""Pattern pixels per pitch at which truth is computed."""
 _CELLS_PER_PITCH: Final = 10
 _SHARES: Final = (np.arange(FRAMES) + 1) / FRAMES
 _LEVEL_MM: Final = 1e-3
-"""Flat surfaces are flat to this, as train.surfaces.named_surfaces.is_flat has it."""
+"""Tolerance of flat surfaces, in [mm], as in train.surfaces.named_surfaces.is_flat."""
 _DROP: Final = 2.0
-"""A surface this many indentations down falls away steeply: its edge is where its depth image says, not in between."""
+"""Depth in indentations from which a surface counts as steep: its edge then follows from its depth image alone."""
 _FORCE_ERROR: Final = 0.003
 _EXPONENT: Final = 1.5
-"""Of force against depth, to begin with: a sphere's on a thick layer."""
+"""Initial exponent of force against depth: that of a sphere on a thick layer."""
 _MAX_GUESSES: Final = 30
 
 
@@ -46,9 +46,10 @@ class Taps:
         counts: (n, FRAMES, 3, rows, cols), zeroed.
         force_n: (n, FRAMES), in [N].
         indentation_mm: (n, FRAMES), in [mm].
-        patterns: (m, L, H, W) at FINE_SCALE, in [mm]. L = 1 if all surfaces are flat: the last frame's, the others are
-            in proportion to their indentation. Else L = FRAMES.
-        touching: (m, L, H, W), where the pad touches.
+        patterns: (m, L, H, W) at FINE_SCALE, in [mm]. L = 1 if all surfaces are flat: the last frame's, while the
+        others
+            are proportional to their indentation. Else L = FRAMES.
+        touching: (m, L, H, W), contact area of the pad.
     """
 
     counts: NDArray[np.float32]
@@ -59,7 +60,7 @@ class Taps:
 
 
 class SimulatedSensor:
-    """One sensor model that taps surfaces.
+    """Sensor model that taps surfaces.
 
     Args:
         geometry: the taxels.
@@ -100,7 +101,7 @@ class SimulatedSensor:
             surfaces: (n,) names, see train.surfaces.named_surfaces.surface_mesh.
             poses: (n,).
             force_n: set forces, one for all or (n,), in [N].
-            with_pattern: whether truth is wanted, for all or (n,); without it costs less.
+            with_pattern: True to compute truth, for all or (n,); without it a tap takes less time.
 
         Raises:
             ValueError: lengths do not fit, a force is not positive, no surface of a name, or nothing under the pad.
@@ -161,7 +162,7 @@ class SimulatedSensor:
 
     @staticmethod
     def _is_level(seen: Footprints) -> NDArray[np.bool_]:
-        """Poses (n,) at which a press finds nothing but one plane; a flat surface's lower parts may be anything."""
+        """Return True for poses (n,) at which a press reaches only one plane; deeper parts do not count."""
         within = (seen.depth_mm > _LEVEL_MM) & (seen.depth_mm <= MAX_INDENTATION_MM)
         return np.logical_not(within.any(axis=(1, 2)))
 
@@ -174,7 +175,7 @@ class SimulatedSensor:
         wanted_n: NDArray[np.float64],
         pattern_of: NDArray[np.int64],
     ) -> None:
-        """Fill in the taps of flat surfaces, that are over these shares of the cells."""
+        """Compute the taps on flat surfaces, which cover these shares of the cells."""
         unit = self._solver.solve(np.where(cover > 0, 0, NOTHING_MM).astype(np.float32), cover=cover)
         end_mm = np.minimum(wanted_n[which] / unit.force_n, MAX_INDENTATION_MM)
         indentation_mm = end_mm[:, None] * _SHARES
@@ -198,7 +199,7 @@ class SimulatedSensor:
         wanted_n: NDArray[np.float64],
         pattern_of: NDArray[np.int64],
     ) -> None:
-        """Fill in the taps of curved surfaces."""
+        """Compute the taps on curved surfaces."""
         depth_mm = seen.depth_mm[which]
         end_mm, pressure_mpa = self._press_to(depth_mm, wanted_n[which])
         indentation_mm = end_mm[:, None] * _SHARES
@@ -220,10 +221,10 @@ class SimulatedSensor:
     def _press_to(
         self, depth_mm: NDArray[np.float32], wanted_n: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Indentations (k,) at which the wanted forces are reached, or the deepest, and the pressures there.
+        """Return indentations (k,) that reach the set forces, or the largest one, and the pressures there.
 
         Force grows with depth about as a power of it: the next guess lies on the power law through the nearest
-        depths found too deep and too shallow.
+        depths that were too deep and too shallow.
         """
         deep_mm = np.full(len(depth_mm), MAX_INDENTATION_MM)
         pressure_mpa = self._press(depth_mm, deep_mm)
@@ -255,7 +256,7 @@ class SimulatedSensor:
         indentation_mm: NDArray[np.float64],
         start_mpa: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Pressures of curved surfaces; none where the tip, between cells, has not brought one down yet."""
+        """Return pressures of curved surfaces; zero until the tip, between cells, brings a cell into contact."""
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         reached = np.flatnonzero(depth_mm.min(axis=(1, 2)) < indentation_mm)
         if len(reached):
@@ -272,7 +273,7 @@ class SimulatedSensor:
         fine_mm: NDArray[np.float32],
         indentation_mm: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
-        """Where the pad touches, on the pixels of the truth (F, H, W), from pressure and gap on the cells.
+        """Return the contact area on the pixels of the truth (F, H, W), from pressure and gap on the cells.
 
         A cell's own deflection under its pressure, less its gap, is positive inside a contact and negative outside;
         the contact's edge is where it passes through zero between the cells' centres.
@@ -285,13 +286,13 @@ class SimulatedSensor:
 
 
 def _between(size: int, cell_mm: float, pixels: int, pixel_mm: float) -> NDArray[np.float32]:
-    """Weights (pixels, size) that interpolate linearly from cells to pixels, both centred on the pad."""
+    """Return weights (pixels, size) that interpolate linearly from cells to pixels, both centred on the pad."""
     place = ((np.arange(pixels) - (pixels - 1) / 2) * pixel_mm / cell_mm + (size - 1) / 2)[:, None]
     return np.maximum(1 - np.abs(place - np.arange(size)), 0).astype(np.float32)
 
 
 @lru_cache(maxsize=64)
 def _surface(name: str) -> tuple[Relief, bool]:
-    """A surface ready to be tapped, and whether it is flat."""
+    """Return a surface as a relief, and True if it is flat."""
     mesh = surface_mesh(name)
     return Relief(name, mesh), is_flat(mesh)

@@ -1,9 +1,9 @@
-"""A bonded elastic layer under tangential traction: what it does at the surface and inside. In Fourier space.
+"""Bonded elastic layer under tangential traction: displacement at the surface and inside, in Fourier space.
 
 Traction along a wave (t parallel to q) moves the pad along the wave and up and down, and traction across it moves it
-across alone: two independent problems. Traction is what acts on the pad, positive to the right and back; z is the
-height above the board, and displacements in z are positive downwards, as in train.physics.elastic_layer. Lengths in
-[mm], stresses in [MPa].
+only across: two independent problems. Traction acts on the pad, positive to the right and back; z is the height above
+the board, and displacements in z are positive downwards, as in train.physics.elastic_layer. Lengths in [mm], stresses
+in [MPa].
 
 For a traction t exp(i q x) in the direction (c, s) = q / |q| the displacements are
     u_i = [across delta_ij + (along - across) q_i q_j / q^2] t_j,   u_down = i sunk (q_j / q) t_j.
@@ -25,8 +25,8 @@ class TangentialResponse:
         along: in the plane, along the wave, under traction along it.
         across: in the plane, across the wave, under traction across it.
         sunk: i times this is the displacement downwards under traction along the wave. On top it is, by reciprocity,
-            -U of train.physics.elastic_layer.inner_displacement. The contact leaves it out (train.physics.friction says
-            why).
+            -U of train.physics.elastic_layer.inner_displacement. The contact leaves it out, for the reason in
+            train.physics.friction.
     """
 
     along: NDArray[np.float64]
@@ -37,17 +37,17 @@ class TangentialResponse:
 def surface_tangential_compliance(
     layer: Layer, q_per_mm: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Surface displacement per traction (along the wave, across it), in closed form, in [mm/MPa].
+    """Return the surface displacement per traction (along the wave, across it), in closed form, in [mm/MPa].
 
     along = (1-nu)/(G q) [(3-4nu) sinh 2a + 2a] / [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2], a = qh, which is
-    train.physics.elastic_layer.surface_compliance but for one sign; across = tanh(a) / (G q). Both are h/G at q = 0.
+    train.physics.elastic_layer.surface_compliance except for one sign; across = tanh(a) / (G q). Both are h/G at q = 0.
 
     Args:
         layer: the pad.
         q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
     """
     nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
-    a = np.maximum(q_per_mm * thickness, 1e-8)  # both are flat here: the limit is exact to a^2
+    a = np.maximum(q_per_mm * thickness, 1e-8)  # both are constant here: the limit is exact to a^2
     decay = np.exp(-2 * a)
     kappa = 3 - 4 * nu
     numerator = kappa * -np.expm1(-4 * a) + 4 * a * decay
@@ -57,7 +57,7 @@ def surface_tangential_compliance(
 
 
 def surface_spread(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Surface displacement along the wave per pressure: u = i times this, in closed form, in [mm/MPa].
+    """Return the surface displacement along the wave per pressure: u = i times this, in closed form, in [mm/MPa].
 
     U = [(1-2nu)(3-4nu)(cosh 2a - 1) - 2a^2] / (2 G q [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2]), a = qh: the surface
     value of train.physics.elastic_layer.inner_displacement. Below 0 a pressure drives the surface apart.
@@ -67,7 +67,7 @@ def surface_spread(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.fl
         q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
     """
     nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
-    a = np.maximum(q_per_mm * thickness, 1e-8)  # goes to 0 as a does
+    a = np.maximum(q_per_mm * thickness, 1e-8)  # proportional to a in the limit
     decay = np.exp(-2 * a)
     kappa = 3 - 4 * nu
     numerator = (1 - 2 * nu) * kappa * np.expm1(-2 * a) ** 2 - 4 * a**2 * decay
@@ -76,7 +76,7 @@ def surface_spread(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.fl
 
 
 def inner_tangential(layer: Layer, q_per_mm: NDArray[np.float64], height_mm: float) -> TangentialResponse:
-    """Displacement at a height inside the layer per tangential traction on its surface.
+    """Return the displacement at a height inside the layer per tangential traction on its surface.
 
     Args:
         layer: the pad.
@@ -94,7 +94,9 @@ def inner_tangential(layer: Layer, q_per_mm: NDArray[np.float64], height_mm: flo
 def surface_tensor(
     layer: Layer, q_x: NDArray[np.floating], q_y: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Surface compliance (xx, yy, xy) per wave vector: u_x = xx t_x + xy t_y, u_y = xy t_x + yy t_y, in [mm/MPa].
+    """Return the surface compliance (xx, yy, xy) per wave vector, in [mm/MPa].
+
+    u_x = xx t_x + xy t_y and u_y = xy t_x + yy t_y.
 
     Args:
         layer: the pad.

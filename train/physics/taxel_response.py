@@ -1,8 +1,8 @@
-"""The simulated skin: pressure and traction on the pad to counts of the taxels, zeroed and clean.
+"""Simulated skin: from pressure and traction on the pad to counts of the taxels, zeroed and clean.
 
-Under each taxel a magnet sits in the pad, and a Hall chip on the board below it. Loads move and tilt the
-magnets with the material around them, in proportion (the pad is linear); the field at the chips follows, and is not in
-proportion. One factor, counts per mT, the same on all axes, is set by the data sheet's newtons per count.
+Under each taxel a magnet sits in the pad, and a Hall chip on the board below it. Loads move and tilt the magnets with
+the material around them, linearly (the pad is linear); the field at the chips depends on that nonlinearly. One factor,
+counts per mT, the same on all axes, is set by the data sheet's newtons per count.
 """
 
 from functools import cached_property
@@ -19,9 +19,12 @@ from train.physics.side_correction import FreeSides
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
 IN_PLANE_SHARE: Final = 0.4
-"""What friction leaves of the magnets' in-plane movement: the contact is solved without, and the pad is squeezed out
-from under a figure that in truth holds it. Recordings of grips show an in-plane to normal ratio of .18 to .26; without
-this factor the simulated one is .57."""
+"""Share of the magnets' in-plane movement that friction leaves.
+
+The contact is solved without friction, so that the simulated pad is squeezed out from under a figure that in reality
+holds it. Recordings of grips have an in-plane to normal ratio of .18 to .26; without this factor the simulated one is
+.57.
+"""
 
 _CALIBRATION_N: Final = 1.0
 
@@ -43,12 +46,12 @@ class Skin:
         size: cells along a side of the pressure grid.
         cell_mm: their size, in [mm].
         magnet: of every taxel.
-        field: how the magnets' field is worked out, a name in train.physics.magnets.FIELDS.
-        in_plane_share: factor on the magnets' in-plane movement under pressure; tractions keep all of theirs.
-        rest: where each magnet sits and how it leans, see train.physics.magnets.MagnetArray.
+        field: model of the magnets' field, a name in train.physics.magnets.FIELDS.
+        in_plane_share: factor on the magnets' in-plane movement under pressure; movement under traction is not scaled.
+        rest: place and lean of each magnet, see train.physics.magnets.MagnetArray.
         moments: of each magnet, see train.physics.magnets.MagnetArray.
         counts_per_newton: of the sum of z under an even load.
-        sides: the pad's free sides; without, it goes on for ever.
+        sides: the pad's free sides; None for an infinite layer.
 
     Attributes:
         counts_per_mt: of every chip and axis.
@@ -96,20 +99,20 @@ class Skin:
 
     @cached_property
     def _traction_response(self) -> NDArray[np.float32]:
-        """MOVEMENT per traction to the right and back in each cell, (taxels, 5, 2, cells); for who has tractions."""
+        """MOVEMENT per traction to the right and back in each cell, (taxels, 5, 2, cells); computed on first use."""
         return traction_response(*self._pad).astype(np.float32)
 
     def movement(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.floating]:
-        """How loads on the pad move the magnets: (..., taxels, 5), train.physics.magnets.MOVEMENT.
+        """Return the movement of the magnets under loads on the pad: (..., taxels, 5), train.physics.magnets.MOVEMENT.
 
         Args:
             pressure_mpa: (..., size, size), in [MPa].
             traction_mpa: on the pad's surface, to the right and back, (..., 2, size, size), in [MPa]; none if None.
 
         Raises:
-            ValueError: the pressures are on another grid, or the tractions are not those of the pressures.
+            ValueError: the pressures are on another grid, or the tractions' shape does not match the pressures'.
         """
         if pressure_mpa.shape[-2:] != (self.size, self.size):
             raise ValueError(f"pressures of shape {pressure_mpa.shape}, expected (..., {self.size}, {self.size})")
@@ -127,7 +130,7 @@ class Skin:
     def frames(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.float32]:
-        """Readings (n, F, 3, rows, cols) in counts, zeroed and clean, of loads on the pad.
+        """Return readings (n, F, 3, rows, cols) in counts, zeroed and clean, of loads on the pad.
 
         Args:
             pressure_mpa: (n, F, size, size), in [MPa].
@@ -141,7 +144,7 @@ class Skin:
     def flat_frames(
         self, unit_pressure_mpa: NDArray[np.floating], indentation_mm: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """The same for taps on flat surfaces, where pressure is in proportion to the indentation.
+        """Return the readings of taps on flat surfaces, where pressure is proportional to the indentation.
 
         Args:
             unit_pressure_mpa: (n, size, size), of an indentation of 1 mm, in [MPa].
@@ -158,7 +161,7 @@ class Skin:
 
     def _counts(self, movement: NDArray[np.floating]) -> NDArray[np.float32]:
         rows, cols = self.geometry.rows, self.geometry.cols
-        # Every frame is worked out: through five depths and a polynomial it took 0.09 ms a tap, thus 0.13 ms.
+        # Every frame is computed: interpolation by a polynomial through five depths took 0.09 ms a tap, this 0.13 ms.
         counts = np.empty((*movement.shape[:2], 3, rows, cols), dtype=np.float32)
         for tap, moved in zip(counts, movement, strict=True):  # one tap at a time stays in the cache
             changed = self._magnets.change_mt(moved) * moved.dtype.type(self.counts_per_mt)

@@ -1,4 +1,4 @@
-"""Where the pad is touched and how far it is pressed in, finer than the cells on which pressure is solved."""
+"""Contact area and indentation of the pad on a finer grid than the cells on which pressure is solved."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final
@@ -10,13 +10,13 @@ from train.physics.contact import REACH, ContactSolver
 from train.physics.covers import BARE, Cover
 
 _WALL_MM: Final = 0.1
-"""A part of a cell this far below its highest part carries nothing while that one is pressed."""
+"""Depth below a cell's highest part from which a part of it carries no load, in [mm]."""
 _STEEP: Final = 2.0
-"""A shape this many indentations down falls away steeply: its edge lies between the cells as its pressure says."""
+"""Depth in indentations from which a shape counts as steep: its edge then follows from the pressure alone."""
 
 
 def carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Depth of each cell's carrying part, and its share of the cell, both (n, cells, cells).
+    """Return the depth of each cell's carrying part, and its share of the cell, both (n, cells, cells).
 
     Args:
         depth_mm: (n, m, m) with m a multiple of `cells`, below the highest part, in [mm].
@@ -30,7 +30,7 @@ def carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.flo
 
 
 def which_of(covers: Sequence[Cover]) -> Iterable[tuple[Cover, NDArray[np.int64]]]:
-    """Each cover once, with the numbers of the presses that have it."""
+    """Yield each cover once, with the numbers of the presses that have it."""
     for cover in dict.fromkeys(covers):
         yield cover, np.array([number for number, one in enumerate(covers) if one == cover])
 
@@ -45,16 +45,16 @@ def pressed_in(
     indentation_mm: NDArray[np.float32],
     pattern_cells: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """How far below its highest part the pad is pressed in, and where it is touched, on pixels of half a cell.
+    """Return the depth of the pad below the highest part and the contact area, on pixels of half a cell.
 
     A cell's own deflection under its pressure, less its gap, is positive inside a contact and negative outside; the
-    contact's edge is where it passes through zero between the cells' centres. A rigid shape is followed; under a soft
-    one the pad lies where its own layer gives way to.
+    contact's edge is where it passes through zero between the cells' centres. In contact with a rigid shape the pad
+    follows the shape; under a soft one its place follows from its own layer's deflection.
 
     Args:
         solvers: of every cover here, and of the bare pad.
         covers: (n,).
-        depth_mm: (n, m, m), of the shape below its highest part, in [mm].
+        depth_mm: (n, m, m), depth of the shape below its highest part, in [mm].
         cells_mm: (n, size, size), of each cell's carrying part, in [mm].
         pressure_mpa: (n, size, size), on the shape, in [MPa].
         on_pad_mpa: (n, size, size), on the pad, in [MPa].
@@ -78,7 +78,7 @@ def pressed_in(
     close_mm = np.where(cells_mm > _STEEP * indented_mm, np.minimum(pressure_mpa, 0), close_mm)
     to_pixels = _between(size, pixels)
     touching = (to_pixels @ close_mm @ to_pixels.T > 0) & (fine_mm < REACH * indented_mm)
-    # The press bottoms out on the highest part, whichever cells that lies between.
+    # The press always reaches the highest part, whichever cells that lies between.
     bottom = fine_mm <= fine_mm.min(axis=(1, 2), keepdims=True) + 1e-4
     touching = (touching | bottom) & _mostly(fine_share)
     touching |= bottom & ~touching.any(axis=(1, 2), keepdims=True)  # a tip thinner than half a pixel
@@ -90,15 +90,15 @@ def pressed_in(
 
 
 def _mostly(share: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels of which the carrying part is more than half; of those with just half, every other one.
+    """Return the pixels whose carrying part is more than half, and every other one of those with exactly half.
 
-    An edge then lies where it is in the mean; with all of these it would lie a quarter of a pixel further out.
+    The mean place of an edge is then correct; with all of these it would lie a quarter of a pixel further out.
     """
     rows, cols = np.indices(share.shape[1:])
     return np.where((rows + cols) % 2, share > 0.5, share >= 0.5)
 
 
 def _between(size: int, pixels: int) -> NDArray[np.float32]:
-    """Weights (pixels, size) that interpolate linearly from cells to pixels of half a cell, both centred on the pad."""
+    """Return weights (pixels, size) of linear interpolation from cells to pixels of half a cell, both centred."""
     place = ((np.arange(pixels) - (pixels - 1) / 2) / 2 + (size - 1) / 2)[:, None]
     return np.maximum(1 - np.abs(place - np.arange(size)), 0).astype(np.float32)

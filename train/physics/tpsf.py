@@ -1,8 +1,8 @@
-"""The tactile PSF: the depth of a contact spread by a point-spread function, with a plateau where it touches.
+"""Tactile PSF: the depth of a contact spread by a point-spread function, with a plateau in the contact.
 
-Two users: `tpsf` for learning, in torch and differentiable; `tpsf_pattern` for truth, where the indentation is known
-and takes the place of alpha. Convolutions are integrals over the pad, in [mm^2], so that a pattern does not depend
-on the scale it is drawn at.
+Two functions: `tpsf` for training, in torch and differentiable; `tpsf_pattern` for truth, where the indentation is an
+input and replaces alpha. Convolutions are integrals over the pad, in [mm^2], so that a pattern does not depend on the
+scale at which it is drawn.
 
 Source: Wu and Liu 2024, Eq. 4-6.
 """
@@ -17,7 +17,7 @@ from torch import Tensor
 Kernel = Literal["gaussian", "exponential"]
 Plateau = Literal["response", "outside", "none"]
 BETA_MM: Final = 1.3
-"""Fits the surface of the default layer best: to 2.6 % of the indentation over the 18 surfaces at x10, see tests."""
+"""Reach with the best fit to the default layer's surface: 2.6 % of the indentation over the 18 surfaces, see tests."""
 
 _FFT_STEPS: Final = 16
 """Rounding noise of an FFT over some hundred pixels each way, in steps of its largest response."""
@@ -31,10 +31,10 @@ def tpsf_pattern(
     kernel: Kernel = "gaussian",
     plateau: Plateau = "response",
 ) -> NDArray[np.float32]:
-    """Surface deformation of flat contacts, (n, H, W) in [mm].
+    """Return the surface deformation of flat contacts, (n, H, W) in [mm].
 
-    The kernel's intensity alpha is set by what is known of a rigid flat contact: where it touches, the pad is
-    pressed in by the indentation. So the plateau equals it.
+    The kernel's intensity alpha follows from the rigid flat contact: in it, the pad is pressed in by the indentation,
+    so the plateau equals it.
 
     Args:
         touching: (n, H, W), the area that the surface touches.
@@ -66,7 +66,7 @@ def tpsf(
     plateau: Plateau = "response",
     touching: Tensor | None = None,
 ) -> Tensor:
-    """HR patterns (n, H, W) of depth images, in alpha's unit times [mm^2]; gradients reach alpha and beta everywhere.
+    """Return HR patterns (n, H, W) of depth images, in alpha's unit times [mm^2], differentiable in alpha and beta.
 
     Args:
         depth: (n, H, W) depth images normalised to 0..1; 1 is the surface's top.
@@ -74,8 +74,8 @@ def tpsf(
         beta_mm: (n,) or (1,), its reach, > 0, in [mm].
         pixel_mm: pixel size, in [mm].
         kernel: see `spread`.
-        plateau: value where the surface touches: "response", the largest response anywhere, as Eq. 6 prints it;
-            "outside", the largest outside the contact, as the authors' code has it (anywhere, if all of the face
+        plateau: value in the contact: "response", the largest response anywhere, as printed in Eq. 6;
+            "outside", the largest outside the contact, as in the authors' code (anywhere, if all of the face
             touches); "none", no plateau: the plain PSF.
         touching: (n, H, W) bool; by default where depth is at least 0.5.
 
@@ -92,16 +92,15 @@ def tpsf(
 
 
 def spread(maps: Tensor, beta_mm: Tensor, pixel_mm: float, kernel: Kernel = "gaussian") -> Tensor:
-    """Convolve maps (n, H, W) with the PSF of alpha 1, nothing outside the map; the maps' unit times [mm^2].
+    """Convolve maps (n, H, W) with the PSF of alpha 1, zero outside the map; the maps' unit times [mm^2].
 
-    The Gaussian is a product of two curves, so two matrix products do it, faster than the FFT that any other
-    kernel takes.
+    The Gaussian is a product of two curves and takes two matrix products, faster than the FFT of the other kernel.
 
     Args:
         maps: (n, H, W).
         beta_mm: (n,) or (1,), reach of the kernel, > 0, in [mm].
         pixel_mm: pixel size, in [mm].
-        kernel: "gaussian" exp(-r^2/beta^2), or "exponential" exp(-r/beta) as Eq. 4 prints it.
+        kernel: "gaussian" exp(-r^2/beta^2), or "exponential" exp(-r/beta) as printed in Eq. 4.
 
     Raises:
         ValueError: beta is not positive, or the kernel is unknown.
@@ -116,7 +115,7 @@ def spread(maps: Tensor, beta_mm: Tensor, pixel_mm: float, kernel: Kernel = "gau
 
 
 def spread_by_fft(maps: Tensor, beta_mm: Tensor, pixel_mm: float, kernel: Kernel) -> Tensor:
-    """Do what `spread` does by FFT, for any kernel of the radius."""
+    """Convolve as `spread` does, by FFT, for any kernel of the radius."""
     _check(beta_mm, kernel)
     height, width = maps.shape[1:]
     shape = (2 * height, 2 * width)
@@ -125,7 +124,7 @@ def spread_by_fft(maps: Tensor, beta_mm: Tensor, pixel_mm: float, kernel: Kernel
     weights = torch.exp(-(ratio**2)) if kernel == "gaussian" else torch.exp(-ratio)
     spectrum = torch.fft.rfft2(maps, s=shape) * torch.fft.rfft2(weights)
     response = torch.fft.irfft2(spectrum, s=shape)[:, :height, :width]
-    # The FFT leaves rounding noise where nothing is near: what little is said of a place may not become its plateau.
+    # The FFT leaves rounding noise far from any contact, which must not become a plateau.
     noise = _FFT_STEPS * torch.finfo(response.dtype).eps * response.detach().amax(dim=(1, 2), keepdim=True)
     return pixel_mm**2 * torch.where(response > noise, response, 0.0)
 
@@ -138,19 +137,19 @@ def _check(beta_mm: Tensor, kernel: str) -> None:
 
 
 def _curve(length: int, beta_mm: Tensor, pixel_mm: float) -> Tensor:
-    """One factor of the Gaussian, between any two pixels of a line: (n, length, length)."""
+    """Return one factor of the Gaussian, between any two pixels of a line: (n, length, length)."""
     place_mm = torch.arange(length, dtype=beta_mm.dtype, device=beta_mm.device) * pixel_mm
     distance_mm = place_mm[:, None] - place_mm[None, :]
     return torch.exp(-((distance_mm / beta_mm[:, None, None]) ** 2))
 
 
 def _offsets_mm(length: int, pixel_mm: float, like: Tensor) -> Tensor:
-    """Offsets 0, 1, ..., -2, -1 pixels on a line padded to twice its length, so that nothing wraps round."""
+    """Return offsets 0, 1, ..., -2, -1 pixels on a line padded to twice its length, so that nothing wraps round."""
     return torch.fft.fftfreq(2 * length, 1 / (2 * length), dtype=like.dtype, device=like.device) * pixel_mm
 
 
 def _level(response: Tensor, touching: Tensor, plateau: str) -> Tensor:
-    """Height of the plateau, (n, 1, 1)."""
+    """Return the height of the plateau, (n, 1, 1)."""
     highest = response.amax(dim=(1, 2), keepdim=True)
     if plateau in ("response", "none"):
         return highest

@@ -1,7 +1,7 @@
-"""The whole pad with its free sides, by linear finite elements: what the correction is fitted to.
+"""Whole pad with its free sides by linear finite elements, the data to which the correction is fitted.
 
-A quarter of the pad, four times over: even and odd about either middle plane. The rigid face is larger than the pad.
-Needs the extra of train.physics.fem_reference.
+A quarter of the pad is solved four times: even and odd about either middle plane. The rigid face is larger than the
+pad. The extra of train.physics.fem_reference is required.
 """
 
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from train.physics.fem_reference import rest_tangent
 from train.physics.magnets import MOVEMENT, Magnet
 
 CELL_MM: Final = USPA44.pixel_pitch_mm(10)
-"""Of the elements over the pad's face, and of the contact's cells."""
+"""Size of the elements over the pad's face, and of the contact's cells, in [mm]."""
 PATCH: Final = 3
 """Cells along a side of a patch that is loaded evenly."""
 PATCHES: Final = 14
 _QUARTER: Final = PATCHES // 2
 _RATIO: Final = 2.5
-"""Of the tallest element to the lowest, which lie at the face and at the board."""
+"""Ratio of the tallest element's height to the lowest's, which lie at the face and at the board."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class FlatPress:
 
     Attributes:
         stiffness_n_per_mm: of the whole pad.
-        pressure: (nodes, nodes) over a quarter of the face, of the mean; row = y, column = x.
+        pressure: (nodes, nodes) over a quarter of the face, as a share of the mean; row = y, column = x.
         nodes_mm: (nodes,), from the centre.
-        movement: (4, 5), MOVEMENT of the four magnets of the quarter, x running fastest.
+        movement: (4, 5), MOVEMENT of the four magnets of the quarter, x changing fastest.
     """
 
     stiffness_n_per_mm: float
@@ -45,12 +45,12 @@ class FlatPress:
 
 
 class WholePad:
-    """A frictionless or bonded face on a square pad that is bonded to its board.
+    """Square pad that is bonded to its board, under a frictionless or bonded face.
 
     Args:
         layer: thickness and material.
         cells_high: elements between the board and the magnets, and as many above; fineness over the thickness.
-        every: cells to an element along x and y, 1 or 5; 5 is for tests alone.
+        every: cells per element along x and y, 1 or 5; 5 is for tests alone.
     """
 
     def __init__(self, layer: Layer, cells_high: int = 5, every: int = 1) -> None:
@@ -85,7 +85,7 @@ class WholePad:
         return FlatPress(stiffness, pressure, self.nodes_mm, self._movement(moved[..., None])[..., 0])
 
     def patches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The face loaded patch by patch, free elsewhere.
+        """Load the face patch by patch, free elsewhere.
 
         Returns:
             Mean displacement of each patch under an even pressure on each, (196, 196) in [mm/MPa]; and MOVEMENT of the
@@ -115,7 +115,7 @@ class WholePad:
         return surface.reshape(PATCHES**2, -1), magnets.reshape(16, len(MOVEMENT), -1)
 
     def _held(self, even_x: bool, even_y: bool) -> NDArray[np.bool_]:
-        """Nodes' directions that do not move: on the board, and in the middle planes."""
+        """Return a mask of the nodes' directions that do not move: on the board, and in the middle planes."""
         held = np.zeros(self._grid, dtype=bool)
         held[0] = True
         held[:, :, 0] |= np.array([even_x, not even_x, not even_x])
@@ -127,7 +127,7 @@ class WholePad:
         return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def _loads(self) -> NDArray[np.float64]:
-        """Forces of 1 MPa on each patch of the quarter on the nodes of the face, (49, nodes, nodes)."""
+        """Return forces of 1 MPa on each patch of the quarter on the nodes of the face, (49, nodes, nodes)."""
         loads_n = np.zeros((_QUARTER**2, len(self.nodes_mm), len(self.nodes_mm)))
         for patch, (row, column) in enumerate(product(range(_QUARTER), repeat=2)):
             for y, x in product(range(PATCH), repeat=2):
@@ -136,7 +136,7 @@ class WholePad:
         return loads_n
 
     def _movement(self, moved: NDArray[np.float64]) -> NDArray[np.float64]:
-        """MOVEMENT (4, 5, k) of the quarter's magnets; they lean as train.physics.taxel_response has it."""
+        """Return MOVEMENT (4, 5, k) of the quarter's magnets, which lean as in train.physics.taxel_response."""
         plane = moved[self._level]
         down = -plane[:, :, 2]
         slope_x, slope_y = (np.gradient(down, self.nodes_mm, axis=axis) for axis in (1, 0))
@@ -152,11 +152,11 @@ class WholePad:
 
 
 def _steps(count: int) -> NDArray[np.float64]:
-    """0 to 1, in steps that grow by _RATIO."""
+    """Return numbers from 0 to 1, in steps that grow by _RATIO."""
     steps = np.geomspace(1, _RATIO, count)
     return np.append(0.0, np.cumsum(steps) / steps.sum())
 
 
 def _half(sign: int, count: int) -> range:
-    """Places of a half, from the middle outwards, among twice as many."""
+    """Return the places of a half, from the middle outwards, among twice as many."""
     return range(count, 2 * count) if sign > 0 else range(count - 1, -1, -1)

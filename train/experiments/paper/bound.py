@@ -2,8 +2,8 @@
 
 The Cramer-Rao bound with priors (van Trees): readings are linearised about each test tap in all unknowns, the surface's
 place, every tap's own pose error and force, and the nuisances. Its inverse information, carried over to the pattern, is
-the least mean squared error. A network may stay above the bound's gain from more taps for two reasons, taps without
-more information or a network that does not use it; the bound separates the two.
+the least mean squared error. If a network gains nothing from more taps, either the taps have no more information or the
+network does not use it; the bound separates the two.
 """
 
 from collections.abc import Iterator

@@ -1,9 +1,8 @@
 """Fig. 5: alpha and beta of the tactile PSF against the contact force, for two surfaces.
 
 One network is trained on simulated taps of both surfaces, and evaluated on taps at other poses. Scans are clean,
-because
-the question is the method's behaviour without noise. The network's beta is compared with the beta that explains each
-scan best, by search: on a pad whose pressure is proportional to the indentation it has no reason to grow.
+because the question is the method's behaviour without noise. The network's beta is compared with the beta that explains
+each scan best, by search: on a pad whose pressure is proportional to the indentation it has no reason to grow.
 
 Source: Wu and Liu 2024, Fig. 5.
 """

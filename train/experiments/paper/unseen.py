@@ -1,10 +1,9 @@
 """Fig. 16: surfaces that were not trained on, and the gain and cost of random figures in the training.
 
 Three of the 18 surfaces are held out; tested glyphs and polygons are of another seed than the trained ones. All
-networks
-are identical; the training set differs. All figures make as many windows as all surfaces do, so training on surfaces
-alone runs once for as long and once for as many windows of the surfaces. Figures reduce the accuracy on seen surfaces,
-so some networks see fewer of them: few figures, or all of them rarely.
+networks are identical; the training set differs. All figures make as many windows as all surfaces do, so training on
+surfaces alone runs once for as long and once for as many windows of the surfaces. Figures reduce the accuracy on seen
+surfaces, so some networks see fewer of them: few figures, or all of them rarely.
 
 Source: Wu and Liu 2024, Fig. 16 and Sec. VI-C.
 """

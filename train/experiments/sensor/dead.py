@@ -127,7 +127,7 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
         stuck = _REST.reshape(3, -1)
         if fault == "stuck at random":
             stuck = stuck + np.random.default_rng([SEED, 3, tap]).uniform(high * [[-1], [-1], [0]], high, (3, _TAXELS))
-        # Readings may lie above one another's range here, so the contact thresholds are set explicitly.
+        # Thresholds are far below the default ones, so that the lightest frames are contacts too.
         runtime = Runtime(
             model,
             source="replay",

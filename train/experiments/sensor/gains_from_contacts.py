@@ -1,8 +1,7 @@
 """Identification of sensors from their own contacts: simulated ones with given constants, then real recordings.
 
 Simulated sensors each have a pad, gains and all other nuisances of Nuisances; the mixture was fitted to presses of
-other
-pads. The gains of real sensors are not available; those from three trials predict a hidden taxel of the fourth.
+other pads. The gains of real sensors are not available; those from three trials predict a hidden taxel of the fourth.
 """
 
 from dataclasses import replace

@@ -2,9 +2,8 @@
 
 Recordings go through edge.perception.runtime with the default model and the baseline of a free pad. Their true patterns
 are unknown, but both fingers hold a flat face that covers the pad: a pattern should cover it, evenly and without a
-hole.
-It should also explain the readings: it is degraded back to z by one linear operator, fitted on simulated presses, with
-no taxel hidden and with each in turn, which is then silent like a broken one.
+hole. It should also explain the readings: it is degraded back to z by one linear operator, fitted on simulated presses,
+with no taxel hidden and with each in turn, which is then silent like a broken one.
 
 Recordings are read from TACTILE_RECORDINGS, or from next to the repository; no reading of theirs goes into a report,
 patterns do.

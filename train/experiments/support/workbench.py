@@ -71,7 +71,7 @@ class Workbench:
         return make_presses(world, self.data_folder / f"{name}.npz")
 
     def wide_test(self) -> FrozenPresses:
-        """Return the wide frozen set."""
+        """The wide frozen set."""
         wide = load_frozen_presses()
         return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
 
