@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.errors import EdgeError
+from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.stability import pareto
@@ -51,7 +52,8 @@ def main(arguments: list[str] | None = None) -> None:
 def run(parts: tuple[str, ...], folder: Path, quick: bool = False) -> list[Case]:
     """Write the report `stability`, and give the rows that are broken."""
     works = {part: _cases(part) for part in parts}  # what lacks is missed before anything is worked out
-    report = Report(_name(parts, quick), folder, quick=quick)
+    sources = [__file__, *(str(Path(__file__).with_name(f"{part}.py")) for part in parts)]
+    report = Report(_name(parts, quick), folder, sources, _used(), quick=quick)
     found: dict[str, list[Case]] = {}
     for part in tracked(parts, "stability", "part"):
         found[part] = list(works[part](quick))
@@ -73,6 +75,11 @@ def run(parts: tuple[str, ...], folder: Path, quick: bool = False) -> list[Case]
         _pareto(report, folder, quick)
     report.write()
     return broken
+
+
+def _used() -> list[Path]:
+    """Return the bundled files that the parts look at."""
+    return [*bundled_models(), BUNDLE_DIR / "frozen.npz", BUNDLE_DIR / "classical.npz"]
 
 
 def _name(parts: tuple[str, ...], quick: bool) -> str:

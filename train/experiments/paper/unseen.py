@@ -95,7 +95,7 @@ def run(bench: Workbench, folder: Path) -> Path:
                 name: Row = {"trained on": trained, "tested on": tested, "taps": given}
                 rows.append(name | error_cells(figures, frozen, "test") | found.cells() | cost)
 
-    report = Report("unseen", folder, quick=bench.quick)
+    report = Report("unseen", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"Held out: {', '.join(HELD_OUT)}. Figures are random glyphs and polygons, {len(FIGURES.surfaces)} to train on "
         f"and {TEST_FIGURES} of each kind, of another seed, to test. All tests are made at the test position, which no "
