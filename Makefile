@@ -54,6 +54,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(BIN)/python tests/system/faults.py 10 --seed 2 --out reports
 	$(BIN)/python tests/system/zenoh_load.py --out reports
 	$(REPORT) tests/system/fuzz.py --inputs 10000000 --seed 1 --blind --out reports/fuzz.md
+	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
 
 reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why
 	@$(BIN)/python -m edge.bench.stale_reports
