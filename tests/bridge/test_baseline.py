@@ -202,6 +202,14 @@ def test_from_counts_takes_what_it_is_given():
             Baseline.from_counts("6", bad, 99.0)
 
 
+def test_a_pad_that_has_drifted_rests_higher_by_that_and_round_the_circle():
+    baseline = made(np.full_like(REST, 65_530))
+    moved = baseline.moved(np.full(REST.shape, 10.5, dtype=np.float32))
+    assert (moved.counts == 4.5).all() and moved.id == baseline.id
+    with pytest.raises(ValueError, match="read-only"):
+        moved.counts[...] = 0
+
+
 def test_too_few_scans_for_a_third_are_refused():
     with pytest.raises(ValueError, match="at least 3"):
         BaselineEstimator(min_scans=2)
