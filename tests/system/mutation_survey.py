@@ -197,6 +197,8 @@ def page(scores: Sequence[Score], seed: int) -> str:
     share = noticed / counted
     verdict = f"{'above' if share > WANTED else 'not above'} the {100 * WANTED:.0f} % that are wanted"
     lines += ["", f"Together {noticed} of {counted}, {100 * share:.1f} %: {verdict}.", ""]
+    if missing := [subject.module for name, subject in SUBJECTS.items() if name not in names]:
+        lines += [f"Not in this run: {', '.join(missing)}.", ""]
     for score in scores:
         if score.survivors:
             lines += [f"## Survivors in {SUBJECTS[score.subject].module}", ""]
