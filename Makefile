@@ -6,7 +6,7 @@ PIP := PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --dis
 
 NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt
 
-.PHONY: run test lint docs models clean
+.PHONY: run test lint docs models reports reports-stale clean
 
 run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 	$(BIN)/edge-sr demo --view
@@ -33,6 +33,24 @@ models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the b
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --int8 $(TAPS)
 	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
+
+REPORT := nice $(BIN)/python
+
+reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each command stands alone, too
+	$(REPORT) -m train.experiments all
+	$(REPORT) -m export.stability
+	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
+	$(BIN)/edge-sr bench --threads 1 --by-surface --out reports
+	$(BIN)/edge-sr bench --only stsr-int8 --threads 1 2 --load --out reports/load
+	$(BIN)/edge-sr bench --system --out reports/system
+	$(REPORT) tests/system/cycles.py --out reports/cycles.md
+	$(BIN)/python tests/system/faults.py 10 --seed 2 --out reports
+	$(BIN)/python tests/system/zenoh_load.py --out reports
+	$(REPORT) tests/system/fuzz.py --inputs 10000000 --seed 1 --blind --out reports/fuzz.md
+	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
+
+reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why
+	@$(BIN)/python -m edge.bench.stale_reports
 
 data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
 	$(BIN)/python -m train.data.make_presses $@ --count 100000 --seed 1

@@ -10,7 +10,7 @@ quantised. That network is restored from the float32 graph's own weights, or loa
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -21,6 +21,7 @@ import torch
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from edge.bench.provenance import provenance
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
@@ -55,6 +56,7 @@ Measured: .10 on the test set, .17 on recordings.
 """
 INT8_EXTREME: Final = 0.75
 """On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
+FROZEN: Final = BUNDLE_DIR / "frozen.npz"
 READINGS: Final = ("test set", "recordings")
 PASSES: Final = 1 + len(LEVELS)
 """Passes over all windows of a model: by torch, and at each level."""
@@ -225,6 +227,14 @@ def table(rows: list[Parity]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
+def page(rows: list[Parity], models: Sequence[Path]) -> str:
+    """Return the report `parity`."""
+    command = "python -m export.verify edge/models/*.onnx --out reports/parity.md"
+    made = provenance(command, [__file__], [*models, FROZEN])
+    text = f"With torch {torch.__version__}. Of the extreme windows the worst one of each level is shown."
+    return f"# parity\n\n{made}\n\n{text}\n\n{table(rows)}\n"
+
+
 def _worst(rows: list[Parity]) -> list[Parity]:
     """Return all rows of readings; of extreme windows those that break a bound, or else the largest difference."""
     shown: dict[tuple[str, str, str], list[Parity]] = {}
@@ -250,9 +260,10 @@ def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os
         default=Path(told) if told else None,
         help="folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)",
     )
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")
     options = parser.parse_args(arguments)
     try:
-        frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+        frozen = load_frozen_set(FROZEN)
         with Progress("verifying", len(options.models) * PASSES, "pass") as bar:
             rows = [
                 row
@@ -262,6 +273,8 @@ def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"verify: {error}")
     sys.stdout.write(table(rows) + "\n")
+    if options.out is not None:
+        options.out.write_text(page(rows, options.models), encoding="utf-8")
     broken = sum(bool(row.broken) for row in rows)
     if broken:
         sys.exit(f"verify: {broken} of {len(rows)} comparisons break a bound")

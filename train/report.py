@@ -1,13 +1,10 @@
 """Report of an experiment: a table as CSV and Markdown, a plot as PNG, and the command and machine that made them."""
 
 import csv
-import os
-import platform
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +12,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+
+from edge.bench.provenance import provenance
+from train.data.generation_config import SEED
 
 Cell = str | int | float | None
 Row = dict[str, Cell]
@@ -30,11 +30,17 @@ class Report:
     Args:
         name: of the experiment, and of its files.
         folder: where they go; made if absent.
+        sources: file or files of the experiment, for the head of the page.
+        models: files of models and frozen sets that it uses, looked at when the page is written.
         quick: the run was cut short for a test: said at the top of the page.
     """
 
-    def __init__(self, name: str, folder: Path, *, quick: bool = False) -> None:
+    def __init__(
+        self, name: str, folder: Path, sources: str | Sequence[str], models: Iterable[Path] = (), *, quick: bool = False
+    ) -> None:
         self._path = folder / name
+        self._sources = [sources] if isinstance(sources, str) else sources
+        self._models = models
         self._quick = quick
         self._parts: list[str] = []
         folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +80,7 @@ class Report:
 
     def write(self) -> Path:
         """Write the page, and say where it lies."""
-        head = [f"# {self._path.name}", _circumstances()]
+        head = [f"# {self._path.name}", str(provenance(_command(), self._sources, self._models, SEED))]
         if self._quick:
             head.append("**A quick run, for the tests: no figure here means anything.**")
         page = self._file(".md", "")
@@ -112,8 +118,7 @@ def _shown(cell: Cell) -> str:
     return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
 
 
-def _circumstances() -> str:
+def _command() -> str:
+    """Return the command line of this process."""
     module = getattr(sys.modules["__main__"].__spec__, "parent", None)
-    command = shlex.join(["python", *(["-m", module] if module else []), *sys.argv[1:]])
-    date = datetime.now(UTC).date().isoformat()
-    return f"`{command}`, {date}, {platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
+    return shlex.join(["python", *(["-m", module] if module else []), *sys.argv[1:]])

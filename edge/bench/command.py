@@ -22,6 +22,7 @@ from edge.bench.machine import this_machine
 from edge.bench.macs import macs_of
 from edge.bench.plot import draw
 from edge.bench.processes import busy_core, measured, start_up
+from edge.bench.provenance import provenance, with_head
 from edge.bench.record import Facts, Record, RunTimeRow, read_record
 from edge.bench.system_section import show_system
 from edge.bench.timing import Pace, Times
@@ -118,7 +119,7 @@ def run(settings: Settings, out: TextIO, err: TextIO) -> int:
         return INTERRUPTED
     finally:
         if record.errors or record.run_times or record.system:  # an earlier bench is not replaced by nothing
-            _write(record, page, settings.out)
+            _write(record, page, settings.out, [Path(subject.path) for subject in measured_ones if subject.path])
     return 0
 
 
@@ -239,13 +240,15 @@ def _compare(record: Record, earlier: dict[str, Any], path: Path, page: Page) ->
         page.say(tables.compare_line(row))
 
 
-def _write(record: Record, page: Page, folder: Path | None) -> None:
+def _write(record: Record, page: Page, folder: Path | None, models: Sequence[Path]) -> None:
     if folder is None:
         return
+    sources = ["edge/bench/command.py", "edge/bench/worker.py", *(["edge/__main__.py"] if record.system else [])]
+    made = provenance(record.command, sources, [*models, subjects.FROZEN_FILE])
     try:
         (folder / "bench.json").write_text(record.to_json())
         (folder / "bench.csv").write_text(record.to_csv())
-        (folder / "bench.md").write_text("\n".join(page.lines) + "\n")
+        (folder / "bench.md").write_text(with_head("\n".join(page.lines) + "\n", made))
         rows = record.front_rows()
         if rows:
             draw(rows, folder / "bench.png", f"{record.date}, {record.machine}")

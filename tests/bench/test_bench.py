@@ -20,6 +20,7 @@ from edge.bench.command import Settings, run
 from edge.bench.contenders import Subject, bundled_subjects, classical_subjects
 from edge.bench.errors import BenchError
 from edge.bench.plot import draw
+from edge.bench.provenance import read_provenance, with_head
 from edge.cli.main import main
 from edge.errors import ModelError
 from edge.evaluation.test_set import load_frozen_set
@@ -82,7 +83,9 @@ def test_a_file_that_is_no_model_is_told_and_left_out_and_another_scale_is_run_t
 
 def test_the_page_says_what_the_files_keep(bench):
     settings, out, _, told = bench
-    assert (settings.out / "bench.md").read_text() == out
+    page = (settings.out / "bench.md").read_text()
+    made = read_provenance(page)
+    assert made is not None and made.command == settings.command and page == with_head(out, made)
     assert (settings.out / "bench.png").read_bytes().startswith(b"\x89PNG")
     assert len((settings.out / "bench.csv").read_text().splitlines()) == 1 + 3 * 2
     assert "peer theirs (run time only, weights random, seed 0)" in out

@@ -12,6 +12,7 @@ from firmware_bridge.errors import BaselineRefusedError, RecordingError
 from firmware_bridge.geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.zeroing.baseline import (
+    LAST_UNIX_S,
     LOAD_LIMIT_COUNTS,
     Baseline,
     BaselineEstimator,
@@ -202,6 +203,14 @@ def test_from_counts_takes_what_it_is_given():
             Baseline.from_counts("6", bad, 99.0)
 
 
+def test_a_pad_that_has_drifted_rests_higher_by_that_and_round_the_circle():
+    baseline = made(np.full_like(REST, 65_530))
+    moved = baseline.moved(np.full(REST.shape, 10.5, dtype=np.float32))
+    assert (moved.counts == 4.5).all() and moved.id == baseline.id
+    with pytest.raises(ValueError, match="read-only"):
+        moved.counts[...] = 0
+
+
 def test_too_few_scans_for_a_third_are_refused():
     with pytest.raises(ValueError, match="at least 3"):
         BaselineEstimator(min_scans=2)
@@ -279,6 +288,16 @@ def refused(tmp_path: Path, changed: object, match: str) -> None:
 )
 def test_files_that_are_none(tmp_path, changes, match):
     refused(tmp_path, document(tmp_path) | changes, match)
+
+
+def test_the_least_reading_and_the_last_second_are_lawful(tmp_path):
+    path = tmp_path / "zero.json"
+    content = document(tmp_path)
+    content["baselines"][0] |= {"counts": with_cell(0), "created_unix_s": LAST_UNIX_S}
+    del content["baselines"][0]["id"]
+    path.write_text(json.dumps(content))
+    baseline = load_baselines(path)["4"]
+    assert baseline.counts.min() == 0 and baseline.created_unix_s == LAST_UNIX_S
 
 
 def with_cell(cell: object) -> list:

@@ -85,6 +85,33 @@ def test_a_controller_that_cannot_do_it_is_refused(changed):
         bit_timing(CANDLELIGHT._replace(**changed))
 
 
+@pytest.mark.parametrize(
+    ("limits", "timing"),
+    [
+        ({"brp_min": 3, "brp_max": 3}, (6, 7, 2, 1, 3)),
+        ({"tseg1_min": 13, "tseg1_max": 13, "tseg2_min": 2, "tseg2_max": 2}, (6, 7, 2, 1, 3)),
+        ({"clock_hz": 8_000_000, "tseg2_min": 2, "tseg2_max": 2}, (2, 3, 2, 1, 1)),  # sampled at .75
+        ({"clock_hz": 10_000_000, "tseg2_max": 1}, (4, 4, 1, 1, 1)),  # and at .9
+        ({"clock_hz": 8_000_000, "tseg2_min": 0, "tseg2_max": 1}, (3, 3, 1, 1, 1)),
+    ],
+)
+def test_limits_belong_to_what_the_controller_can_do(limits, timing):
+    assert bit_timing(CANDLELIGHT._replace(**limits)) == timing
+
+
+def test_a_second_segment_longer_than_the_controller_has_is_not_tried():
+    with pytest.raises(ValueError, match="cannot do 1 Mbit/s"):
+        bit_timing(CANDLELIGHT._replace(clock_hz=16_000_000, brp_max=1, tseg2_max=1))
+
+
+def test_numbers_of_the_protocol():
+    """Source: Linux, drivers/net/can/usb/gs_usb.c."""
+    assert (gs_usb.REQUEST_OUT, gs_usb.REQUEST_IN) == (0x41, 0xC1)
+    requests = (gs_usb.HOST_FORMAT, gs_usb.BIT_TIMING, gs_usb.MODE, gs_usb.BIT_TIMING_LIMITS, gs_usb.DEVICE_CONFIG)
+    assert requests == (0, 1, 2, 4, 5)
+    assert (gs_usb.HARDWARE_STAMPS, gs_usb.LPC546XX_QUIRK, gs_usb.OVERFLOW_FLAG) == (0x10, 0x200, 1)
+
+
 def test_answers_that_are_too_short():
     with pytest.raises(ValueError, match="39 bytes, expected 40"):
         BitTimingLimits.from_bytes(bytes(39))
@@ -202,6 +229,23 @@ def test_a_header_that_no_adapter_sends_is_skipped(wrong):
     stream = host_frame(SCAN[0], stamp_us=7, **wrong) + host_frame(SCAN[1], stamp_us=8)
     assert [one.frame for one in decoder.feed(stream)] == [SCAN[1]]
     assert decoder.counters()["skipped_bytes"] == 24
+
+
+def test_the_highest_flags_and_the_highest_id_are_told_from_those_that_nothing_sends():
+    decoder = GsUsbDecoder(stamped=False)
+    decoder.feed(host_frame(SCAN[0], flags=13, fd=True))
+    assert decoder.counters()["fd_frames"] == 1
+    decoder.feed(host_frame(CanFrame(0x7FF, b"")))
+    assert (decoder.counters()["frames"], decoder.counters()["skipped_bytes"]) == (1, 0)
+    decoder.feed(host_frame(CanFrame(0x800, b"")))
+    assert decoder.counters()["frames"] == 1
+
+
+def test_one_frame_behind_a_wreck_is_enough_to_be_in_step_again():
+    decoder = GsUsbDecoder(stamped=False)
+    stream = b"\xfe" * 5 + host_frame(SCAN[0]) + host_frame(SCAN[1], channel=3) + host_frame(SCAN[2])
+    assert [one.frame for one in decoder.feed(stream)] == [SCAN[0], SCAN[2]]
+    assert (decoder.counters()["other_channels"], decoder.counters()["skipped_bytes"]) == (1, 5)
 
 
 @given(st.integers(1, 23))

@@ -317,6 +317,25 @@ def test_who_closes_no_scan_does_not_change_how_many_readings_are_waited_for():
     assert assembler.fewest_missing() == 16
 
 
+def test_a_scan_is_waited_for_as_long_as_the_slowest_sensor_takes_and_no_longer():
+    assert LONGEST_SCAN_NS == 1_000_000_000
+    assembler = ScanAssembler(USPA44_MAP)
+    feed(assembler, cycle(0) + cycle(1))
+    feed(assembler, cycle(0, "6") + cycle(1, "6")[:9], 60)  # open since 76
+    assembler.feed(cycle(2)[0], 76 + LONGEST_SCAN_NS)
+    assert assembler.fewest_missing() == 7
+    assembler.feed(cycle(2)[1], 77 + LONGEST_SCAN_NS)
+    assert assembler.fewest_missing() == 14
+
+
+def test_a_sensor_that_was_never_seen_is_not_fed_by_the_cycle():
+    assembler = ScanAssembler(USPA44_MAP)
+    feed(assembler, cycle(0))
+    ids = {sensor: [can_id for can_id, _ in USPA44_MAP.wire_order(sensor)] for sensor in "45"}
+    cycles = {sensor: USPA44_MAP.cycle(ids[sensor]) for sensor in ids}
+    assert {sensor: assembler.longest_cycle_ns(one) > 0 for sensor, one in cycles.items()} == {"4": True, "5": False}
+
+
 def test_a_broken_link_leaves_no_half_scan_to_be_joined():
     """Half of a cycle, the link away for less than a scan may stand open, and the other half of a later one."""
     assembler = ScanAssembler(USPA44_MAP)

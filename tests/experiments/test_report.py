@@ -31,7 +31,7 @@ def test_a_single_tap_has_no_spread():
 
 
 def test_a_report_is_a_page_a_table_and_a_plot(tmp_path):
-    report = Report("mine", tmp_path / "reports")
+    report = Report("mine", tmp_path / "reports", __file__)
     report.say("What was done.")
     report.table([{"method": "a", "PSNR dB": 30.0}, {"method": "b", "run time ms": None}], "All methods.")
     with report.figure() as figure:
@@ -43,4 +43,4 @@ def test_a_report_is_a_page_a_table_and_a_plot(tmp_path):
         assert next(csv.DictReader(file)) == {"method": "a", "PSNR dB": "30.0", "run time ms": ""}
     assert image.imread(tmp_path / "reports" / "mine.png").std() > 0
     assert "quick run" not in page
-    assert "quick run" in Report("mine", tmp_path, quick=True).write().read_text()
+    assert "quick run" in Report("mine", tmp_path, __file__, quick=True).write().read_text()

@@ -15,6 +15,7 @@ from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, bundled_models, fi
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import load_frozen_presses
+from train.experiments.support.report import bootstrap_interval
 
 IN_FLOAT = ("stsr", "stsr-small", "mtsr2", "mtsr4")
 NAMES = (*IN_FLOAT, *(f"{name}-int8" for name in IN_FLOAT))
@@ -95,11 +96,15 @@ def test_every_model_beats_the_classical_methods(name):
 
 @pytest.mark.parametrize("test_set", [frozen, wide])
 def test_no_model_of_several_taps_is_clearly_better_than_the_default(test_set):
-    """Why STSR is the default. Measured on the wide set 27.27 dB against 27.28, on the figures 28.6 against 28.1."""
+    """Why STSR is the default. Measured on the wide set 27.27 dB against 27.28, on the figures 28.6 against 28.1.
+
+    Clearly: the difference's 95 % interval, frames of one tap drawn together, lies above zero.
+    """
     assert DEFAULT_MODEL == "stsr-int8"
     for name in NAMES:
         if (taps := all_taps(name)) > 1:
-            assert psnr_db(name, taps, test_set) < psnr_db(DEFAULT_MODEL, 1, test_set) + 0.1, name
+            gained_db = errors(name, taps, test_set)["psnr_db"] - errors(DEFAULT_MODEL, 1, test_set)["psnr_db"]
+            assert bootstrap_interval(gained_db, test_set().tap)[0] <= 0, name
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -279,3 +279,9 @@ def test_one_thread_sequential_without_spinning(session):
     assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
     assert options.get_session_config_entry("session.set_denormal_as_zero") == "1"
     assert session._session.get_providers() == ["CPUExecutionProvider"]
+
+
+@pytest.mark.parametrize("changes", [{"scale": 64}, {"traction_scale": 1}])
+def test_a_contract_at_the_edge_of_what_is_lawful_is_read(changes):
+    contract = make_contract(**changes)
+    assert Contract.from_metadata(contract.to_metadata()) == contract

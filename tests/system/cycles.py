@@ -9,6 +9,8 @@ from pathlib import Path
 
 from cycle_samples import READERS, Reader, Worth, bus, doubling, losing, pausing, read, swapping
 
+from edge.bench.provenance import provenance
+
 CYCLES = 1000
 
 
@@ -48,9 +50,10 @@ def main() -> None:
     lines = [
         "# Scans of one cycle",
         "",
-        "Written by `python tests/system/cycles.py --out reports/cycles.md`. Every reading is the number of its",
-        "cycle, so a scan of two is seen at once. In each cell: whole scans with readings of two cycles, of all whole",
-        "scans; and torn ones.",
+        str(provenance("python tests/system/cycles.py --out reports/cycles.md", [__file__], seed=0)),
+        "",
+        "Every reading is the number of its cycle, so a scan of two is seen at once. In each cell: whole scans with",
+        "readings of two cycles, of all whole scans; and torn ones.",
         "",
         "| | " + " | ".join(reader.name for reader in READERS) + " |",
         "|---" * (1 + len(READERS)) + "|",

@@ -20,7 +20,8 @@ from fault_server import judge_server, run_against_server
 
 from edge.bench.errors import BenchError
 from edge.bench.live_report import Page
-from edge.bench.machine import this_machine
+from edge.bench.provenance import provenance
+from edge.inference.bundled import DEFAULT_MODEL, find_model
 
 SETTLE_S: Final = 2.0
 SERVER_S: Final = 20.0
@@ -50,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"MINUTES is {options.minutes:g}, expected .25 or more")
     page = Page(sys.stdout, sys.stderr)
     command = f"python tests/system/faults.py {options.minutes:g} --seed {options.seed}"
-    page.say(f"# Faults\n\n    {command}\n\n{this_machine()}\n\n{_TEXT}")
+    models = [find_model(DEFAULT_MODEL)]
+    head = provenance(command, [__file__, "edge/__main__.py"], models, options.seed)
+    page.say(f"# Faults\n\n{head}\n\n{_TEXT}")
     try:
         with tempfile.TemporaryDirectory() as folder:
             ran = run_among_faults(schedule(60 * options.minutes), options.seed, Path(folder))

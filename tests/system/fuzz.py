@@ -10,7 +10,6 @@ What breaks a promise is kept as a file and ends the run with exit code 1.
 import argparse
 import json
 import os
-import platform
 import re
 import subprocess
 import sys
@@ -109,18 +108,19 @@ def child(name: str, options: list[str]) -> None:
     atheris.Fuzz()
 
 
-def page(rows: list[dict[str, object]]) -> str:
+def page(rows: list[dict[str, object]], seed: int) -> str:
     """Figures as a page."""
+    from edge.bench.provenance import provenance
+
     columns = list(rows[0])
     lines = [columns, ["---"] * len(columns), *([row[column] for column in columns] for row in rows)]
     table = "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    command = " ".join(["python", "tests/system/fuzz.py", *sys.argv[1:]])
+    made = provenance(command, [__file__, "tests/system/fuzz_targets.py"], seed=seed)
     return (
-        "# What the parsers were fed\n\n"
-        f"`{' '.join(['python', 'tests/system/fuzz.py', *sys.argv[1:]])}`, "
-        f"{sum(int(str(row['inputs'])) for row in rows):,} inputs, Python {platform.python_version()}, "
-        f"{platform.machine()}, {os.cpu_count()} cores, "
-        f"{time.strftime('%Y-%m-%d')}. Edges and features are of this repository's own code; `held`: no promise was "
-        f"broken, no input took {INPUT_LIMIT_S} s or {MEMORY_LIMIT_MB} MB.\n\n{table}\n"
+        f"# What the parsers were fed\n\n{made}\n\n"
+        f"{sum(int(str(row['inputs'])) for row in rows):,} inputs. Edges and features are of this repository's own "
+        f"code; `held`: no promise was broken, no input took {INPUT_LIMIT_S} s or {MEMORY_LIMIT_MB} MB.\n\n{table}\n"
     )
 
 
@@ -161,7 +161,7 @@ def main(arguments: list[str]) -> int:
         with bar.aside():
             print(json.dumps(rows[-1]), flush=True)
         if options.out is not None:
-            options.out.write_text(page(rows))
+            options.out.write_text(page(rows, options.seed))
     bar.close()
     return 0 if all(row.get("held", True) for row in rows) else 1
 

@@ -28,7 +28,7 @@ from edge.bench.contenders import FROZEN_FILE
 from edge.bench.errors import BenchError
 from edge.bench.gate_savings import REST, stream
 from edge.bench.live_report import Page
-from edge.bench.machine import this_machine
+from edge.bench.provenance import provenance
 from edge.bench.report import head, line
 from edge.errors import EdgeError
 from edge.evaluation.test_set import load_frozen_set
@@ -286,9 +286,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         zenoh_version = version("eclipse-zenoh")
         if options.out is not None:  # found out before minutes are spent
             options.out.mkdir(parents=True, exist_ok=True)
-        page.say(
-            f"# zenoh\n\n    python tests/system/zenoh_load.py {command}\n\n{this_machine()}, zenoh {zenoh_version}\n"
-        )
+        command = f"python tests/system/zenoh_load.py {command}"
+        made = provenance(command, [__file__], [find_model(DEFAULT_MODEL), FROZEN_FILE])
+        page.say(f"# zenoh\n\n{made}\n\nWith zenoh {zenoh_version}.\n")
         page.say(f"{_TEXT.format(**asked)}\n\n{head(_COLUMNS)}")
         runs: dict[str, list[tuple[float, ...]]] = {setup: [] for setup in _SETUPS}
         for setup in page.tracked([one for one in _SETUPS for _ in range(options.runs)], "zenoh", "run"):

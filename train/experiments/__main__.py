@@ -6,6 +6,7 @@ python -m train.experiments table3 angle --reports reports
 import argparse
 import importlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -64,7 +65,7 @@ def main(arguments: list[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="\n".join(f"  {name:15} {what}" for name, what in EXPERIMENTS.items()),
     )
-    parser.add_argument("names", nargs="+", choices=EXPERIMENTS, metavar="NAME", help="which, in this order")
+    parser.add_argument("names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="which, in this order")
     parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
     parser.add_argument("--data", type=Path, default=Path("data"), help="datasets, made where they lack")
     parser.add_argument(
@@ -85,8 +86,9 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     bench = Workbench(options.data, options.checkpoints, options.quick, options.found, options.models, options.before)
     try:
-        for name in tracked(options.names, "experiments", "page"):
-            page = importlib.import_module(module_of(name)).run(bench, options.reports)
+        names = list(EXPERIMENTS) if "all" in options.names else options.names
+        for name in tracked(names, "experiments", "page"):
+            page = importlib.import_module(module_of(name)).run(replace(bench, used=set()), options.reports)
             sys.stdout.write(f"{page}\n")
     except (TrainError, EdgeError) as error:
         sys.exit(f"experiments: {error}")

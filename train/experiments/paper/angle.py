@@ -33,7 +33,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         row: Row = {"network": "MTSR-2", "angle deg": angle_deg} | error_cells(figures, sets["test"], "test")
         row |= {"over STSR dB": f"{gain.mean():+.2f} ({low:+.2f}..{high:+.2f})"}
         rows.append(row | cost_cells(net) | bench.training_cells(told))
-    report = Report("angle", folder, quick=bench.quick)
+    report = Report("angle", folder, __file__, bench.used, quick=bench.quick)
     best = max(range(len(gains)), key=lambda i: gains[i][0])
     apart = [
         f"{angle_deg:g}" for angle_deg, (_, _, high) in zip(ANGLES_DEG, gains, strict=True) if high < gains[best][1]

@@ -153,7 +153,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         psnr = psnr_db(infer(net, test.windows(count)[ends])[0], truth, test.full_scale_mm)
         rows.append({"what": "compact networks", "taps": count, "PSNR dB": with_interval(psnr, np.arange(len(psnr)))})
         curves.setdefault("compact networks", []).append(float(psnr.mean()))
-    report = Report("bound", folder, quick=bench.quick)
+    report = Report("bound", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"The 18 surfaces, known but for their place, at the end of each test tap (frame {FRAMES} of {FRAMES}, "
         f"{TEST_FORCE_N:g} N). Cross-talk and hysteresis are left out of the bound, so it is a little too good. A "

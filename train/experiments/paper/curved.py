@@ -56,7 +56,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     meshes = _QUICK_MESHES if bench.quick else MESHES
     steps = 2 if bench.quick else STEPS
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
-    report = Report("curved", folder, quick=bench.quick)
+    report = Report("curved", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "Surfaces at p5 r0; which pixels touch is the layer's answer, the same for all methods. One PSF: tPSF, its "
         f"plateau at the indentation. One PSF, heights: the surface's own height where it touches, and one PSF beside "

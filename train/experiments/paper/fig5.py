@@ -59,7 +59,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     surface = np.repeat(np.array(names)[held_out], taps.counts.shape[1])
     force_n, indentation_mm = taps.force_n[held_out].ravel(), taps.indentation_mm[held_out].ravel()
 
-    report = Report("fig5", folder, quick=bench.quick)
+    report = Report("fig5", folder, __file__, bench.used, quick=bench.quick)
     report.table(
         [row for name in SURFACES for row in _by_force(name, force_n, seen, surface == name)],
         "Alpha and beta by contact force at poses that the network has not seen: means, and the median of the betas "

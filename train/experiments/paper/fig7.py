@@ -102,7 +102,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         for mesh, found in verdicts.items()
     ]
 
-    report = Report("fig7", folder, quick=bench.quick)
+    report = Report("fig7", folder, __file__, bench.used, quick=bench.quick)
     psf = next(method for method in methods if method.name == "PSF")
     report.say(_how(len(surfaces), steps, psf.note))
     report.table(

@@ -71,7 +71,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     figures = {
         method.name: [errors(method, scans) for scans in bins] for method in tracked(methods, "forces", "method")
     }
-    report = Report("force", folder, quick=bench.quick)
+    report = Report("force", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"The {len(sequences)} test taps, newest scan somewhere on its press, earlier taps at their ends of "
         f"{TEST_FORCE_N:g} N; forces drawn evenly over their logarithm, {draws} a tap and "

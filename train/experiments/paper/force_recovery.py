@@ -97,7 +97,7 @@ def run(bench: Workbench, folder: Path) -> Path:
             cells: Row = {f"{gauge.name} error %": round(figures[gauge.name][i]["error"], 2) for gauge in gauges}
             by_surface.append({"nuisances": condition, "surface": str(name)} | cells)
 
-    report = Report("force-recovery", folder, quick=bench.quick)
+    report = Report("force-recovery", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{len(sequences)} surfaces at the held-out position, each pressed to {TEST_FORCE_N:g} N (or as deep as may "
         f"be) in {PRESS_S:g} s, held {HOLD_S:g} s, released in {RELEASE_S:g} s, then {REST_S:g} s at no load, at "

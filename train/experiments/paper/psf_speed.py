@@ -46,7 +46,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """
     maps, rounds = (8, 2) if bench.quick else (32, 7)
     depth, beta_mm = _contacts(16 * _BATCH)
-    report = Report("psf_speed", folder, quick=bench.quick)
+    report = Report("psf_speed", folder, __file__, bench.used, quick=bench.quick)
     rows = _compare("gaussian", {"two matrix products": spread, "FFT": spread_by_fft}, depth, beta_mm, maps, rounds)
     rows += _compare("exponential", {"FFT": spread_by_fft}, depth, beta_mm, maps, rounds)
     routes = [row for row in rows if row["route"] != _DIRECT]

@@ -49,7 +49,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     for row, figures in (*_classical(bench, data, judged), *_networks(bench, data, sets["validation"], judged)):
         rows.append(row)
         test_psnr[str(row["method"])] = figures["psnr_db"]
-    report = Report("table3", folder, quick=bench.quick)
+    report = Report("table3", folder, __file__, bench.used, quick=bench.quick)
     test = judged["test"]
     report.say(
         f"{len(test)} frames of {len(test.surface)} taps a set, one in {ONE_IN} evenly over each tap, the same for "

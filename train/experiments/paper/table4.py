@@ -31,7 +31,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         means.append(float(figures["psnr_db"].mean()))
         row |= {"paper's test PSNR dB": paper_db, "paper's test SSIM": paper_ssim}
         rows.append(row | cost_cells(net) | bench.training_cells(told))
-    report = Report("table4", folder, quick=bench.quick)
+    report = Report("table4", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "The compact STSR. Truth is made at x20 and brought to each scale with anti-aliasing. At x10 the layers that"
         " make pixels are as old as the base network, at the other scales they are trained from nothing for the last"

@@ -47,7 +47,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         row |= cost_cells(net)
         rows.append(row | {"its own min": round(told["elapsed_s"] / 60, 1), "trained on": told["device"]})
         course.append(_course(name, told))
-    report = Report("trained_out", folder, quick=bench.quick)
+    report = Report("trained_out", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{len(test)} frames of {len(test.surface)} taps a set; full scale {test.full_scale_mm} mm. PSNR with its 95 % "
         f"interval by tap. A name's numbers are passes over the same {SEQUENCES} sequences, from nothing and, after a "

@@ -56,7 +56,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         row for (name, tested), seen in found.items() for row in _distance_rows(name, tested, seen, distance_mm[tested])
     ]
 
-    report = Report("calibration", folder, quick=bench.quick)
+    report = Report("calibration", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "Deviations are scaled once, on the validation position; here they are judged at the test position, on the 18 "
         f"surfaces and on {TEST_FIGURES} glyphs that no network was trained on. Intervals of the mean are by tap."

@@ -53,7 +53,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         for name, frozen in sets.items()
         for given in range(1, model.contract.taps + 1)
     }
-    report = Report("confidence", folder, quick=bench.quick)
+    report = Report("confidence", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "`expected_rmse_mm` of a record against the RMS error that came out, over all pixels; error of the expectation "
         "is its mean absolute error as a share of the mean error. Intervals of the mean are by tap."

@@ -71,10 +71,10 @@ class Told:
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `dead`; the full run takes a few minutes."""
-    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    frozen = load_frozen_set(bench.use(BUNDLE_DIR / "frozen.npz"))
     frozen = thinned(frozen, len(frozen) // 4 if bench.quick else _FRAMES_APART)
-    estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
-    report = Report("dead", folder, quick=bench.quick)
+    estimator = load_estimator(bench.use(TAXELS), (USPA44.rows, USPA44.cols))
+    report = Report("dead", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{len(frozen)} frames of {len(np.unique(frozen.tap))} taps of the frozen test set, one in {_FRAMES_APART}, "
         f"through edge.perception.runtime; seed {SEED}. Which taxels fail is drawn for each tap, those of fewer "
@@ -88,7 +88,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     )
     rows: list[Row] = []
     for name in MODELS:
-        model = ModelSession(find_model(name))
+        model = ModelSession(bench.use(find_model(name)))
         counts = (0, 1, MOST_DEAD) if bench.quick else range(MOST_DEAD + 1)
         for dead in tracked(counts, name, "count"):
             for fault in FAULTS if dead in (1, 4, 8) else ("stuck at random",):

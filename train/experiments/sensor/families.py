@@ -46,12 +46,13 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate all methods, and write the report `families`."""
     wide = bench.wide_test()
     model = load_shipped(bench.models)
+    bench.use(bench.models / f"{model.name}.onnx")
     validation = freeze_presses(bench.presses("validation", VALIDATION), SEED)
     baselines, chosen = fit_baselines(bench.presses("gripped", TRAINING), validation)
     best = max(baselines, key=lambda one: one.validation_db).name
     found = _judged(model, baselines, wide)
 
-    report = Report("families", folder, quick=bench.quick)
+    report = Report("families", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"`{model.name}` of contract version {model.contract.version} (training "
         f"{model.contract.training_sha256[:12]}), through the runtime's session, one tap. Wide test set: {len(wide)} "

@@ -69,7 +69,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Repeat the fit, compare, and write the report."""
     from train.physics.whole_pad import WholePad  # here, because it needs FElupe
 
-    report = Report("free_sides", folder, quick=bench.quick)
+    report = Report("free_sides", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "Linear elements of the whole pad (20 x 20 x 4.5 mm, bonded below, free sides) under rigid faces, against the "
         "infinite layer that may be pressed on the pad's 42 x 42 cells only, bare and with `FreeSides(1)`. Pressures "

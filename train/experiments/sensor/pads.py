@@ -72,11 +72,12 @@ def run(bench: Workbench, folder: Path) -> Path:
     jobs = cast(Iterator[PressSet], pool(joblib.delayed(pressed)(one.pad, shapes) for one in off))
     read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
     model = load_shipped(bench.models)
+    bench.use(bench.models / f"{model.name}.onnx")
     scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
     if bench.before is not None:
-        scores[_BEFORE] = _psnr_db(ModelSession(bench.before), read, NOTHING)
+        scores[_BEFORE] = _psnr_db(ModelSession(bench.use(bench.before)), read, NOTHING)
 
-    report = Report("pads", folder, quick=bench.quick)
+    report = Report("pads", folder, __file__, bench.used, quick=bench.quick)
     plain = {name: with_interval(psnr[NONE_OFF], np.arange(count)) for name, psnr in scores.items()}
     report.say(
         f"`{model.name}` of contract version {model.contract.version} (training "

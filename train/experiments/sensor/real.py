@@ -132,7 +132,8 @@ def run(bench: Workbench, folder: Path) -> Path:
         DatasetError: there are no recordings, or no presses.
     """
     grips = recorded_grips(recordings_folder())
-    model = ModelSession(find_model(DEFAULT_MODEL))
+    bench.use(TAXELS)
+    model = ModelSession(bench.use(find_model(DEFAULT_MODEL)))
     readings, truth = drawn(_presses(bench, "gripped"), _QUICK_FITTED_ON if bench.quick else _FITTED_ON)
     operator = fit_linear_map(truth.reshape(len(truth), -1), z_of(readings), _RIDGE)
 
@@ -146,7 +147,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         for grip, said in zip(grips, hidden, strict=True):
             said[:, taxel] = _degraded(play(grip, model, taxel).patterns, operator)[:, taxel]
 
-    classical = fitted_methods(BUNDLE_DIR / "classical.npz", SCALE)
+    classical = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)
     told = {
         model.name: (
             [one.patterns for one in whole],
@@ -158,7 +159,7 @@ def run(bench: Workbench, folder: Path) -> Path:
             classical["linear map"], whole, [linear_from_others(z_of(readings), one) for one in z]
         ),
     }
-    report = Report("real", folder, quick=bench.quick)
+    report = Report("real", folder, __file__, bench.used, quick=bench.quick)
     report.say(_method(whole, model.name))
     report.say(_unexplained(_presses(bench, "validation"), operator))
     rows: list[Row] = [

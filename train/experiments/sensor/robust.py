@@ -53,7 +53,7 @@ def run(bench: Workbench, folder: Path) -> Path:
             gains[f"{sweep.name} {_label(severity)} {sweep.unit}"] = four - one
 
     bounds = [_bound(sweep, method.name, curves[sweep.name][method.name]) for sweep in sweeps for method in methods]
-    report = Report("robust", folder, quick=bench.quick)
+    report = Report("robust", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{len(plain.surface)} taps at the held-out position, {len(plain)} frames, clean sequences the same "
         "everywhere; of the nuisances (train.physics.sensor_noise) one is changed, the others stay at their "

@@ -31,6 +31,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Integrate tractions, compare the methods, and write the report `wrench`."""
     wide = bench.wide_test()
     model = load_shipped(bench.models)
+    bench.use(bench.models / f"{model.name}.onnx")
     truth = true_loads(wide)
     found: dict[str, Loads] = {}
     for known in tracked(KNOWN, "inferring", "pass"):
@@ -40,7 +41,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         found[SHORT[known]] = loads(traction, model.contract.traction_scale or TRACTION_SCALE)
     found |= _linear(bench, wide)
 
-    report = Report("wrench", folder, quick=bench.quick)
+    report = Report("wrench", folder, __file__, bench.used, quick=bench.quick)
     size = np.sqrt(np.mean(np.square(truth[:, :4]), axis=0))
     report.say(
         f"`{model.name}` of contract version {model.contract.version} (training "

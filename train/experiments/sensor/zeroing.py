@@ -146,8 +146,8 @@ class Tally:
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `zeroing`."""
-    report = Report("zeroing", folder, quick=bench.quick)
-    model = ModelSession(find_model(MODEL))
+    report = Report("zeroing", folder, __file__, bench.used, quick=bench.quick)
+    model = ModelSession(bench.use(find_model(MODEL)))
     rows: list[Row] = []
     traces: dict[str, dict[str, list[float]]] = {}
     found = recording_paths(recordings_folder())

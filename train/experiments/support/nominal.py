@@ -32,7 +32,7 @@ def nominal_rows(bench: Workbench, model: ModelSession) -> list[Row]:
     even = Nuisances().without("gain_spread")
     figures = random_figures(TEST_FIGURES, TEST_FIGURES, TEST_SEED)
     kinds = {"glyphs": figures[:TEST_FIGURES], "polygons": figures[TEST_FIGURES:]}
-    bundled = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    bundled = load_frozen_set(bench.use(BUNDLE_DIR / "frozen.npz"))
     sets = {"frozen.npz": (thinned(bundled, 8) if bench.quick else bundled, bench.frozen("test", nuisances=even))}
     for name, surfaces in kinds.items():
         read = (bench.frozen("test", surfaces), bench.frozen("test", surfaces, nuisances=even))

@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.geometry import USPA44
 from train.data.dataset import Sequences
-from train.data.frozen_presses import FrozenPresses, load_frozen_presses
+from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
 from train.data.generation_config import SEED, Generation
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
@@ -54,6 +54,7 @@ class Workbench:
         found: True to evaluate networks brought from another machine as they are, and to leave out absent ones.
         models: folder of the shipped models.
         before: file of a model of an earlier release, to be compared with.
+        used: files of models and frozen sets that the experiments of this run have used.
     """
 
     data_folder: Path = Path("data")
@@ -62,6 +63,12 @@ class Workbench:
     found: bool = False
     models: Path = BUNDLE_DIR
     before: Path | None = None
+    used: set[Path] = field(default_factory=set)
+
+    def use(self, path: Path) -> Path:
+        """Return the path, which the head of the report is to name with its hash."""
+        self.used.add(path)
+        return path
 
     def presses(self, name: str, world: World) -> PressSet:
         """Return the presses of that world, read if they exist, else made."""
@@ -72,7 +79,7 @@ class Workbench:
 
     def wide_test(self) -> FrozenPresses:
         """The wide frozen set."""
-        wide = load_frozen_presses()
+        wide = load_frozen_presses(self.use(WIDE_TEST))
         return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
 
     def data(self, name: str, config: Generation) -> Sequences:
@@ -88,7 +95,7 @@ class Workbench:
         path = self.checkpoints / f"{training.name}.pt"
         before = path.stat().st_mtime_ns if path.exists() else None
         fit_network(training, data, validation, self.checkpoints)
-        net, report = load_network(path)
+        net, report = load_network(self.use(path))
         if path.stat().st_mtime_ns != before:
             sys.stdout.write(f"{training.name}: {report['steps']} steps in {report['elapsed_s']:.0f} s\n")
         return net, report
@@ -103,7 +110,7 @@ class Workbench:
         path = self.checkpoints / f"{training.name}.pt"
         if not path.exists():
             return None
-        net, report = load_network(path)
+        net, report = load_network(self.use(path))
         if report["config"] != json.loads(json.dumps(asdict(training))):
             raise CheckpointError(f"{path} was trained by another recipe than '{training.name}' has now: delete it")
         return net, report

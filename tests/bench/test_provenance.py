@@ -1,0 +1,117 @@
+"""Reports know their age: what stands at their head, and when it is out of date."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from edge_samples import ROOT
+
+from edge.bench import stale_reports
+from edge.bench.provenance import (
+    UNKNOWN,
+    changed_files,
+    code_hash,
+    file_hash,
+    imported_sources,
+    provenance,
+    read_provenance,
+    with_head,
+)
+from edge.inference.bundled import DEFAULT_MODEL, find_model
+
+SOURCE = "edge/bench/stale_reports.py"
+
+
+@pytest.fixture(scope="module")
+def made():
+    return provenance('python x.py --out "a b"', [ROOT / SOURCE], [find_model(DEFAULT_MODEL)], seed=3)
+
+
+def written(folder: Path, made, name="mine.md"):
+    (folder / name).write_text(with_head("# mine\n\nWhat was measured.\n", made))
+
+
+def test_a_head_is_read_as_it_was_written(made):
+    page = with_head("# mine\n\nText.\n", made)
+    assert page.startswith("# mine\n\n```toml\ncommand = ") and page.endswith("```\n\nText.\n")
+    assert read_provenance(page) == made
+    bare = replace(made, seed=None, models={})
+    assert read_provenance(with_head("# b\n", bare)) == bare
+
+
+def test_a_head_names_commit_seed_sources_and_models(made):
+    assert made.sources == (SOURCE,) and made.seed == 3
+    assert made.models == {f"edge/models/{DEFAULT_MODEL}.onnx": file_hash(find_model(DEFAULT_MODEL))}
+    assert made.tree in {"clean", "changed", UNKNOWN}
+
+
+@pytest.mark.parametrize(
+    "page", ["# no head\n", "# a\n\n```toml\ncommand = \n```\n", '# a\n\n```toml\ncommand = "x"\n```\n']
+)
+def test_a_head_that_lacks_or_is_damaged_is_none(page):
+    assert read_provenance(page) is None
+
+
+def test_sources_are_all_that_is_imported_here_and_nothing_else():
+    files = {
+        "a.py": "import numpy\nfrom pack import b\ndef f():\n    from pack.c import g\n",
+        "pack/__init__.py": "",
+        "pack/b.py": "import fake\n",
+        "pack/c.py": "from pack.b import h\n",
+        "pack/d.py": "",
+        "tests/support/fake.py": "",
+    }
+    assert set(imported_sources(["a.py"], files.get)) == set(files) - {"pack/d.py"}
+
+
+def test_words_do_not_age_a_report_and_code_does():
+    def digest(text):
+        return code_hash({"a.py": text})
+
+    before = digest('"""Old."""\ndef f():\n    """Old."""\n    return 1\n')
+    assert digest('"""New."""\n\n# why\ndef f():\n    """New, longer."""\n    return (1)\n') == before
+    assert digest('"""Old."""\ndef f():\n    """Old."""\n    return 2\n') != before
+
+
+def test_a_report_just_made_is_fresh(made, tmp_path, capsys):
+    written(tmp_path, made)
+    stale_reports.main([str(tmp_path)])
+    assert capsys.readouterr().out == f"mine.md: fresh ({made.commit})\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"models": {"README.md": "0" * 12}}, "models have changed: README.md"),
+        ({"models": {"gone.onnx": "0" * 12}}, "gone.onnx is not here, so whether it has changed is unknown"),
+        ({"sources": ("gone.py",)}, "gone.py is gone"),
+        ({"code": "0" * 12, "commit": "f" * 10}, f"which files is unknown, as commit {'f' * 10} cannot be compared"),
+    ],
+)
+def test_a_report_is_stale_and_the_line_says_why(made, tmp_path, capsys, change, told):
+    (tmp_path / "load").mkdir()
+    written(tmp_path, replace(made, **change), "load/mine.md")
+    stale_reports.main([str(tmp_path)])
+    line = capsys.readouterr().out
+    assert line.startswith(f"load/mine.md: stale, of {made.date[:10]} (") and told in line
+
+
+def test_files_that_differ_from_a_commit_are_named(made):
+    if made.commit == UNKNOWN:
+        pytest.skip("not a checkout")
+    # Against the empty tree.
+    assert changed_files("4b825dc642cb6eb9a060e54bf8d69288fbee4904", ["README.md", "no.py"]) == [
+        "README.md"
+    ]  # the empty tree
+
+
+def test_a_report_without_a_head_is_named(tmp_path, capsys):
+    (tmp_path / "old.md").write_text("# old\n")
+    stale_reports.main([str(tmp_path)])
+    assert capsys.readouterr().out == "old.md: no head: make it again with its command\n"
+
+
+def test_every_report_has_a_head():
+    pages = sorted((ROOT / "reports").rglob("*.md"))
+    assert [page.name for page in pages if read_provenance(page.read_text()) is None] == []
+    assert len(pages) > 30
