@@ -318,13 +318,13 @@ def test_who_closes_no_scan_does_not_change_how_many_readings_are_waited_for():
 
 
 def test_a_scan_is_waited_for_as_long_as_the_slowest_sensor_takes_and_no_longer():
-    assert LONGEST_SCAN_NS == 1_000_000_000
+    assert SCAN_GIVEN_UP_NS == 1_000_000_000
     assembler = ScanAssembler(USPA44_MAP)
     feed(assembler, cycle(0) + cycle(1))
     feed(assembler, cycle(0, "6") + cycle(1, "6")[:9], 60)  # open since 76
-    assembler.feed(cycle(2)[0], 76 + LONGEST_SCAN_NS)
+    assembler.feed(cycle(2)[0], 76 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 7
-    assembler.feed(cycle(2)[1], 77 + LONGEST_SCAN_NS)
+    assembler.feed(cycle(2)[1], 77 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 14
 
 
