@@ -94,8 +94,8 @@ class CanBusLink(Link):
         else:
             self._errors.restarted()
         self._scans.begin_anew()
-        self._bus = self._open()
         self._unread.found_empty(self._clock_ns())
+        self._bus = self._open()
         try:
             for frame in self._triggers:
                 message = self._can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
@@ -134,7 +134,7 @@ class CanBusLink(Link):
                 scans = []
             else:
                 self._unread.found(begun_ns, now_ns)
-                scans = self._unread.mark(self._take(message, now_ns), now_ns)
+                scans = self._unread.mark(self._take(message, now_ns), now_ns, self._device_clock.begun_ns)
             self.trouble = self._errors.trouble(now_ns)
             left_s = (end_ns - now_ns) / 1e9
             if scans or left_s <= 0:

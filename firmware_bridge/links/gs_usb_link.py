@@ -92,7 +92,6 @@ class GsUsbLink(Link):
             raise DeviceError(f"{self.name}: {_reason(error, described)}") from error
         self.serial_number = described.serial_number
         self._device = device
-        self._unread.found_empty(self._clock_ns())
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -123,7 +122,7 @@ class GsUsbLink(Link):
                 self._unread.found(begun_ns, now_ns)
             else:
                 self._unread.found_empty(now_ns)
-            scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
+            scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns, self._scans.clock_begun_ns)
             if data and len(data) < len(self._packet):
                 self._scans.end_transfer()
             self.trouble = self._scans.trouble(now_ns)
@@ -180,6 +179,7 @@ class GsUsbLink(Link):
         _request(device, gs_usb.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
         features = limits.features & gs_usb.HARDWARE_STAMPS
         self._scans.start(stamped=features != 0, channels=channels)
+        self._unread.found_empty(self._clock_ns())  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
             data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS, limits)

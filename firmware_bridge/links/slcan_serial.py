@@ -115,7 +115,6 @@ class SlcanSerialLink(Link):
         self._serial = self._open_port()
         try:
             self._start(self._serial)
-            self._bursts = BurstReader(self._serial.fileno())
         except _PORT_ERRORS as error:
             self._serial.close()
             raise DeviceError(f"{self.port}: does not take commands: {error}") from error
@@ -158,7 +157,7 @@ class SlcanSerialLink(Link):
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
         self._received_bytes += len(data)
         now_ns = time.monotonic_ns()
-        scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
+        scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns, self._scans.clock_begun_ns)
         if self._questions.due(len(scans), self._scans.decoder.refusals, now_ns):
             _ask(self._serial, STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
@@ -223,6 +222,7 @@ class SlcanSerialLink(Link):
             port.write(command)
             _wait_until_sent(port)
         self._drop_old_bytes(port)
+        self._bursts = BurstReader(port.fileno())  # empty from here on: this thread may not run for long after OPEN
         port.write(OPEN)
         for frame in self._triggers:
             _wait_until_sent(port)
@@ -243,6 +243,8 @@ class SlcanSerialLink(Link):
             _say(port, command)
         with suppress(*_PORT_ERRORS):  # gone, which reading tells
             self._drop_old_bytes(port)
+            if self._bursts is not None:
+                self._bursts.look()
         self._scans.begin_anew()
         _say(port, OPEN)
 

@@ -29,9 +29,18 @@ class Unread:
         if ended_ns - begun_ns > WAITED_NS:
             self._empty_ns = begun_ns
 
-    def mark(self, scans: Sequence[Scan], time_ns: int) -> list[Scan]:
-        """Scans that were read at `time_ns`, each with how long it may have lain there, where that is long."""
+    def mark(self, scans: Sequence[Scan], time_ns: int, clock_begun_ns: int | None) -> list[Scan]:
+        """Return scans, each with how long it may have lain there, where that is long.
+
+        Args:
+            scans: read at `time_ns`.
+            time_ns: monotonic, in [ns].
+            clock_begun_ns: as in `DeviceClock`. A clock that was set by what lay there does not know how old that is:
+                its times are left out.
+        """
         unread_ns = 0 if self._empty_ns is None else time_ns - self._empty_ns
         if unread_ns <= LONG_UNREAD_NS:
             return list(scans)
+        if clock_begun_ns is not None and self._empty_ns is not None and clock_begun_ns >= self._empty_ns:
+            return [replace(scan, unread_ns=unread_ns, device_ns=None) for scan in scans]
         return [replace(scan, unread_ns=unread_ns) for scan in scans]

@@ -34,6 +34,8 @@ class DeviceClock:
 
     Attributes:
         restarts: how often the device's clock began anew.
+        begun_ns: monotonic time of the arrival by which the two clocks were first compared, since the last restart, in
+            [ns]; None before there is one. Had it lain unread, it would seem new nevertheless.
     """
 
     def __init__(self, tick_ns: int, wrap_ticks: int | None) -> None:
@@ -44,6 +46,7 @@ class DeviceClock:
             wrap_ticks: stamps go from 0 to one less than this, then begin again; None if they never do.
         """
         self.restarts = 0
+        self.begun_ns: int | None = None
         self._tick_ns = tick_ns
         self._wrap_ns = None if wrap_ticks is None else wrap_ticks * tick_ns
         self._stamp_ns = 0
@@ -80,7 +83,8 @@ class DeviceClock:
 
     def _offset_ns(self, difference_ns: int, arrival_ns: int) -> int:
         if self._smallest_ns is None:
-            self._window_start_ns, self._smallest_ns = arrival_ns, difference_ns
+            self.begun_ns = self._window_start_ns = arrival_ns
+            self._smallest_ns = difference_ns
         elif arrival_ns - self._window_start_ns > WINDOW_NS:
             self._smallest_before_ns, self._smallest_ns = self._smallest_ns, difference_ns
             if arrival_ns - self._window_start_ns > 2 * WINDOW_NS:  # after a silence the window before is long over

@@ -48,6 +48,11 @@ class GsUsbScans:
             scans += self._scans.feed(host_frame.frame, time_ns, device)
         return scans
 
+    @property
+    def clock_begun_ns(self) -> int | None:
+        """Monotonic time at which the adapter's clock was first compared, as in `DeviceClock`, in [ns]."""
+        return self._clock.begun_ns
+
     def end_transfer(self) -> None:
         """Give up a frame that is not whole: the next transfer begins with another."""
         self._decoder.end_transfer()

@@ -63,6 +63,11 @@ class SlcanScans:
         self._assembler.begin_anew()
         self._clock, self._stamped = _millisecond_clock(), None
 
+    @property
+    def clock_begun_ns(self) -> int | None:
+        """Monotonic time at which the adapter's clock was first compared, as in `DeviceClock`, in [ns]."""
+        return self._clock.begun_ns
+
     def bytes_until_scan(self) -> int:
         """How many bytes must come at least before a scan can close whole; from 1."""
         return max(1, self._assembler.fewest_missing() * self.decoder.usual_line_bytes - self.decoder.pending_bytes)

@@ -62,7 +62,8 @@ def test_the_same_scans_as_over_slcan(bus):
     for scan, other in zip(scans, expected, strict=True):
         assert (scan.sensor, scan.number) == (other.sensor, other.number)
         assert (scan.counts == other.counts).all() and (scan.renewed == other.renewed).all()
-        assert scan.device_ns is not None and scan.device_ns <= scan.time_ns
+        # What lay there for long, on a busy machine, sets no clock.
+        assert scan.device_ns <= scan.time_ns if not scan.unread_ns else scan.device_ns is None
     assert (counters["frames"], counters["foreign"], counters["duplicates"]) == (len(frames), 2, 1)
 
 

@@ -473,6 +473,24 @@ def test_what_lay_there_because_nobody_read_is_marked_old(old_canable):
             assert time.monotonic() < end_s
 
 
+def test_what_lay_there_since_the_opening_is_marked_old_and_sets_no_clock(monkeypatch):
+    """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
+
+    def starved(frame):
+        time.sleep(0.6)
+        return encode_frame(frame)
+
+    playing = Emulator([make_recording(50)], loop=True)
+    monkeypatch.setattr(slcan_serial, "encode_frame", starved)
+    with playing as emulator, SlcanSerialLink(emulator.port, triggers=[trigger_frame(1)]) as link:
+        (first, *_) = read_scans(link, 1)
+        assert first.unread_ns > 500_000_000 and first.device_ns is None
+        assert first.not_before_ns == first.time_ns - first.unread_ns
+        end_s = time.monotonic() + 20
+        while any(scan.unread_ns or scan.device_ns is None for scan in read_scans(link, 1)):
+            assert time.monotonic() < end_s
+
+
 def test_the_end_of_a_scan_that_is_nearly_complete_is_looked_for_at_once():
     """Two sensors at 300 Hz on one line leave no time to wait first."""
     leader, follower = pty.openpty()
