@@ -50,11 +50,12 @@ PARSED = {
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python -m edge\.bench\.soak .*": "takes minutes; test_soak runs it",
-    r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_wire and test_zenoh_end run them",
+    r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench and test_zenoh run them",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
     r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until it is ended; test_emulator runs it",
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
+    r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
     r"edge-sr (record |replay |--source replay:)FILE( --view)?": "a name is to be filled in; press.mcap is run",
 }
@@ -69,7 +70,7 @@ LEFT_OUT = {
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
     r"tensorboard .*": "serves until it is ended, and is not ours",
-    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_asked takes one of them",
+    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page takes one of them",
     r"mkdocs build .*": "test_site builds the site",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }

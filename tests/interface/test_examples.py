@@ -14,6 +14,7 @@ from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_m
 from test_cli import write_recording
 
 from edge.api import Result
+from edge.perception.event import Note
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Notice
@@ -163,10 +164,11 @@ def reading(state="idle", sensor="4", **said):
     return Result(scan, "device", "tiny", state, **({"force_counts": 10.0} | said))
 
 
+SILENT = Note("dead", "taxel 3 was not heard")
 WRONG = {
     "the reading is 50": {"age_ms": 5000},
     "taxels [5] are dead": {"dead": {5: "stuck"}},
-    "not ready: taxel 3 was not heard": {"state": "incomplete", "note": "taxel 3 was not heard", "force_counts": None},
+    "not ready: taxel 3 was not heard": {"state": "incomplete", "notes": (SILENT,), "force_counts": None},
     "not ready: zeroing": {"state": "zeroing", "force_counts": None},
     "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
 }

@@ -1,7 +1,10 @@
 """The mutator of the mutation survey."""
 
 import ast
+import subprocess
+import sys
 
+from edge_samples import ROOT
 from mutants import compiled, mutants
 
 SOURCE = '''"""Words."""
@@ -44,3 +47,10 @@ def test_a_mutant_is_one_change_and_the_tree_stays_as_it_was():
     names = {}
     exec(compile(tree, "mine.py", "exec"), names)
     assert names["close"]([1, 2]) and not names["close"]([1, 3, 4])
+
+
+def test_a_survey_of_one_module_is_a_page():
+    """python tests/system/mutation_survey.py taps --mutants 2"""
+    command = [sys.executable, "tests/system/mutation_survey.py", "taps", "--mutants", "2"]
+    page = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert page.startswith("# ") and "edge.perception.tap_tracker" in page
