@@ -96,8 +96,8 @@ class Silence:
         elif gap_ns > GAP_PERIODS * period_ns:
             if gap is not None:
                 gap.least, gap.settled = math.inf, 0
-            elif gap_ns > GAP_PERIODS * (mean_ns := self._mean_period_ns(before, period_ns)):
-                self._gaps[scan.sensor] = _Gap(before, mean_ns)
+            else:
+                self._gaps[scan.sensor] = _Gap(before, self._mean_period_ns(before, period_ns))
         elif gap is not None and gap_ns >= gap.period_ns / 2:
             periods = (_on_bus_ns(scan) - _on_bus_ns(gap.before)) / gap.period_ns
             gap.least = min(gap.least, periods - (scan.number - gap.before.number))

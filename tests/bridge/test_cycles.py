@@ -75,6 +75,7 @@ def test_no_scan_is_of_two_cycles_at_any_share_of_loss(reader, share):
 def test_doubles_and_swaps_mix_nothing(reader):
     for fault in (doubling(0.02), swapping(0.02)):
         assert read(fault(bus(300)), reader).mixed == 0
+    assert read(swapping(0.02)(bus(300)), reader).whole >= 240
     assert read(doubling(0.02)(bus(300)), reader).whole >= 295
 
 

@@ -3,6 +3,7 @@ import pytest
 from bridge_samples import make_counts, write_recording
 
 from firmware_bridge.errors import RecordingError, SourceError
+from firmware_bridge.links.parse import open_sources
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.scans.scan import ABSENT
 
@@ -75,6 +76,26 @@ def test_two_fingers_side_by_side(tmp_path):
         assert link.name == f"replay:{paths[0]},{paths[1]}"
         read = [[(scan.sensor, scan.number) for scan in link.read(1.0)] for _ in range(3)]
     assert read == [[("a", n), ("b", n)] for n in range(3)]
+
+
+def test_sources_without_a_name_are_called_by_their_place(tmp_path):
+    """Not "1/4", which reads like the first of four sensors."""
+    forms = []
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        forms.append(f"replay:{write_recording(tmp_path / folder / '4.csv', make_counts(1), rate_hz=50)}")
+    for texts, names in (
+        (forms, ["source1/4", "source2/4"]),
+        ([forms[0], f"left={forms[1]}"], ["source1/4", "left/4"]),
+        (forms[:1], ["4"]),
+    ):
+        links = open_sources(texts)
+        assert [scan.sensor for link in links for scan in played(link)] == names
+
+
+def played(link):
+    with link:
+        return link.read(1)
 
 
 def test_an_npz_at_its_recorded_times(tmp_path):

@@ -185,6 +185,23 @@ def test_half_of_the_taxels_make_a_sensor():
     assert counters(fewer) == {"readings": 15, "unconfirmed": 14}
 
 
+def test_where_the_order_wraps_round_is_another_cycle_though_the_taxel_had_not_come():
+    """Read in one piece, so that no pause tells: of the second cycle the fourth frame was lost, and its last four."""
+    assembler, second = ScanAssembler(USPA44_MAP), cycle(1)
+    scans = feed(assembler, cycle(0) + second[:3] + second[4:12] + cycle(2)[3:] + cycle(3))
+    assert [set(scan.counts[2][scan.fresh].tolist()) for scan in scans] == [{3000}, {3001}, {3002}, {3003}]
+    assert [int(scan.fresh.sum()) for scan in scans] == [16, 11, 13, 16]
+    assert "resynchronised" not in counters(assembler)
+
+
+@pytest.mark.parametrize("first", range(14))
+def test_two_frames_that_changed_places_are_of_one_cycle(first):
+    assembler, swapped = ScanAssembler(USPA44_MAP), cycle(1)
+    swapped[first], swapped[first + 1] = swapped[first + 1], swapped[first]
+    scans = feed(assembler, cycle(0) + swapped + cycle(2))
+    assert [scan.complete for scan in scans] == [True] * 3 and counters(assembler) == {"readings": 48, "scans": 3}
+
+
 @pytest.mark.parametrize("known", [False, True])
 def test_what_comes_after_a_pause_is_of_another_scan(known):
     """As where the bus was off for a moment: half of one press and half of another are no reading of the pad."""

@@ -2,6 +2,7 @@ import gc
 import itertools
 import threading
 import tracemalloc
+from dataclasses import replace
 
 import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
@@ -70,6 +71,21 @@ def test_the_loop_counts_late_patterns_and_tells_every_latency():
     assert [result.latency_us for result in sink.results] == [1000 * done_ms[n] for n in range(10)]
     assert [counters["late"] for counters in sink.counters] == [0] * 9 + [1]
     assert statistics.late == 1 and statistics.latency_us.count == 10 and statistics.dropped == 0
+
+
+def test_scans_that_lay_unread_set_no_pace():
+    """A dozen lay there and are read a millisecond apart; then they come every 10 ms, each result 4 ms behind."""
+    lay, came = range(12), range(12, 24)
+    times_ms = [500 + n for n in lay] + [520 + 10 * (n - len(lay)) for n in came]
+    read = [
+        replace(scan, time_ns=times_ms[n] * MS, unread_ns=400 * MS * (n in lay))
+        for n, scan in enumerate(scans(range(24)))
+    ]
+    written = [threading.Event() for _ in read]
+    sink = ListSink(on_write=lambda result: written[result.scan.number].set())
+    link = FakeLink([part for scan, event in zip(read, written, strict=True) for part in ([scan], event)])
+    statistics = run(link, sink, clock_ns=lambda: read[len(sink.results)].time_ns + 4 * MS)
+    assert statistics.scans == 24 and statistics.late == 0
 
 
 def test_collection_stands_still_in_the_loop_only():

@@ -252,6 +252,19 @@ def test_what_a_link_tells_reaches_runtime_and_sinks_in_its_place(kind):
     assert statistics.events == {kind: 1}
 
 
+class Troubled(ListSink):
+    trouble = None
+
+
+def test_what_is_wrong_with_sinks_at_last_is_of_the_summary():
+    bad, good, worse = Troubled(), ListSink(), Troubled()
+    bad.trouble, worse.trouble = "nobody reads", "the disk is full"
+    statistics = run(FakeLink([scans([0])]), bad, good, worse)
+    assert statistics.sink_trouble == "nobody reads; the disk is full"
+    bad.trouble = worse.trouble = None
+    assert run(FakeLink([scans([0])]), bad, good, worse).sink_trouble is None
+
+
 @pytest.mark.parametrize("at", [1, 5, 9])
 def test_a_notice_keeps_its_place_where_scans_are_thrown_away_that_nobody_took(at):
     link = Telling([[scan] for scan in scans(range(9))], at, "lost")

@@ -74,8 +74,8 @@ def test_rate_is_held_per_sensor_over_the_whole_run():
 def test_summary_tells_all_of_it():
     statistics = Statistics()
     for number in range(3):
-        statistics.add(result(make_scan(number, absent=(0,), time_ns=number * 20_000_000), "contact", 200.0))
-    zeroed = Result(make_scan(3, time_ns=60_000_000), "device", "m", "idle", baseline=BASELINE, baseline_age_s=90.0)
+        statistics.add(result(make_scan(number, absent=(0,), time_ns=number * 500_000_000), "contact", 200.0))
+    zeroed = Result(make_scan(3, time_ns=1_500_000_000), "device", "m", "idle", baseline=BASELINE, baseline_age_s=90.0)
     statistics.add(zeroed)
     statistics.overruns = 7
     statistics.commands_refused = 2
@@ -87,7 +87,7 @@ def test_summary_tells_all_of_it():
         "EMULATED demo: 4 scans, 3 patterns (0 reused), 0 dropped, 7 overrun, 0 missed",
         "torn: 3 on the wire, 0 renewed in part; 0 repeated",
         "run time: p50 200 us, p99 200 us, max 200 us",
-        "rate held: 50.0 Hz (sensor 4), 100 Hz asked for",
+        "rate held: 2.0 Hz (sensor 4), 100 Hz asked for",
         f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
         "sinks: nobody subscribes to zenoh:a",
         "events: lost 2, back 1",
@@ -131,6 +131,17 @@ def test_summary_tells_no_rate_of_scans_that_came_in_one_burst():
     for number in range(6):
         statistics.add(result(make_scan(number, time_ns=number * 265_000)))
     assert "rate" not in statistics.summary(source="x")
+
+
+def test_summary_tells_no_rate_of_less_than_a_second():
+    """At 100 Hz, behind a few that came at once."""
+    statistics = Statistics()
+    for number in range(20):
+        statistics.add(result(make_scan(number, time_ns=max(number - 5, 0) * 10_000_000)))
+    assert statistics.rate_hz()["4"] > 135 and "rate" not in statistics.summary(source="x")
+    for number in range(20, 106):
+        statistics.add(result(make_scan(number, time_ns=(number - 5) * 10_000_000)))
+    assert "rate held: 105.0 Hz (sensor 4)" in statistics.summary(source="x")
 
 
 def test_summary_of_nothing():

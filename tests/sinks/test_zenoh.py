@@ -226,6 +226,20 @@ class TestMessages:
         for scan, one in zip(scans, records, strict=True):
             assert scan == {name: one[name] for name in scan} | {"counters": scan["counters"]}
 
+    def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path):
+        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
+        write_recording(tmp_path / "free.csv", np.stack([make_scan(n, noise=2).counts for n in range(150)]))
+        command = [sys.executable, "-m", "edge.cli.main", "--source", f"replay:{tmp_path}/free.csv", "--rate-hz", "100"]
+        with listening(endpoint):
+            done = subprocess.run(
+                [*command, "--model", str(model), "--sink", f"zenoh:grip?connect={endpoint}"],
+                env=ENVIRONMENT,
+                capture_output=True,
+                text=True,
+            )
+        why = f"nobody subscribes to zenoh:grip?connect={endpoint}: see to its reader, or the router"
+        assert done.returncode == 0 and f"edge-sr: {why}\n" in done.stderr and f"\nsinks: {why}\n" in done.stderr
+
     def test_events_say_of_what_they_are(self):
         with api.open_source("demo") as source:
             sink = api.open_sink("zenoh:grip", CONTRACT, source)

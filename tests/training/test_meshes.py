@@ -229,9 +229,12 @@ def test_a_sheet_is_flat_however_it_stands(tmp_path):
 def test_an_impossible_size_says_the_size_and_the_unit(tmp_path):
     for extent_mm in (1.001, 499.9):
         load_mesh(saved(tmp_path, "fits.stl", binary_stl(box((extent_mm, extent_mm / 2, extent_mm / 3)).triangles)))
-    refused(saved(tmp_path, "big.stl", binary_stl(box((501, 8, 3)).triangles)), "501 x 8 x 3 mm.*scale it if it is not")
+    refused(
+        saved(tmp_path, "big.stl", binary_stl(box((501, 8, 3)).triangles)),
+        "501 x 8 x 3 mm, at most 500 mm; .*scale it if it is not",
+    )
     metres = saved(tmp_path, "metres.stl", binary_stl(box((0.02, 0.02, 0.002), at=(0, 0, 0)).triangles))
-    refused(metres, "0.02 x 0.02 x 0.002 mm.*in metres scale it by 1000")
+    refused(metres, "0.02 x 0.02 x 0.002 mm, at least 1 mm; .*in metres scale it by 1000")
     refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "unit_mm=1000, at most 500 mm", unit_mm=1000)
 
 

@@ -113,21 +113,22 @@ def _legible(content: bytes, suffix: str) -> bytes:
 
 def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> None:
     extent_mm = np.ptp(corners, axis=0)
-    sides = " x ".join(f"{side:.4g}" for side in extent_mm)
+    sides = f"{' x '.join(f'{side:.4g}' for side in extent_mm)} mm"
+    asked = "" if unit_mm == 1.0 else f" with unit_mm={unit_mm:g}"  # which no command takes
     smallest_mm, largest_mm = EXTENT_MM
     if extent_mm.max() > largest_mm:
         raise MeshError(
-            f"{path}: {sides} mm with unit_mm={unit_mm:g}, at most {largest_mm:g} mm; "
+            f"{path}: {sides}{asked}, at most {largest_mm:g} mm; "
             "a file is taken to be in mm: scale it if it is not (micrometres by 0.001), else cut out the part to tap"
         )
     if extent_mm.max() < smallest_mm:
         raise MeshError(
-            f"{path}: {sides} mm with unit_mm={unit_mm:g}, at least {smallest_mm:g} mm; "
+            f"{path}: {sides}{asked}, at least {smallest_mm:g} mm; "
             "a file is taken to be in mm: if it is in metres scale it by 1000, if in inches by 25.4"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
     if spreads[0] <= _FLAT**2 * spreads[-1]:
-        raise MeshError(f"{path}: flat, a sheet without thickness ({sides} mm); extrude it to a closed body")
+        raise MeshError(f"{path}: flat, a sheet without thickness ({sides}); extrude it to a closed body")
 
 
 def _open_edges(faces: NDArray[np.int64]) -> int:
