@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Mapping
+from operator import attrgetter, methodcaller
 from typing import Final
 
 from edge.errors import SinkClosedError, SinkError
@@ -12,6 +13,7 @@ from edge.pipeline.sink import Sink
 
 LOOK_NS: Final = 500_000_000
 """Between two looks at what sinks report: who reads them may need a moment to be found."""
+_UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
@@ -42,9 +44,9 @@ class Fan(Sink):
         self._sinks.append(sink)
 
     @property
-    def unwritten(self) -> int:
+    def unwritten(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Records left out, of all sinks."""
-        return self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
+        return self._given_up_unwritten + sum(map(_UNWRITTEN, self._sinks))
 
     @property
     def trouble(self) -> str | None:
@@ -57,15 +59,15 @@ class Fan(Sink):
         Raises:
             SinkError: no sink is left; SinkClosedError if none failed and their readers have gone.
         """
-        self._each(lambda sink: sink.write(result, counters), counters)
+        self._each(methodcaller("write", result, counters), counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Hand on one event; raises as `write` does."""
-        self._each(lambda sink: sink.tell(event, counters), counters)
+        self._each(methodcaller("tell", event, counters), counters)
 
     def wait(self) -> None:
         """Hand on that nothing comes; raises as `write` does."""
-        self._each(lambda sink: sink.wait(), self._counters)
+        self._each(methodcaller("wait"), self._counters)
 
     def close(self) -> None:
         """Close what is left, each whatever becomes of the others.
