@@ -95,7 +95,7 @@ class CanBusLink(Link):
             self._errors.restarted()
         self._scans.begin_anew()
         self._bus = self._open()
-        self._unread.found_empty(self._clock_ns())
+        self._unread.empty_ns = self._clock_ns()
         try:
             for frame in self._triggers:
                 message = self._can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
@@ -130,7 +130,7 @@ class CanBusLink(Link):
                 raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
             now_ns = self._clock_ns()
             if message is None:
-                self._unread.found_empty(now_ns)
+                self._unread.empty_ns = now_ns
                 scans = []
             else:
                 self._unread.found(begun_ns, now_ns)

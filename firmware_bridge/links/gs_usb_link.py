@@ -92,7 +92,7 @@ class GsUsbLink(Link):
             raise DeviceError(f"{self.name}: {_reason(error, described)}") from error
         self.serial_number = described.serial_number
         self._device = device
-        self._unread.found_empty(self._clock_ns())
+        self._unread.empty_ns = self._clock_ns()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -122,7 +122,7 @@ class GsUsbLink(Link):
             if data:
                 self._unread.found(begun_ns, now_ns)
             else:
-                self._unread.found_empty(now_ns)
+                self._unread.empty_ns = now_ns
             scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns)
             if data and len(data) < len(self._packet):
                 self._scans.end_transfer()

@@ -88,7 +88,9 @@ class LastingLink(Link):
             self._close(f"{error}")
             return []
         self.ended = self._link.ended
-        self._follow_trouble()
+        if self._link.trouble != self.trouble:
+            self.trouble = self._link.trouble
+            self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
         if scans:
             self._hear()
         else:
@@ -115,11 +117,6 @@ class LastingLink(Link):
     def serial_line(self) -> SerialLine | None:
         """Return the link's."""
         return self._link.serial_line()
-
-    def _follow_trouble(self) -> None:
-        if self._link.trouble != self.trouble:
-            self.trouble = self._link.trouble
-            self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
 
     def _hear(self) -> None:
         now_ns = self._clock_ns()
