@@ -74,7 +74,9 @@ class Silence:
             self._paced_from[scan.sensor] = scan
             return None
         if scan.device_ns is not None:  # by the device's own time, too, or bursts of a busy reader would look like gaps
-            pace = self._paces.setdefault(scan.sensor, Deadline())
+            pace = self._paces.get(scan.sensor)
+            if pace is None:
+                pace = self._paces[scan.sensor] = Deadline()
             pace.follow(scan.device_ns)
             period_ns = pace.period_ns or period_ns
         if period_ns and period_ns >= SHORTEST_PERIOD_NS:
