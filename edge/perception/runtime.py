@@ -285,7 +285,10 @@ class Runtime:
             deviation = None if deviations is None else deviations[row].copy()
             traction = None if tractions is None else tractions[row].copy()
             made = self._made(results[index], touch.sensor, patterns[row].copy(), deviation, traction, run_time_us)
-            touch.sensor.keep(made, touch.window[0], touch.made_by)
+            sensor = touch.sensor
+            sensor.last = made
+            sensor.last_reading.keep(touch.window[0], touch.made_by)
+            sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
             results[index] = made
 
     def _made(

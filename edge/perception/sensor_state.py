@@ -1,7 +1,7 @@
 """What is remembered of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
 
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -109,12 +109,6 @@ class Sensor:
     def age_s(self, time_ns: int) -> float | None:
         """How old the baseline is, in [s]; None where that is not known."""
         return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
-
-    def keep(self, made: Result, newest: NDArray[np.float32], made_by: Hashable) -> None:
-        """Remember the last pattern, the reading (3, rows, cols) that it was made from, and what made it."""
-        self.last = made
-        self.last_reading.keep(newest, made_by)
-        self.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
 
     def lose_touch(self) -> None:
         """Readings and taps from before are worth nothing: the sensor was not heard for a time.

@@ -44,11 +44,6 @@ class Fan(Sink):
         self._sinks.append(sink)
 
     @property
-    def unwritten(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Records left out, of all sinks."""
-        return self._given_up_unwritten + sum(map(_UNWRITTEN, self._sinks))
-
-    @property
     def trouble(self) -> str | None:
         """What any of its sinks reports."""
         return "; ".join(sorted(self._troubles())) or None
@@ -93,6 +88,7 @@ class Fan(Sink):
                 act(sink)
             except SinkError as error:
                 self._give_up(sink, error, counters)
+        self.unwritten = self._given_up_unwritten + sum(map(_UNWRITTEN, self._sinks))
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
             known, self._known_trouble = self._known_trouble, self._troubles()
@@ -113,6 +109,7 @@ class Fan(Sink):
         except SinkError as another:
             self.failures.append(another)
         if not self._sinks:
+            self.unwritten = self._given_up_unwritten
             raise self.failures[0] if self.failures else error
         self._tell_all(f"{error}; the other sinks go on", counters)
 

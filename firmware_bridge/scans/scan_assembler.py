@@ -182,9 +182,9 @@ class _Sensor:
         counts = counts.reshape(self._scan_shape)
         if device is None:
             self.wire.count(time_ns)
-            return self._count(self._series.close_whole(counts, time_ns), missing=0)
+            return self._count(self._series.close(counts, time_ns, whole=True), missing=0)
         self.wire.count(device.own_ns)
-        return self._count(self._series.close_whole(counts, time_ns, device.host_ns), missing=0)
+        return self._count(self._series.close(counts, time_ns, device.host_ns, whole=True), missing=0)
 
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
         if self._last_cycle is not None:
