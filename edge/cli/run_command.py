@@ -205,8 +205,9 @@ def _tell(line: str) -> None:
 
 
 def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
-    """The sinks asked for, and the live line; not where records may go to the same terminal, or it is over at once."""
-    return list(sinks) if {"status", "jsonl:-"} & set(sinks) or source.patient else [*sinks, "status"]
+    """The sinks asked for, and on a terminal the live line; not where records may go there, or it is over at once."""
+    apart = source.patient or sys.stderr is None or not sys.stderr.isatty()
+    return list(sinks) if apart or {"status", "jsonl:-"} & set(sinks) else [*sinks, "status"]
 
 
 def _print_score(score: "DemoScore", stream: TextIO) -> None:

@@ -2,7 +2,6 @@
 
 import contextlib
 import signal
-import threading
 from collections.abc import Iterator
 
 from edge.cli.keyboard import terminal_keys
@@ -26,15 +25,7 @@ def zero_on_signal(commands: Commands) -> Iterator[None]:
     if number is None:
         yield
         return
-    asked = threading.Event()
-
-    def put() -> None:
-        if asked.is_set():  # twice meanwhile is once
-            asked.clear()
-            commands.put(ZERO)
-
-    commands.ask(put)
-    before = signal.signal(number, lambda *_: asked.set())
+    before = signal.signal(number, lambda *_: commands.signalled.add(ZERO))
     try:
         yield
     finally:

@@ -59,6 +59,15 @@ class ModelSession:
 
     Build it on the thread that runs it: onnxruntime makes denormals zero once in a process, on the thread that builds
     the first session and on threads which that one starts later. Everything else on them computes like this as well.
+
+    Attributes:
+        name: of the model.
+        contract: of the model.
+        deviation: standard deviation of each pixel of the last run's pattern, in its unit, or None where the model has
+            none. (H, W) float32 above zero, or (n, H, W) after n windows were run together: the session's own array,
+            read-only, and overwritten by the next run.
+        traction: on the pad in the last run, in [kPa], or None where the model gives none. (3, h, w) float32, or
+            (n, 3, h, w) after n windows were run together: as `deviation`, the session's own array.
     """
 
     def __init__(self, path: Path, threads: int = 1, stop: threading.Event | None = None) -> None:
@@ -91,27 +100,11 @@ class ModelSession:
             raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
         self._runs: dict[int, _Run] = {}
         self._options = onnxruntime.RunOptions()
-        self._deviation: NDArray[np.float32] | None = None
-        self._traction: NDArray[np.float32] | None = None
+        self.deviation: NDArray[np.float32] | None = None
+        self.traction: NDArray[np.float32] | None = None
+        self._shape = (self.contract.taps, 3, self.contract.rows, self.contract.cols)
         self._unknown_pad = self.contract.pad_row(None)
         within_limit(self._warm_up, path, stop, give_up=self._end_run)
-
-    @property
-    def deviation(self) -> NDArray[np.float32] | None:
-        """Standard deviation of each pixel of the last run's pattern, in its unit, or None where the model has none.
-
-        (H, W) float32 above zero, or (n, H, W) after n windows were run together: the session's own array, read-only,
-        and overwritten by the next run.
-        """
-        return self._deviation
-
-    @property
-    def traction(self) -> NDArray[np.float32] | None:
-        """Traction on the pad in the last run, in [kPa], or None where the model gives none.
-
-        (3, h, w) float32, or (n, 3, h, w) after n windows were run together: as `deviation`, the session's own array.
-        """
-        return self._traction
 
     def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """Infer the pattern of one window.
@@ -130,10 +123,10 @@ class ModelSession:
                 deviation that is not finite and above zero.
         """
         pattern = self.run_together([window], None if pad is None else [pad])[0]
-        if self._deviation is not None:
-            self._deviation = self._deviation[0]
-        if self._traction is not None:
-            self._traction = self._traction[0]
+        if self.deviation is not None:
+            self.deviation = self.deviation[0]
+        if self.traction is not None:
+            self.traction = self.traction[0]
         return pattern
 
     def run_together(
@@ -161,23 +154,22 @@ class ModelSession:
             if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
                 expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
                 raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
-        run = self._runs.get(count) or self._runs.setdefault(
-            count, _Run(self._session, self._options, self.contract, count)
-        )
+        run = self._runs.get(count) or self._runs.setdefault(count, _Run(self._session, self.contract, count))
         for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
             run.window[index] = window.reshape(run.window.shape[1:])
             if run.pad is not None:
                 run.pad[index] = pad
         try:
-            run()
+            for binding in run.bindings:
+                self._session.run_with_iobinding(binding, self._options)
         except ORT_ERRORS as error:
             raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
-        pattern, self._deviation, self._traction = run.pattern, run.deviation, run.traction
+        pattern, self.deviation, self.traction = run.pattern, run.deviation, run.traction
         if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
-        if self._traction is not None and not np.isfinite(self._traction).all():
+        if self.traction is not None and not np.isfinite(self.traction).all():
             raise ModelError(f"model '{self.name}' gave a traction that is not finite: export it again")
-        deviation = self._deviation
+        deviation = self.deviation
         # Not a number is neither above nor below anything, so it fails here too.
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
@@ -190,25 +182,18 @@ class ModelSession:
     def _end_run(self) -> None:
         self._options.terminate = True  # looked at before each operator
 
-    @property
-    def _shape(self) -> tuple[int, int, int, int]:
-        return (self.contract.taps, 3, self.contract.rows, self.contract.cols)
-
 
 class _Run:
-    """Arrays for so many windows, and what fills them."""
+    """Arrays for so many windows, and what binds them to a session."""
 
-    def __init__(
-        self, session: onnxruntime.InferenceSession, options: onnxruntime.RunOptions, contract: Contract, count: int
-    ) -> None:
+    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int) -> None:
         inputs, outputs = (
             {name: np.zeros((count, *shape[1:]), dtype=np.float32) for name, shape in shapes.items()}
             for shapes in (contract.input_shapes, contract.output_shapes)
         )
         at_once = count if contract.batch == ANY_BATCH else 1
-        self._session, self._options = session, options
-        self._bindings = [session.io_binding() for _ in range(0, count, at_once)]
-        for index, binding in enumerate(self._bindings):
+        self.bindings = [session.io_binding() for _ in range(0, count, at_once)]
+        for index, binding in enumerate(self.bindings):
             part = slice(index * at_once, (index + 1) * at_once)
             for name, given in inputs.items():
                 _bind(binding.bind_input, name, given[part])
@@ -221,10 +206,6 @@ class _Run:
         self.pattern = outputs[OUTPUT_NAME]
         self.deviation = outputs.get(DEVIATION_NAME)
         self.traction = outputs.get(TRACTION_NAME)
-
-    def __call__(self) -> None:
-        for binding in self._bindings:
-            self._session.run_with_iobinding(binding, self._options)
 
 
 def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Flag, auto
 from functools import partial
+from itertools import repeat
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
@@ -61,11 +62,15 @@ class Kind:
 
 
 class Column(NamedTuple):
-    """One value to read: `make` makes it of an attribute that is not None; `unknown` stands for None."""
+    """One value to read: `make` makes it of an attribute that is not None; `unknown` stands for None.
+
+    `decimals` of a number, or of each number of a vector, are kept; None keeps all.
+    """
 
     attribute: str
     make: Function | None
     unknown: Any
+    decimals: int | None = None
 
 
 class Columns:
@@ -75,6 +80,9 @@ class Columns:
         columns = tuple(columns)
         self._get = attrgetter(*(column.attribute for column in columns))
         self._made = tuple((index, one.make) for index, one in enumerate(columns) if one.make is not None)
+        # Here and not in `make`: a record rounds a dozen numbers, and a function for each costs more than the rounding.
+        rounded = tuple((index, one.decimals) for index, one in enumerate(columns) if one.decimals is not None)
+        self._rounded = rounded
         self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
         # From the last to the first, so that a vector that is spread out moves none that is still to be.
         self._vectors = tuple(index for index, unknown in reversed(self._unknown) if isinstance(unknown, tuple))
@@ -85,6 +93,11 @@ class Columns:
         for index, make in self._made:
             if (value := values[index]) is not None:
                 values[index] = make(value)
+        for index, decimals in self._rounded:
+            if isinstance(value := values[index], tuple):
+                values[index] = list(map(round, value, repeat(decimals)))
+            elif value is not None:
+                values[index] = round(value, decimals)
         for index, unknown in self._unknown:
             if values[index] is None:
                 values[index] = unknown
@@ -135,18 +148,11 @@ class Field:
 
     def in_record(self) -> Column:
         """Return the column of the JSON record, where null stands for what is unknown."""
-        make = self.json
-        if make is None and self.decimals is not None:
-            make = _then(self.make, self._rounding(self.decimals))
-        return Column(self.attribute, make or self.make, None)
-
-    def _rounding(self, decimals: int) -> Function:
-        if self.kind.shape:
-            return lambda values: np.round(values, decimals)
-        if self.parts:
-            return lambda values: [round(value, decimals) for value in values]
-        # Not a partial with a keyword, which costs twice as much: a record rounds a dozen numbers.
-        return lambda value: round(value, decimals)
+        if self.json is not None:
+            return Column(self.attribute, self.json, None)
+        if self.kind.shape and self.decimals is not None:
+            return Column(self.attribute, partial(np.round, decimals=self.decimals), None)
+        return Column(self.attribute, self.make, None, self.decimals)
 
     def in_array(self) -> Column:
         """Return the column of the npz; a vector is a tuple."""

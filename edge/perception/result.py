@@ -84,12 +84,12 @@ class Result:
     @property
     def note(self) -> str | None:
         """The notes in one line, for a person; None without any."""
-        return joined(self.notes)
+        return joined(self.notes) if self.notes else None
 
     @property
     def event(self) -> str | None:
         """The events in one line, for a person; None without any."""
-        return joined(self.events)
+        return joined(self.events) if self.events else None
 
     def baseline_text(self) -> str:
         """Which baseline, how old."""

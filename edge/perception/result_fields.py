@@ -8,6 +8,7 @@ into the pages.
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from itertools import repeat
 from operator import attrgetter
 from typing import Any, Final
 
@@ -67,7 +68,7 @@ def _dead_bits(dead: Mapping[int, str]) -> int:
 
 
 def _dead_reasons(dead: Mapping[int, str]) -> dict[str, str]:
-    return {str(taxel): reason for taxel, reason in dead.items()}
+    return dict(zip(map(str, dead), dead.values(), strict=True))
 
 
 @lru_cache(maxsize=64)  # the same for many scans of a sensor in a row
@@ -83,9 +84,9 @@ def _force_and_torque(wrench: Wrench) -> tuple[float, ...]:
 def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
     centre = wrench.centre_of_pressure_mm
     return {
-        "force_n": [round(value, 4) for value in wrench.force_n],
-        "torque_n_mm": [round(value, 3) for value in wrench.torque_n_mm],
-        "centre_of_pressure_mm": None if centre is None else [round(value, 3) for value in centre],
+        "force_n": list(map(round, wrench.force_n, repeat(4))),
+        "torque_n_mm": list(map(round, wrench.torque_n_mm, repeat(3))),
+        "centre_of_pressure_mm": None if centre is None else list(map(round, centre, repeat(3))),
     }
 
 

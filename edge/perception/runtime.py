@@ -1,7 +1,7 @@
 """Scan in, result out: the only state there is between scans, kept per sensor."""
 
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -112,7 +112,8 @@ class Runtime:
         self._events: list[Untimed] = []
         self._source: SourceKind = source
         self._estimator = estimator
-        self._geometry = geometry
+        self._geometry, self._scan_shape = geometry, geometry.scan_shape
+        self._pixel_mm = geometry.pixel_pitch_mm(model.contract.scale)
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad = pad
@@ -196,20 +197,21 @@ class Runtime:
                     due[len(results)] = touch
             results.append(result)
         if due:
-            for index, made in self._infer(due, results):
-                results[index] = made
+            self._infer(due, results)
         return results
 
     def _follow(self, scan: Scan) -> tuple[Result, "_Due | None"]:
         """The result without a pattern, and what a pattern is to be made from."""
-        if scan.counts.shape != self._geometry.scan_shape:
-            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._geometry.scan_shape}")
+        if scan.counts.shape != self._scan_shape:
+            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
         sensor = self._sensors.get(scan.sensor) or self._meet(scan)
         zeroed = sensor.hear(scan)
-        readings = None if zeroed is None else sensor.fill(zeroed)
+        readings = None if zeroed is None or sensor.filler is None else sensor.fill(zeroed)
         filled = None if readings is None else readings.filled
-        notes = (*sensor.watch.notes(filled), *sensor.zeroing_notes, *sensor.drift_notes, *_age_notes(scan))
-        unit, dead = self._model.contract.output_unit, sensor.watch.reasons
+        watch = sensor.watch
+        taxel_notes = () if watch.sound else watch.notes(filled)
+        notes = (*taxel_notes, *sensor.zeroing_notes, *sensor.drift_notes, *_age_notes(scan))
+        unit, dead = self._model.contract.output_unit, watch.reasons
         events = self._take_events(sensor, scan.time_ns) if self._events or sensor.events else ()
         known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "notes": notes, "events": events}
         if sensor.baseline is None or zeroed is None:
@@ -217,7 +219,7 @@ class Runtime:
         age_s = sensor.age_s(scan.time_ns)
         known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "drift": sensor.drift, "filled": filled}
         known["zeroed"] = zeroed
-        if sensor.watch.waiting or (dead and readings is None):
+        if not watch.sound and (watch.waiting or (dead and readings is None)):
             return Result(scan, self._source, self._model.name, "incomplete", **known), None
 
         force_counts = float(np.add.reduce(zeroed[2], axis=None)) if readings is None else readings.z_counts
@@ -231,7 +233,8 @@ class Runtime:
         if sensor.counts_per_newton is not None:
             force_n = force_counts / sensor.counts_per_newton
         else:
-            force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
+            vendor_force_n = None if scan.vendor is None else scan.vendor_force_n
+            force_n = None if vendor_force_n is None else vendor_force_n[2]
         # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
         window = tap.window.copy() if tap.contact else None
         result = Result(
@@ -264,42 +267,53 @@ class Runtime:
         result = replace(result, **{name: getattr(before, name) for name in MADE})
         return replace(result, reused_from=before.scan.number)
 
-    def _infer(self, due: Mapping[int, "_Due"], results: Sequence[Result]) -> Iterator[tuple[int, Result]]:
+    def _infer(self, due: Mapping[int, "_Due"], results: list[Result]) -> None:
+        """Put the patterns that are due into their results."""
         contract = self._model.contract
         start_ns = self._clock_ns()
-        windows = []
+        windows: list[NDArray[np.float32]] = []
+        pads: list[NDArray[np.float32]] = []
         for index, touch in due.items():
             window = contract.scale_window(touch.window[: contract.taps], touch.sensor.gains)
             window[results[index].taps_used :] = 0
             windows.append(window)
-        patterns = self._model.run_together(windows, [touch.sensor.pad_row for touch in due.values()])
+            pads.append(touch.sensor.pad_row)
+        patterns = self._model.run_together(windows, pads)
         run_time_us = (self._clock_ns() - start_ns) / 1e3
         deviations, tractions = self._model.deviation, self._model.traction
         for row, (index, touch) in enumerate(due.items()):
             deviation = None if deviations is None else deviations[row].copy()
-            made = self._made(results[index], patterns[row].copy(), deviation, run_time_us)
-            if tractions is not None:
-                made = self._with_traction(made, tractions[row].copy(), touch.sensor)
-            touch.sensor.keep(made, touch.window[0], touch.made_by)
-            yield index, made
+            traction = None if tractions is None else tractions[row].copy()
+            made = self._made(results[index], touch.sensor, patterns[row].copy(), deviation, traction, run_time_us)
+            sensor = touch.sensor
+            sensor.last = made
+            sensor.last_reading.keep(touch.window[0], touch.made_by)
+            sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
+            results[index] = made
 
     def _made(
         self,
         result: Result,
+        sensor: Sensor,
         pattern: NDArray[np.float32],
         deviation: NDArray[np.float32] | None,
+        traction: NDArray[np.float32] | None,
         run_time_us: float,
     ) -> Result:
         contract = self._model.contract
         if deviation is not None and result.dead:
             deviation *= np.float32(widening(len(result.dead) / self._geometry.taxel_count))
         touching = touched(pattern, contract.contact_level)
-        area_mm2, centroid_mm = touched_patch(pattern, touching, self._geometry.pixel_pitch_mm(contract.scale))
+        area_mm2, centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
         interval_mm = expected = None
         if deviation is not None:
             expected = expect(contract.confidence, result.taps_used, pattern, deviation)
             if contract.interval_factor is not None and touching.any():
                 interval_mm = contract.interval_factor * float(deviation[touching].mean())
+        wrench = wrench_origin = None
+        if traction is not None:
+            wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
+            wrench_origin = sensor.wrench_origin
         return replace(
             result,
             state="contact",
@@ -310,16 +324,10 @@ class Runtime:
             interval_mm=interval_mm,
             expected_rmse_mm=None if expected is None else expected.rmse,
             another_tap=None if expected is None else expected.another_tap,
-            run_time_us=run_time_us,
-        )
-
-    def _with_traction(self, result: Result, traction: NDArray[np.float32], sensor: Sensor) -> Result:
-        pixel_mm = self._geometry.rows * self._geometry.pitch_mm / traction.shape[1]
-        return replace(
-            result,
             traction=traction,
-            wrench=wrench_of(traction, pixel_mm),
-            wrench_origin=sensor.wrench_origin,
+            wrench=wrench,
+            wrench_origin=wrench_origin,
+            run_time_us=run_time_us,
         )
 
     def _meet(self, scan: Scan) -> Sensor:

@@ -1,7 +1,7 @@
 """What is remembered of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
 
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +38,7 @@ class Sensor:
         pad_row: the same as the model takes it.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
         wrench_origin: whether the model is told the counts per newton.
+        filler: estimates the dead taxels; None where none is dead, or nothing may be estimated.
         events: what has happened to the zeroing since the last scan; the reader clears them.
     """
 
@@ -69,7 +70,7 @@ class Sensor:
         self.watch = TaxelWatch((geometry.rows, geometry.cols), mounting)
         self._mounting = mounting
         self._name = name
-        self._filler: Filler | None = None
+        self.filler: Filler | None = None
         self._heard_ns: int | None = None
         self._estimator = estimator
         self._unix_time_s = unix_time_s
@@ -109,12 +110,6 @@ class Sensor:
         """How old the baseline is, in [s]; None where that is not known."""
         return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
 
-    def keep(self, made: Result, newest: NDArray[np.float32], made_by: Hashable) -> None:
-        """Remember the last pattern, the reading (3, rows, cols) that it was made from, and what made it."""
-        self.last = made
-        self.last_reading.keep(newest, made_by)
-        self.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
-
     def lose_touch(self) -> None:
         """Readings and taps from before are worth nothing: the sensor was not heard for a time.
 
@@ -147,7 +142,7 @@ class Sensor:
 
     def fill(self, zeroed: NDArray[np.float32]) -> Readings | None:
         """Readings with something for the dead taxels; None where none is dead, or too many are."""
-        return self._filler(zeroed) if self._filler is not None and self.watch.may_be_estimated else None
+        return self.filler(zeroed) if self.filler is not None and self.watch.may_be_estimated else None
 
     def follow_drift(self, scan: Scan, contact: bool) -> None:
         """Let the rest level follow what a free pad reads; the next scan is the first to know."""
@@ -184,10 +179,10 @@ class Sensor:
         """Get ready to fill in for other dead taxels than before."""
         # What a taxel read before it was found out is in earlier taps; and no tap may be filled in unsaid.
         self.taps.reset()
-        self._filler = None
+        self.filler = None
         dead = np.count_nonzero(self.watch.dead)
         if 0 < 2 * dead <= self.watch.dead.size and self._estimator is not None:
-            self._filler = self._estimator.filler(self.watch.dead)
+            self.filler = self._estimator.filler(self.watch.dead)
 
     def _zero(self, scan: Scan) -> None:
         """Use the scan for the baseline; a refusal becomes a note, and zeroing starts over."""

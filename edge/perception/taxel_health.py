@@ -61,6 +61,12 @@ class TaxelWatch:
     itself while most others do not; far, when it reads what no contact makes; or was not heard while zeroing. It is
     believed again after BACK_SCANS good scans. A taxel that is stuck only nearly, or wrong in a way that a contact
     could be, is not found: a small sphere on one taxel looks to its neighbours like a fault.
+
+    Attributes:
+        held: (3, rows, cols), the newest reading of each taxel.
+        dead: taxels (rows, cols) that are not believed; another array only where they are others than before.
+        reasons: dead taxels, row-major from the top left, and one of REASONS for each.
+        sound: every taxel is believed, and nothing speaks against one.
     """
 
     def __init__(self, grid_shape: tuple[int, int], mounting: Mounting | None = None) -> None:
@@ -82,18 +88,13 @@ class TaxelWatch:
         self._old = np.zeros(grid_shape, dtype=np.int64)
         self._repeats = 0
         self._baseline: Baseline | None = None
-        self._sound = False
-        self._reasons: dict[int, str] = {}
+        self.sound = False
+        self.reasons: dict[int, str] = {}
 
     @property
     def waiting(self) -> bool:
         """A taxel has not been heard yet, and is not given up."""
-        return not self._sound and not bool((self._heard | self.dead).all())
-
-    @property
-    def reasons(self) -> dict[int, str]:
-        """Dead taxels, row-major from the top left, and one of REASONS for each."""
-        return self._reasons
+        return not self.sound and not bool((self._heard | self.dead).all())
 
     @property
     def silent_long(self) -> NDArray[np.bool_]:
@@ -103,13 +104,13 @@ class TaxelWatch:
     @property
     def may_be_estimated(self) -> bool:
         """Enough taxels live; half of them silent are no defect but a wrong id map."""
-        silent = sum(reason == "silent" for reason in self._reasons.values())
-        return len(self._reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
+        silent = sum(reason == "silent" for reason in self.reasons.values())
+        return len(self.reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
 
     def forget(self) -> None:
         """No reading from before is held any longer; dead taxels stay dead until they prove themselves."""
         self._heard[:] = False
-        self._sound = False
+        self.sound = False
 
     def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
         """Follow one scan.
@@ -124,9 +125,9 @@ class TaxelWatch:
         if baseline is not self._baseline and baseline is not None:
             unzeroed = np.isnan(baseline.counts).any(axis=0)
             if self._baseline is None or (unzeroed != self._unzeroed).any():  # not where it has drifted alone
-                self._unzeroed, self._sound = unzeroed, False
+                self._unzeroed, self.sound = unzeroed, False
         self._baseline = baseline
-        if self._sound and baseline is not None and scan.whole:
+        if self.sound and baseline is not None and scan.whole:
             zeroed = np.subtract(scan.counts, baseline.counts, dtype=np.float32)
             if self._mounting is not None:
                 zeroed = self._mounting.correct(zeroed)
@@ -143,7 +144,7 @@ class TaxelWatch:
                 return zeroed
         ends = self._find_saturated(scan, baseline)
         zeroed = None
-        if not ends and self._sound and scan.whole:
+        if not ends and self.sound and scan.whole:
             np.copyto(self.held, scan.counts)
             self._whole_ns = scan.not_before_ns
             zeroed = None if baseline is None else deformation(scan.counts, baseline, self._mounting)
@@ -166,17 +167,17 @@ class TaxelWatch:
         Args:
             filled: what stands for dead ones; None where there is no pattern for them.
         """
-        if self._sound:
+        if self.sound:
             return ()
         notes: list[Note] = []
         overloaded = np.flatnonzero(self._saturated & ~self.dead)
         if overloaded.size:
             text = f"its last reading is held, {_named(overloaded)} {_WORDS['saturated']}{_OVERLOADED}"
             notes.append(Note("held", text))
-        kinds = {reason: self._dead_by(reason) for reason in dict.fromkeys(self._reasons.values())}
+        kinds = {reason: self._dead_by(reason) for reason in dict.fromkeys(self.reasons.values())}
         if filled is not None and kinds:
             dead = ", ".join(f"{_named(taxels)} {_WORDS[reason]}" for reason, taxels in kinds.items())
-            owner = "its" if len(self._reasons) == 1 else "their"
+            owner = "its" if len(self.reasons) == 1 else "their"
             notes.append(Note("estimated", f"{dead}: estimated from {owner} neighbours"))
             return tuple(notes)
         silent_long = self.silent_long
@@ -195,13 +196,13 @@ class TaxelWatch:
         return tuple(notes)
 
     def _dead_by(self, reason: str) -> list[int]:
-        return [taxel for taxel, why in self._reasons.items() if why == reason]
+        return [taxel for taxel, why in self.reasons.items() if why == reason]
 
     def _find_saturated(self, scan: Scan, baseline: Baseline | None) -> bool:
         """Keep which taxels stand, on some axis, at an end of the chip's range and far from rest; are there any?"""
         low, high = RANGE_ENDS
         ends = (scan.counts == low) | (scan.counts == high)
-        if not self._sound:
+        if not self.sound:
             self._saturated &= ~scan.fresh
         if baseline is not None and ends.any():
             far = np.abs(deformation(scan.counts, baseline)) > NEAR_END_COUNTS
@@ -255,9 +256,9 @@ class TaxelWatch:
             if (dead != self.dead).any():
                 self.dead = dead  # a new one, so that a change is seen by identity
             self._code = code
-            self._reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
+            self.reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
         counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
-        self._sound = not counting and not self.dead.any() and bool(self._heard.all())
+        self.sound = not counting and not self.dead.any() and bool(self._heard.all())
 
     def _follow_far(self, zeroed: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Count scans in which a taxel reads what no contact makes; the largest of its axes, (rows, cols)."""

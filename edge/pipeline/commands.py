@@ -46,12 +46,14 @@ class Commands:
     Attributes:
         refused: messages that were no command, or came when too many waited.
         record: begins or ends a recording; nothing is recorded without.
+        signalled: asked for by a signal, which may come at any moment, also while another is put; twice is once.
     """
 
     def __init__(self) -> None:
         """Start empty, without a producer."""
         self.refused = 0
         self.record: Callable[[bool], object] = lambda on: None
+        self.signalled: set[Command] = set()
         self._lock = threading.Lock()
         self._waiting: SimpleQueue[Command] = SimpleQueue()
         self._producers: list[Callable[[], object]] = []
@@ -76,6 +78,8 @@ class Commands:
 
     def poll(self) -> list[Command]:
         """Return what was asked of the runtime since the last call; what was to be recorded is done. Never waits."""
+        while self.signalled:
+            self.put(self.signalled.pop())
         for produce in self._producers:
             produce()
         commands: list[Command] = []

@@ -40,7 +40,14 @@ class Deadline:
         if last_ns is None or scan_time_ns <= last_ns:
             return
         interval_ns = scan_time_ns - last_ns
-        if self._is_of_a_burst(interval_ns):
+        # Held up somewhere, it came right behind the one before; unless all of late did.
+        hurried = self.period_ns is not None and interval_ns * BURST_SHARE < self.period_ns
+        self._hurried = self._hurried + 1 if hurried else 0
+        if self._hurried > LONGEST_BURST:
+            self._intervals.clear()
+            self._sorted.clear()
+            self.period_ns = self.period_ns if self._known else None
+        elif hurried:
             return
         if len(self._intervals) == REMEMBERED_INTERVALS:
             del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
@@ -48,16 +55,6 @@ class Deadline:
         insort(self._sorted, interval_ns)
         if not self._known and len(self._sorted) >= FEWEST_INTERVALS:
             self.period_ns = self._sorted[len(self._sorted) // 2]
-
-    def _is_of_a_burst(self, interval_ns: int) -> bool:
-        """Whether the scan was held up somewhere and came right behind the one before; not if all of late did."""
-        hurried = self.period_ns is not None and interval_ns * BURST_SHARE < self.period_ns
-        self._hurried = self._hurried + 1 if hurried else 0
-        if self._hurried > LONGEST_BURST:
-            self._intervals.clear()
-            self._sorted.clear()
-            self.period_ns = self.period_ns if self._known else None
-        return hurried and self._hurried <= LONGEST_BURST
 
     def check(self, scan_time_ns: int, done_ns: int) -> bool:
         """Whether a pattern missed its deadline; without a period none does.

@@ -1,9 +1,10 @@
 """From a source through the runtime into sinks, in one loop."""
 
 import gc
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from operator import attrgetter
+from typing import Any, Final
 
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
@@ -11,6 +12,8 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
+
+_UNWRITTEN: Final = attrgetter("unwritten")
 
 
 @contextmanager
@@ -48,17 +51,9 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
         ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
     """
 
-    def counters() -> Mapping[str, int]:
-        unwritten = 0
-        for sink in sinks:
-            unwritten += sink.unwritten
-        statistics.unwritten = unwritten
-        counters = stream.counters
-        counters["unwritten"] = unwritten
-        return counters
-
     def tell(event: Event) -> None:
-        known = counters()
+        known = stream.counters
+        known["unwritten"] = statistics.unwritten = sum(map(_UNWRITTEN, sinks))
         for sink in sinks:
             sink.tell(event, known)
 
@@ -70,9 +65,10 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
     with uncollected():
         try:
             for result in stream:
-                known = counters()
+                known = stream.counters
+                known["unwritten"] = statistics.unwritten = sum(map(_UNWRITTEN, sinks))
                 for sink in sinks:
                     sink.write(result, known)
         finally:
-            counters()  # what the last ones left out belongs to the run, too
+            statistics.unwritten = sum(map(_UNWRITTEN, sinks))  # what the last ones left out belongs to the run, too
             statistics.sink_trouble = "; ".join(sink.trouble for sink in sinks if sink.trouble is not None) or None

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Self
 
 from edge.perception.event import Event
 from edge.perception.result import Result
@@ -92,8 +91,9 @@ class Stream:
         counters["missed"] = statistics.missed
         return counters
 
-    def __iter__(self) -> Self:
-        return self
+    def __iter__(self) -> Iterator[Result]:
+        """Return the results, from the next one on; raises as `__next__` does."""
+        return self._running
 
     def __next__(self) -> Result:
         """The next result, as it comes.

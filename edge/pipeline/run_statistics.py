@@ -115,7 +115,8 @@ class Statistics:
         span = self._spans.get(scan.sensor)
         if span is None:
             span = self._spans[scan.sensor] = _Span(scan.time_ns)
-        span.add(scan.time_ns)
+        span.last_ns = scan.time_ns
+        span.scans += 1
 
     def tell(self, event: Event) -> None:
         """Count one event."""
@@ -194,19 +195,15 @@ def _drift_text(drift: Drift | None) -> str:
 
 
 class _Span:
-    """Time from a sensor's first scan to its last."""
+    """Time from a sensor's first scan to its last, and how many there were."""
 
     def __init__(self, first_ns: int) -> None:
-        self._first_ns = self._last_ns = first_ns
-        self._scans = 0
-
-    def add(self, time_ns: int) -> None:
-        self._last_ns = time_ns
-        self._scans += 1
+        self._first_ns = self.last_ns = first_ns
+        self.scans = 0
 
     @property
     def duration_ns(self) -> int:
-        return self._last_ns - self._first_ns
+        return self.last_ns - self._first_ns
 
     def rate_hz(self) -> float | None:
-        return (self._scans - 1) * 1e9 / self.duration_ns if self.duration_ns > 0 else None
+        return (self.scans - 1) * 1e9 / self.duration_ns if self.duration_ns > 0 else None

@@ -74,7 +74,9 @@ class Silence:
             self._paced_from[scan.sensor] = scan
             return None
         if scan.device_ns is not None:  # by the device's own time, too, or bursts of a busy reader would look like gaps
-            pace = self._paces.setdefault(scan.sensor, Deadline())
+            pace = self._paces.get(scan.sensor)
+            if pace is None:
+                pace = self._paces[scan.sensor] = Deadline()
             pace.follow(scan.device_ns)
             period_ns = pace.period_ns or period_ns
         if period_ns and period_ns >= SHORTEST_PERIOD_NS:
@@ -87,7 +89,7 @@ class Silence:
 
     def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
         """Count what is missing behind a gap, once scans come at their pace again: what was late comes in a burst."""
-        gap_ns = _on_bus_ns(scan) - _on_bus_ns(before)
+        gap_ns = scan.on_bus_ns - before.on_bus_ns
         gap = self._gaps.get(scan.sensor)
         if gap is not None and period_ns > GAP_PERIODS * gap.period_ns:
             del self._gaps[scan.sensor]  # it was of the pace, which was not known: what is read late comes in bursts
@@ -99,7 +101,7 @@ class Silence:
             else:
                 self._gaps[scan.sensor] = _Gap(before, self._mean_period_ns(before, period_ns))
         elif gap is not None and gap_ns >= gap.period_ns / 2:
-            periods = (_on_bus_ns(scan) - _on_bus_ns(gap.before)) / gap.period_ns
+            periods = (scan.on_bus_ns - gap.before.on_bus_ns) / gap.period_ns
             gap.least = min(gap.least, periods - (scan.number - gap.before.number))
             gap.settled += 1
             if gap.settled == SETTLING_SCANS:
@@ -114,7 +116,7 @@ class Silence:
         """
         first = self._paced_from[scan.sensor]
         scans = scan.number - first.number
-        mean_ns = (_on_bus_ns(scan) - _on_bus_ns(first)) / scans if scans else 0.0
+        mean_ns = (scan.on_bus_ns - first.on_bus_ns) / scans if scans else 0.0
         if scans >= PACED_SCANS:
             self._periods_ns[scan.sensor] = mean_ns
         return self._periods_ns.get(scan.sensor, max(period_ns, mean_ns))
@@ -144,7 +146,3 @@ class Silence:
     def _heard_ns(self, sensor: str, time_ns: int) -> int:
         since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
         return max([time_ns, *since_ns])
-
-
-def _on_bus_ns(scan: Scan) -> int:
-    return scan.time_ns if scan.device_ns is None else scan.device_ns

@@ -15,9 +15,7 @@ class Sink(Protocol):
         trouble: what its user must know of it, in plain words; None while all is well.
     """
 
-    @property
-    def unwritten(self) -> int:  # noqa: D102 - above
-        return 0
+    unwritten: int = 0
 
     @property
     def trouble(self) -> str | None:  # noqa: D102 - above

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Mapping
+from operator import attrgetter, methodcaller
 from typing import Final
 
 from edge.errors import SinkClosedError, SinkError
@@ -12,6 +13,7 @@ from edge.pipeline.sink import Sink
 
 LOOK_NS: Final = 500_000_000
 """Between two looks at what sinks report: who reads them may need a moment to be found."""
+_UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
@@ -42,11 +44,6 @@ class Fan(Sink):
         self._sinks.append(sink)
 
     @property
-    def unwritten(self) -> int:
-        """Records left out, of all sinks."""
-        return self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
-
-    @property
     def trouble(self) -> str | None:
         """What any of its sinks reports."""
         return "; ".join(sorted(self._troubles())) or None
@@ -57,15 +54,15 @@ class Fan(Sink):
         Raises:
             SinkError: no sink is left; SinkClosedError if none failed and their readers have gone.
         """
-        self._each(lambda sink: sink.write(result, counters), counters)
+        self._each(methodcaller("write", result, counters), counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Hand on one event; raises as `write` does."""
-        self._each(lambda sink: sink.tell(event, counters), counters)
+        self._each(methodcaller("tell", event, counters), counters)
 
     def wait(self) -> None:
         """Hand on that nothing comes; raises as `write` does."""
-        self._each(lambda sink: sink.wait(), self._counters)
+        self._each(methodcaller("wait"), self._counters)
 
     def close(self) -> None:
         """Close what is left, each whatever becomes of the others.
@@ -91,6 +88,7 @@ class Fan(Sink):
                 act(sink)
             except SinkError as error:
                 self._give_up(sink, error, counters)
+        self.unwritten = self._given_up_unwritten + sum(map(_UNWRITTEN, self._sinks))
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
             known, self._known_trouble = self._known_trouble, self._troubles()
@@ -111,6 +109,7 @@ class Fan(Sink):
         except SinkError as another:
             self.failures.append(another)
         if not self._sinks:
+            self.unwritten = self._given_up_unwritten
             raise self.failures[0] if self.failures else error
         self._tell_all(f"{error}; the other sinks go on", counters)
 

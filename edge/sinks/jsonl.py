@@ -2,6 +2,7 @@
 
 import errno
 import os
+import stat
 import sys
 import threading
 from collections.abc import Mapping
@@ -52,7 +53,7 @@ class JsonLinesSink(Sink):
         self._stop = threading.Event() if stop is None else stop
         self._patient = patient
         self._source = source
-        self._unwritten = 0
+        self.unwritten = 0
         try:
             self._file = _open(target)
         except OSError as error:
@@ -60,24 +61,20 @@ class JsonLinesSink(Sink):
                 raise SinkError(f"nobody reads {self._target}: start its reader first") from error
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
         widen(self._file.fileno())
-
-    @property
-    def unwritten(self) -> int:
-        """Records left out so far."""
-        return self._unwritten
+        self._may_be_full = not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record; of what sinks left out it tells its own reader's."""
-        self._write(record_line(result, {**counters, "unwritten": self._unwritten}))
+        self._write(record_line(result, {**counters, "unwritten": self.unwritten}))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
-        self._write(event_line(event, {**counters, "unwritten": self._unwritten}, self._source))
+        self._write(event_line(event, {**counters, "unwritten": self.unwritten}, self._source))
 
     def _write(self, line: bytes) -> None:
-        while not has_room(self._file.fileno(), len(line)):
+        while self._may_be_full and not has_room(self._file.fileno(), len(line)):
             if not self._patient or self._stop.wait(_ROOM_S):
-                self._unwritten += 1
+                self.unwritten += 1
                 return
         try:
             self._file.write(line)

@@ -84,7 +84,7 @@ class McapSink(Sink):
         self._origin = origin
         self._source_told = False
         self._patient = patient
-        self._unwritten = 0
+        self.unwritten = 0
         self._failed = False
         try:
             self._file = McapFile(path, _PROFILE, f"tactile-edge-sr {_version()}", clock_s)
@@ -111,11 +111,6 @@ class McapSink(Sink):
         """On the disk so far, of all sensors."""
         numbers = [number for (_, name), number in self._channels.items() if name == "scan"]
         return sum(self._file.written.get(number, 0) for number in numbers)
-
-    @property
-    def unwritten(self) -> int:
-        """Records left out so far."""
-        return self._unwritten
 
     @property
     def size_bytes(self) -> int:
@@ -189,7 +184,7 @@ class McapSink(Sink):
                 return True
         except OSError as error:
             raise self._failure(error) from error
-        self._unwritten += full
+        self.unwritten += full
         return not full
 
     def _log(self, event: Event) -> None:

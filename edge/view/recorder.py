@@ -58,7 +58,7 @@ class Recorder(Sink):
         self._closing: tuple[Future[None], Path | None] | None = None
 
     @property
-    def unwritten(self) -> int:
+    def unwritten(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Records left out, of all recordings."""
         return self._unwritten + (0 if self._sink is None else self._sink.unwritten)
 

@@ -93,6 +93,7 @@ class SlcanDecoder:
         late_stamps: lines lost so far because their time stamp was beyond LAST_TIMESTAMP_MS.
         usual_line_bytes: a usual frame's line as the adapter sends it, with its CR; the shorter one before that is
             learnt.
+        pending_bytes: of an unfinished line.
     """
 
     def __init__(self) -> None:
@@ -102,6 +103,7 @@ class SlcanDecoder:
         self._newest_stamped = False
         self._same_in_a_row = 0
         self._pending = b""
+        self.pending_bytes = 0
         self.frames = 0
         self._bad_lines = 0
         self._non_ascii_lines = 0
@@ -110,15 +112,10 @@ class SlcanDecoder:
         self._replies = 0
         self.refusals = 0
 
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes of an unfinished line."""
-        return len(self._pending)
-
     def begin_anew(self) -> None:
         """Give up an unfinished line: the link broke, and what comes next does not belong to it, nor has its form."""
         self._skipped_bytes += len(self._pending)
-        self._pending = b""
+        self._pending, self.pending_bytes = b"", 0
         self._form, self._same_in_a_row = None, 0
         self.usual_line_bytes = _FORMS[False].line_bytes
 
@@ -165,6 +162,7 @@ class SlcanDecoder:
         cut = max(position, len(buffer) - LONGEST_LINE)
         self._skipped_bytes += cut - position
         self._pending = buffer[cut:]
+        self.pending_bytes = len(self._pending)
         return pieces
 
     def counters(self) -> dict[str, int]:
@@ -177,7 +175,7 @@ class SlcanDecoder:
             "late_stamps": self.late_stamps,
             "replies": self._replies,
             "refusals": self.refusals,
-        } | self.status.counters()
+        } | self.status.counts
 
     def _read_line(self, line: bytes, *, refused: bool) -> CanFrame | None:
         self.refusals += refused

@@ -54,13 +54,11 @@ class AdapterStatus:
     """Counts what the adapter reports, and knows what of it a user must know.
 
     Attributes:
-        answers: how often `F` was answered.
+        counts: status_lines: unasked; status_answers: to `F`; and of each sort that was ever reported, how often.
     """
 
     def __init__(self) -> None:
-        self.answers = 0
-        self._status_lines = 0
-        self._counts: dict[str, int] = {}
+        self.counts = {"status_lines": 0, "status_answers": 0}
         self._flags: frozenset[str] = frozenset()
         self._off_at_frame: int | None = None
         self._lost_at_frame: int | None = None
@@ -70,18 +68,18 @@ class AdapterStatus:
         if _FLAGS.fullmatch(line):
             value = int(line[1:], 16)
             self._flags = frozenset(name for bit, name in FLAGS.items() if value & bit)
-            self.answers += 1
+            self.counts["status_answers"] += 1
             self._count(self._flags)
         elif _STATUS.fullmatch(line) and line[:1] == b"s":
             state = STATES[chr(line[1])]
             self._off_at_frame = frames if state == "bus_off" else None
-            self._status_lines += 1
+            self.counts["status_lines"] += 1
             self._count([state])
         elif _STATUS.fullmatch(line) and int(line[1:2]) == len(line) - 2:
             errors = [ERRORS[letter] for letter in line[2:].decode()]
             if "overrun" in errors:
                 self._lost_at_frame = frames
-            self._status_lines += 1
+            self.counts["status_lines"] += 1
             self._count(errors)
         else:
             return False
@@ -108,14 +106,15 @@ class AdapterStatus:
         """It answers no more: the flags that it told last hold no longer."""
         self._flags = frozenset()
 
-    def counters(self) -> dict[str, int]:
-        """status_lines: unasked; status_answers: to `F`; and of each sort that was ever reported, how often."""
-        return {"status_lines": self._status_lines, "status_answers": self.answers} | self._counts
+    @property
+    def answers(self) -> int:
+        """Number of times that `F` was answered."""
+        return self.counts["status_answers"]
 
     def _count(self, names: Iterable[str]) -> None:
         for name in names:
             key = f"adapter_{name}"
-            self._counts[key] = self._counts.get(key, 0) + 1
+            self.counts[key] = self.counts.get(key, 0) + 1
 
 
 class StatusQuestions:

@@ -94,7 +94,7 @@ class CanBusLink(Link):
         else:
             self._errors.restarted()
         self._scans.begin_anew()
-        self._unread.found_empty(self._clock_ns())
+        self._unread.empty_ns = self._clock_ns()
         self._bus = self._open()
         try:
             for frame in self._triggers:
@@ -130,7 +130,7 @@ class CanBusLink(Link):
                 raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
             now_ns = self._clock_ns()
             if message is None:
-                self._unread.found_empty(now_ns)
+                self._unread.empty_ns = now_ns
                 scans = []
             else:
                 self._unread.found(begun_ns, now_ns)

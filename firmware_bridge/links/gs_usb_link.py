@@ -121,7 +121,7 @@ class GsUsbLink(Link):
             if data:
                 self._unread.found(begun_ns, now_ns)
             else:
-                self._unread.found_empty(now_ns)
+                self._unread.empty_ns = now_ns
             scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns, self._scans.clock_begun_ns)
             if data and len(data) < len(self._packet):
                 self._scans.end_transfer()
@@ -179,7 +179,7 @@ class GsUsbLink(Link):
         _request(device, gs_usb.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
         features = limits.features & gs_usb.HARDWARE_STAMPS
         self._scans.start(stamped=features != 0, channels=channels)
-        self._unread.found_empty(self._clock_ns())  # from here on: this thread may not run for long after the start
+        self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
             data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS, limits)

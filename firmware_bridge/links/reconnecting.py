@@ -88,9 +88,14 @@ class LastingLink(Link):
             self._close(f"{error}")
             return []
         self.ended = self._link.ended
-        self._follow_trouble()
+        if self._link.trouble != self.trouble:
+            self.trouble = self._link.trouble
+            self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
         if scans:
-            self._hear()
+            now_ns = self._clock_ns()
+            if self._lost_ns is not None or self._silent:
+                self._end_outage(now_ns)
+            self._heard_ns = now_ns
         else:
             self._suspect()
         return scans
@@ -116,19 +121,11 @@ class LastingLink(Link):
         """Return the link's."""
         return self._link.serial_line()
 
-    def _follow_trouble(self) -> None:
-        if self._link.trouble != self.trouble:
-            self.trouble = self._link.trouble
-            self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
-
-    def _hear(self) -> None:
-        now_ns = self._clock_ns()
-        if self._lost_ns is not None or self._silent:
-            away_s = (now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)) / 1e9
-            self._tell("back", f"{self.name} is back after {away_s:.1f} s")
-            self._lost_ns, self._silent = None, False
-            self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
-        self._heard_ns = now_ns
+    def _end_outage(self, now_ns: int) -> None:
+        away_s = (now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)) / 1e9
+        self._tell("back", f"{self.name} is back after {away_s:.1f} s")
+        self._lost_ns, self._silent = None, False
+        self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
 
     def _suspect(self) -> None:
         """Open a silent link anew, ever more seldom."""

@@ -150,7 +150,7 @@ class SlcanSerialLink(Link):
             data = self._bursts.read(timeout_s, self._scans.bytes_until_scan())
             if self._bursts.held_until_s is not None:
                 return []
-            self._unread.found_empty(round(self._bursts.empty_s * 1e9))
+            self._unread.empty_ns = round(self._bursts.empty_s * 1e9)
             with suppress(OSError):  # of an error behind bytes the next call tells
                 self._bursts.look()
         except OSError as error:

@@ -13,21 +13,21 @@ WAITED_NS: Final = 1_000_000
 
 
 class Unread:
-    """Follows when a link was last found empty."""
+    """Follows when a link was last found empty.
+
+    Attributes:
+        empty_ns: monotonic time at which nothing lay there, as its reader last saw, in [ns]; None before.
+    """
 
     def __init__(self) -> None:
-        self._empty_ns: int | None = None
-
-    def found_empty(self, time_ns: int) -> None:
-        """Take it that nothing lay there at `time_ns` [ns] of monotonic time."""
-        self._empty_ns = time_ns
+        self.empty_ns: int | None = None
 
     def found(self, begun_ns: int, ended_ns: int) -> None:
         """Take it that something came while it was read from `begun_ns` to `ended_ns`."""
-        if self._empty_ns is not None and begun_ns - self._empty_ns > LONG_UNREAD_NS:
+        if self.empty_ns is not None and begun_ns - self.empty_ns > LONG_UNREAD_NS:
             return  # nobody ran: how long this took says nothing before all of it is fetched
         if ended_ns - begun_ns > WAITED_NS:
-            self._empty_ns = begun_ns
+            self.empty_ns = begun_ns
 
     def mark(self, scans: Sequence[Scan], time_ns: int, clock_begun_ns: int | None) -> list[Scan]:
         """Return scans, each with how long it may have lain there, where that is long.
@@ -38,9 +38,9 @@ class Unread:
             clock_begun_ns: as in `DeviceClock`. A clock that was set by what lay there does not know how old that is:
                 its times are left out.
         """
-        unread_ns = 0 if self._empty_ns is None else time_ns - self._empty_ns
+        unread_ns = 0 if self.empty_ns is None else time_ns - self.empty_ns
         if unread_ns <= LONG_UNREAD_NS:
             return list(scans)
-        if clock_begun_ns is not None and self._empty_ns is not None and clock_begun_ns >= self._empty_ns:
+        if clock_begun_ns is not None and self.empty_ns is not None and clock_begun_ns >= self.empty_ns:
             return [replace(scan, unread_ns=unread_ns, device_ns=None) for scan in scans]
         return [replace(scan, unread_ns=unread_ns) for scan in scans]

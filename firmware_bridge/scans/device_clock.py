@@ -78,10 +78,7 @@ class DeviceClock:
             self._smallest_ns = self._smallest_before_ns = None
         self._stamp_ns, self._arrival_ns = stamp_ns, arrival_ns
         self._device_ns += step_ns
-        offset_ns = self._offset_ns(arrival_ns - self._device_ns, arrival_ns)
-        return DeviceTime(self._device_ns + offset_ns, self._device_ns)
-
-    def _offset_ns(self, difference_ns: int, arrival_ns: int) -> int:
+        difference_ns = arrival_ns - self._device_ns
         if self._smallest_ns is None:
             self.begun_ns = self._window_start_ns = arrival_ns
             self._smallest_ns = difference_ns
@@ -91,4 +88,5 @@ class DeviceClock:
                 self._smallest_before_ns = None
             self._window_start_ns = arrival_ns
         self._smallest_ns = min(self._smallest_ns, difference_ns)
-        return min(self._smallest_ns, difference_ns if self._smallest_before_ns is None else self._smallest_before_ns)
+        before_ns = difference_ns if self._smallest_before_ns is None else self._smallest_before_ns
+        return DeviceTime(self._device_ns + min(self._smallest_ns, before_ns), self._device_ns)

@@ -1,6 +1,6 @@
 """A scan: one reading of all taxels of one sensor, and which of them are new."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -53,6 +53,12 @@ class Scan:
         vendor: what the vendor's software says of the same moment; None of a link that reads the sensor itself.
         unread_ns: it may have lain there for so long before it was read, in [ns], since nobody looked meanwhile; 0
             where somebody did.
+        complete: every taxel's reading arrived.
+        whole: every taxel's reading arrived and is new: nothing is torn or repeated.
+        on_bus_ns: `device_ns`, or without one `time_ns`.
+        not_before_ns: monotonic time before which none of its readings was taken, as far as is known, in [ns]. By the
+            device's time stamps, or by when the link was last found empty: the first reading after an opening sets the
+            device's clock, and seems new where nobody read it for long.
     """
 
     sensor: str
@@ -64,28 +70,19 @@ class Scan:
     device_ns: int | None = None
     vendor: VendorReading | None = None
     unread_ns: int = 0
+    complete: bool = field(init=False, repr=False, compare=False)
+    whole: bool = field(init=False, repr=False, compare=False)
+    on_bus_ns: int = field(init=False, repr=False, compare=False)
+    not_before_ns: int = field(init=False, repr=False, compare=False)
 
-    @property
-    def not_before_ns(self) -> int:
-        """Monotonic time before which none of its readings was taken, as far as is known, in [ns].
-
-        By the device's time stamps, or by when the link was last found empty: the first reading after an opening sets
-        the device's clock, and seems new where nobody read it for long.
-        """
-        since_ns = self.time_ns - self.unread_ns
-        return since_ns if self.device_ns is None else min(self.device_ns, since_ns)
-
-    # On sixteen taxels numpy's all() costs ten times what looking for a byte does, and these are asked of every scan.
-
-    @property
-    def whole(self) -> bool:
-        """Every taxel's reading arrived and is new: nothing is torn or repeated."""
-        return False not in self.renewed.tobytes()
-
-    @property
-    def complete(self) -> bool:
-        """Every taxel's reading arrived."""
-        return False not in self.fresh.tobytes()
+    def __post_init__(self) -> None:
+        # Found once: reader, perception and statistics all ask. On sixteen taxels numpy's all() costs ten times what
+        # looking for a byte does.
+        find, since_ns = object.__setattr__, self.time_ns - self.unread_ns
+        find(self, "complete", False not in self.fresh.tobytes())
+        find(self, "whole", False not in self.renewed.tobytes())
+        find(self, "on_bus_ns", self.time_ns if self.device_ns is None else self.device_ns)
+        find(self, "not_before_ns", min(self.on_bus_ns, since_ns))
 
     @property
     def torn(self) -> bool:
@@ -122,6 +119,8 @@ class ScanSeries:
         time_ns: int,
         device_ns: int | None = None,
         vendor: VendorReading | None = None,
+        *,
+        whole: bool = False,
     ) -> Scan:
         """The next scan.
 
@@ -130,27 +129,15 @@ class ScanSeries:
             time_ns: arrival of its newest reading, in [ns].
             device_ns: of its newest reading, as in Scan.
             vendor: what the vendor's software says of it.
+            whole: it is known to hold every taxel, which halves the cost.
         """
-        fresh = counts[0] != ABSENT
-        renewed = fresh & (counts != self._last).any(axis=0)
-        self._last = np.where(fresh, counts, self._last)
-        return self._number_on(counts, fresh, renewed, time_ns, device_ns, vendor)
-
-    def close_whole(self, counts: NDArray[np.int32], time_ns: int, device_ns: int | None = None) -> Scan:
-        """The same for a scan that holds every taxel, at half the cost."""
-        renewed = np.logical_or.reduce(counts != self._last)
-        self._last = counts
-        return self._number_on(counts, self._all_fresh, renewed, time_ns, device_ns)
-
-    def _number_on(
-        self,
-        counts: NDArray[np.int32],
-        fresh: NDArray[np.bool_],
-        renewed: NDArray[np.bool_],
-        time_ns: int,
-        device_ns: int | None,
-        vendor: VendorReading | None = None,
-    ) -> Scan:
+        if whole:
+            fresh, renewed = self._all_fresh, np.logical_or.reduce(counts != self._last)
+            self._last = counts
+        else:
+            fresh = counts[0] != ABSENT
+            renewed = fresh & (counts != self._last).any(axis=0)
+            self._last = np.where(fresh, counts, self._last)
         for array in (counts, fresh, renewed):
             array.setflags(write=False)
         scan = Scan(self._sensor, self._number, time_ns, counts, fresh, renewed, device_ns, vendor)

@@ -118,13 +118,13 @@ class ScanAssembler:
         """
         totals = dict.fromkeys(_COUNTED, 0)
         for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and find a sensor
-            for name, count in sensor.counters().items():
+            for name, count in sensor.counts.items():
                 totals[name] += count
         return {"readings": self._readings} | totals
 
     def sensor_counters(self) -> dict[str, dict[str, int]]:
         """The same counters apart for each sensor that exists."""
-        return {name: sensor.counters() for name, sensor in list(self._sensors.items()) if sensor.confirmed}
+        return {name: sensor.counts.copy() for name, sensor in list(self._sensors.items()) if sensor.confirmed}
 
 
 class _Sensor:
@@ -146,13 +146,10 @@ class _Sensor:
         self._opened_ns = 0
         self._newest_ns = 0
         self._device: DeviceTime | None = None
-        self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
-
-    def counters(self) -> dict[str, int]:
-        return dict(self._counts)
+        self.counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
     def begin_anew(self) -> None:
-        self._counts["abandoned"] += len(self._taxels)
+        self.counts["abandoned"] += len(self._taxels)
         self._taxels, self._place, self._begins_known = {}, -1, False
         self._last = self._last_cycle = self._device = None
         self.wire.begin_anew()
@@ -185,9 +182,9 @@ class _Sensor:
         counts = counts.reshape(self._scan_shape)
         if device is None:
             self.wire.count(time_ns)
-            return self._count(self._series.close_whole(counts, time_ns), missing=0)
+            return self._count(self._series.close(counts, time_ns, whole=True), missing=0)
         self.wire.count(device.own_ns)
-        return self._count(self._series.close_whole(counts, time_ns, device.host_ns), missing=0)
+        return self._count(self._series.close(counts, time_ns, device.host_ns, whole=True), missing=0)
 
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
         if self._last_cycle is not None:
@@ -195,7 +192,7 @@ class _Sensor:
         # Twice the same frame in a row is the link's doing. Closing on it would tear a scan, and skipping it loses
         # nothing.
         if reading == self._last:
-            self._counts["duplicates"] += 1
+            self.counts["duplicates"] += 1
             return []
         self._last = reading
         wire, taxel = self.wire, reading.taxel
@@ -242,15 +239,15 @@ class _Sensor:
         elif known and not (half or by_pause):
             self.wire.doubt()
             if self.confirmed:
-                self._counts["resynchronised"] += come
+                self.counts["resynchronised"] += come
                 return []
         if not known or not self.wire.order:
             joined = bool(self.wire.order)
-            self._counts["resynchronised" if self.confirmed or joined else "unconfirmed"] += come
+            self.counts["resynchronised" if self.confirmed or joined else "unconfirmed"] += come
             return []
         self.confirmed, self._half_before = self.confirmed or (half and self._half_before), half
         if not self.confirmed:
-            self._counts["unconfirmed"] += come
+            self.counts["unconfirmed"] += come
             return []
         if half:
             self.wire.count(self._newest_ns if self._device is None else self._device.own_ns)
@@ -261,10 +258,10 @@ class _Sensor:
         return [self._count(self._series.close(counts, self._newest_ns, device_ns), missing=count - come)]
 
     def _count(self, scan: Scan, missing: int) -> Scan:
-        self._counts["scans"] += 1
+        self.counts["scans"] += 1
         if not scan.whole:
-            self._counts["missing_taxels"] += missing
-            self._counts["torn_wire"] += missing > 0
-            self._counts["repeated"] += scan.repeated
-            self._counts["torn_source"] += missing == 0 and scan.torn
+            self.counts["missing_taxels"] += missing
+            self.counts["torn_wire"] += missing > 0
+            self.counts["repeated"] += scan.repeated
+            self.counts["torn_source"] += missing == 0 and scan.torn
         return scan

@@ -52,7 +52,7 @@ class SlcanScans:
                 else:
                     end = start + frame_bytes
                     self.can_ids.add(packed[start] << 4 | packed[start + 1] >> 4)
-                    stamp_ms = _stamp_ms(packed, end) if frame_bytes != PACKED_BYTES else None
+                    stamp_ms = int.from_bytes(packed[end - 2 : end]) if frame_bytes != PACKED_BYTES else None
                     self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans)
                 start = end
         return scans
@@ -101,9 +101,9 @@ class SlcanScans:
             return None
         if frame_bytes == PACKED_BYTES:
             return self._assembler.feed_cycle(cycle, packed, time_ns)
-        last_ms = _stamp_ms(packed, len(packed))
+        first_ms, last_ms = int.from_bytes(packed[frame_bytes - 2 : frame_bytes]), int.from_bytes(packed[-2:])
         # Read late and in one piece, half a cycle from before a pause and half from behind look like a whole one.
-        if (last_ms - _stamp_ms(packed, frame_bytes)) % (LAST_TIMESTAMP_MS + 1) * _MS_NS > longest_ns:
+        if (last_ms - first_ms) % (LAST_TIMESTAMP_MS + 1) * _MS_NS > longest_ns:
             return None
         return self._assembler.feed_cycle(cycle, packed, time_ns, self._device_time(last_ms, time_ns))
 
@@ -113,11 +113,6 @@ class SlcanScans:
             self._stamped = stamp_ms, time_ns
             self._device = self._clock.at(stamp_ms, time_ns)
         return self._device
-
-
-def _stamp_ms(packed: bytes, end: int) -> int:
-    """The time stamp of the packed frame that ends there."""
-    return packed[end - 2] << 8 | packed[end - 1]
 
 
 def _millisecond_clock() -> DeviceClock:

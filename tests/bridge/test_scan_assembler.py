@@ -10,7 +10,7 @@ from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP, Reading
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
-from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler, _Sensor
+from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
 
@@ -374,17 +374,23 @@ def test_a_pause_is_measured_by_the_device_s_own_clock():
     assert not torn.complete
 
 
-def test_counters_are_asked_for_while_another_thread_finds_a_sensor(monkeypatch):
+def test_counters_are_asked_for_while_another_thread_finds_a_sensor():
     """As it happens where a link has a thread of its own: the new sensor comes in the midst of the counting."""
     assembler = ScanAssembler(USPA44_MAP)
     feed(assembler, cycle(0))
-    new, count = iter("56"), _Sensor.counters
+    new = iter("56")
 
-    def counters_meanwhile(sensor):
-        assembler.feed(cycle(0, next(new))[0], 100)
-        return count(sensor)
+    class Counts(dict[str, int]):
+        def items(self):
+            assembler.feed(cycle(0, next(new))[0], 100)
+            return super().items()
 
-    monkeypatch.setattr(_Sensor, "counters", counters_meanwhile)
+        def copy(self):
+            assembler.feed(cycle(0, next(new))[0], 100)
+            return super().copy()
+
+    known = assembler._sensors["4"]
+    known.counts = Counts(known.counts)
     assert assembler.counters()["scans"] == 1
     assert list(assembler.sensor_counters()) == ["4"]
 

@@ -22,7 +22,7 @@ def told(*lines: bytes, frames: int = 0) -> AdapterStatus:
 
 
 def counted(status: AdapterStatus) -> dict[str, int]:
-    return {name: count for name, count in status.counters().items() if count}
+    return {name: count for name, count in status.counts.items() if count}
 
 
 def test_every_flag_by_itself_and_all_together():

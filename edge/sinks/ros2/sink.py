@@ -105,7 +105,7 @@ class Ros2Sink(Sink):
         self._source = source
         self._of_now = unix_offset_ns is None
         self._unix_offset_ns = unix_ns() - clock_ns() if unix_offset_ns is None else unix_offset_ns
-        self._unwritten = 0
+        self.unwritten = 0
         self._sensors: dict[str, _Sensor] = {}
         self._counters: Mapping[str, int] = {}
         self._counters_before: Mapping[str, int] = {}
@@ -113,11 +113,6 @@ class Ros2Sink(Sink):
         self._domain, self._participant = join(environment)
         self._diagnostics = self._writer(_DIAGNOSTICS_TOPIC, DiagnosticArray)
         self._events = self._writer(f"{self._base}/events", String, _EVENTS_KEPT)
-
-    @property
-    def unwritten(self) -> int:
-        """Messages that could not be sent without waiting."""
-        return self._unwritten
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Publish one result: its pattern if it has one, its force in newtons if that is known.
@@ -203,7 +198,7 @@ class Ros2Sink(Sink):
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise SinkError(f"cannot publish on {writer.topic.name.removeprefix('rt')}: {error}") from error
-            self._unwritten += 1
+            self.unwritten += 1
 
     def _header(self, time_ns: int, frame: str) -> Header:
         sec, nanosec = divmod(time_ns + self._unix_offset_ns, 10**9)

@@ -271,7 +271,7 @@ def play(scene: Scene, seconds: float, model: ModelSession) -> dict[str, Tally]:
             continue
         off = np.rint(drift + press + scene.noise(rng, len(t)))
         counts = (_REST + off).astype(np.int32)
-        batch = [series.close_whole(one, int(n * 1e9 / RATE_HZ)) for n, one in zip(number, counts, strict=True)]
+        batch = [series.close(one, int(n * 1e9 / RATE_HZ), whole=True) for n, one in zip(number, counts, strict=True)]
         start_s = time.perf_counter()
         results = [runtime.push(scan) for scan in batch]
         tallies["followed"].run_s += time.perf_counter() - start_s
@@ -322,7 +322,7 @@ def _cost(model: ModelSession, quick: bool) -> list[Row]:
     count = _COST_SCANS // (_QUICK if quick else 1)
     counts = (_REST + np.rint(_noise(rng, count))).astype(np.int32)
     series = ScanSeries("4", USPA44)
-    scans = [series.close_whole(one, int(n * 1e9 / RATE_HZ)) for n, one in enumerate(counts)]
+    scans = [series.close(one, int(n * 1e9 / RATE_HZ), whole=True) for n, one in enumerate(counts)]
     took_us: dict[str, list[float]] = {"fixed": [], "followed": []}
     runtimes = {
         name: Runtime(
