@@ -1,4 +1,4 @@
-"""The sinks a user asked for, as one; a sink that fails is given up while the others go on."""
+"""Fan-out to all sinks of a run; a sink that fails is given up while the others go on."""
 
 import sys
 import time
@@ -11,11 +11,11 @@ from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 
 LOOK_NS: Final = 500_000_000
-"""Between two looks at what sinks report: who reads them may need a moment to be found."""
+"""Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
 
 
 class Fan(Sink):
-    """Hands everything on to its sinks.
+    """Fan-out of results and events to several sinks.
 
     Attributes:
         failures: of sinks given up, in their order.
@@ -25,7 +25,7 @@ class Fan(Sink):
         """Begin without a sink.
 
         Args:
-            tell: is told of a sink that is given up, or reports trouble, before the others.
+            tell: called first with the event of a sink that is given up or reports trouble.
             clock_ns: monotonic, in [ns].
         """
         self.failures: list[SinkError] = []
@@ -38,21 +38,21 @@ class Fan(Sink):
         self._known_trouble: set[str] = set()
 
     def add(self, sink: Sink) -> None:
-        """Take one more sink, which is open; the last to fail ends the run."""
+        """Add one open sink; the failure of the last sink ends the run."""
         self._sinks.append(sink)
 
     @property
     def unwritten(self) -> int:
-        """Records left out, of all sinks."""
+        """Number of records left out, of all sinks."""
         return self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
 
     @property
     def trouble(self) -> str | None:
-        """What any of its sinks reports."""
+        """Trouble that any of the sinks reports, or None."""
         return "; ".join(sorted(self._troubles())) or None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Hand on one result.
+        """Pass on one result.
 
         Raises:
             SinkError: no sink is left; SinkClosedError if none failed and their readers have gone.
@@ -60,15 +60,15 @@ class Fan(Sink):
         self._each(lambda sink: sink.write(result, counters), counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Hand on one event; raises as `write` does."""
+        """Pass on one event; raises as `write` does."""
         self._each(lambda sink: sink.tell(event, counters), counters)
 
     def wait(self) -> None:
-        """Hand on that nothing comes; raises as `write` does."""
+        """Pass on that no scan came; raises as `write` does."""
         self._each(lambda sink: sink.wait(), self._counters)
 
     def close(self) -> None:
-        """Close what is left, each whatever becomes of the others.
+        """Close every sink that is left, even if others fail to close.
 
         Raises:
             SinkError: of the first sink that failed, now or before, unless another error ends the run.
@@ -79,13 +79,13 @@ class Fan(Sink):
             except SinkError as error:
                 self.failures.append(error)
         self._sinks = []
-        if self.failures and sys.exception() is None:  # else what ended the run is what is to be told
+        if self.failures and sys.exception() is None:  # else the error that ended the run is reported
             raise self.failures[0]
 
     def _each(self, act: Callable[[Sink], None], counters: Mapping[str, int]) -> None:
-        self._counters = counters  # of a sink that fails while nothing comes, these are still true
+        self._counters = counters  # still true for a sink that fails while no scan comes
         for sink in tuple(self._sinks):
-            if sink not in self._sinks:  # given up meanwhile, when it was told that another was
+            if sink not in self._sinks:  # given up by an earlier call of this loop
                 continue
             try:
                 act(sink)
