@@ -145,7 +145,7 @@ class McapSink(Sink):
                 self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
             for event in result.events:
                 self._log(event)
-            self._file.look()  # after the last message of the scan, so that one chunk holds all of them
+            self._file.look()  # after the last message, so that a due chunk does not end in mid-scan
         except OSError as error:
             raise self._failure(error) from error
 

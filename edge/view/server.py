@@ -142,7 +142,7 @@ class Server:
             sock=self._socket,
             process_request=self._answer,
             create_connection=Counted,
-            compression=None,  # 25 frames a second, made and read on one machine, are not worth the time
+            compression=None,  # it would cost time 25 times a second, for a reader close by
             server_header=None,
             open_timeout=OPEN_S,
             ping_interval=None,
