@@ -43,7 +43,7 @@ def check_sink(text: str) -> tuple[str, str]:
 
 
 def check_apart(texts: Sequence[str]) -> None:
-    """Check that each sink is there once: two would write the same place.
+    """Check that each sink is there once: two would write to the same place.
 
     Raises:
         UsageError: a sink is there twice.

@@ -84,7 +84,7 @@ class ZenohSink(Sink):
 
     @property
     def trouble(self) -> str | None:
-        """Report that there was no subscriber when the last result was put, else None."""
+        """Trouble where there was no subscriber when the last result was put, else None."""
         return None if self._read else f"nobody subscribes to zenoh:{self._target}: see to its reader, or the router"
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
