@@ -1,4 +1,4 @@
-"""Error on the frozen test set, every metric of a subject with some taps given."""
+"""Error on the frozen test set: every metric of a subject, by the number of taps that it gets."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from edge.inference.onnx_session import ModelSession
 from firmware_bridge.geometry import USPA44
 
 FORCE_RANGE_N: Final = 5.0
-"""At which, or as deep as the sensor allows, every tap of a frozen set ends."""
+"""Force at which every tap of a frozen set ends, unless the sensor's depth limit comes first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,8 @@ class ErrorRow:
 
     Attributes:
         name: of the subject.
-        given: newest taps that it was given.
-        error: metric to its mean over all frames; "force_percent" as `force_error_percent` has it.
+        given: number of newest taps in its input.
+        error: metric to its mean over all frames; "force_percent" is that of `force_error_percent`.
         psnr_db_by_surface: surface to PSNR in [dB].
     """
 
@@ -40,7 +40,9 @@ class ErrorRow:
 
 
 def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
-    """A classical method with the newest tap, a model with one and with all it takes; a peer has no error.
+    """Yield the error of a classical method with the newest tap, of a model with one tap and with all it takes.
+
+    A peer has no error.
 
     Raises:
         ModelError: the model cannot be used, or was made for another scale than the test set.
@@ -74,12 +76,12 @@ def _row(
 
 
 def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:
-    """RMS error of the force that patterns (n, H, W) in [mm] sum up to, in [% of FORCE_RANGE_N].
+    """Return the RMS error of the force that patterns (n, H, W) in [mm] sum up to, in [% of FORCE_RANGE_N].
 
     A pattern's deformation summed over its area becomes newtons by one factor, the same for every subject: the one that
-    brings the true patterns nearest to the true forces, least squares, no offset. It is not fitted to what is judged:
-    a pattern that is too deep on the whole is an error. Shapes have factors of their own: true patterns are off too,
-    which is the least that can be asked for (`force_floor_percent`).
+    brings the true patterns nearest to the true forces, least squares, no offset. It is not fitted to the evaluated
+    patterns: a pattern that is too deep on the whole is an error. Shapes have factors of their own, so true patterns
+    are off too, which is the floor of the error (`force_floor_percent`).
     """
     pixel_mm = USPA44.pixel_pitch_mm(frozen.scale)
     newtons_per_mm3 = fit_gain(volume_mm3(frozen.patterns(), pixel_mm), frozen.force_n)
@@ -88,5 +90,5 @@ def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> fl
 
 
 def force_floor_percent(frozen: FrozenSet) -> float:
-    """What `force_error_percent` says of the truth itself."""
+    """Return the `force_error_percent` of the true patterns."""
     return force_error_percent(frozen.patterns(), frozen)

@@ -1,4 +1,4 @@
-"""`edge-sr bench`: its sections, one after the other, and its files."""
+"""Command `edge-sr bench`: its sections, one after the other, and its files."""
 
 import contextlib
 from collections.abc import Sequence
@@ -31,27 +31,27 @@ from edge.evaluation.classical_methods import method_macs
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
 INTERRUPTED: Final = 130
-"""What a shell calls ended by Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
+"""Exit code that a shell gives for Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is asked of a bench.
+    """Settings of a bench.
 
     Attributes:
         out: folder for bench.json, .csv, .md and .png, or None for no files.
         rate_hz: of the paced runs, in [Hz].
         ticks: of the paced runs.
         threads: numbers of threads to measure on.
-        load: whether to measure with the other core busy, too.
+        load: True to measure with the other core busy, too.
         models: folder of the user's own models, or None.
         peers: ONNX files of peers.
         earlier: bench.json of an earlier bench, or None.
-        by_surface: whether to show PSNR by surface.
-        only: names of what is measured, all without.
-        system: whether to measure the whole program, and nothing else.
+        by_surface: True to show PSNR by surface.
+        only: names of the subjects to measure, or None for all.
+        system: True to measure the whole program, and nothing else.
         soak_minutes: of the whole program afterwards, in [min], or None.
-        command: as it was called.
+        command: command line of the bench.
     """
 
     out: Path | None
@@ -73,7 +73,7 @@ def run(settings: Settings, out: TextIO, err: TextIO) -> int:
     """Measure, show and write; returns the exit code.
 
     Raises:
-        EdgeError: something asked for cannot be used, or a measurement failed; what was measured is written first.
+        EdgeError: an input cannot be used, or a measurement failed; the measurements so far are written first.
     """
     page = Page(out, err)
     earlier = None if settings.earlier is None else read_record(settings.earlier)
@@ -118,13 +118,13 @@ def run(settings: Settings, out: TextIO, err: TextIO) -> int:
         page.warn(f"bench stopped before its end{kept}")
         return INTERRUPTED
     finally:
-        if record.errors or record.run_times or record.system:  # an earlier bench is not replaced by nothing
+        if record.errors or record.run_times or record.system:  # an earlier bench is not replaced by an empty one
             _write(record, page, settings.out, [Path(subject.path) for subject in measured_ones if subject.path])
     return 0
 
 
 def _tried_load() -> str:
-    """How the load is kept; found out before minutes are spent, as it itself runs beside its rows alone."""
+    """Return the description of the load, tried before minutes are spent; later it runs only next to its own rows."""
     with busy_core() as told:
         return told
 

@@ -1,7 +1,7 @@
-"""Two benches of one machine: ratios of run times, with intervals.
+"""Comparison of two benches of one machine: ratios of run times, with intervals.
 
-The intervals hold what varies between the blocks of a run. What differs from run to run, as a shared host does, they
-do not: the machine's peak, measured in both, tells something of it.
+The intervals cover variation between the blocks of a run. They do not cover variation from run to run, as on a shared
+host; the machine's peak, measured in both, gives a hint of that.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ _DECIDING = ("cpu", "architecture", "usable_cores", "numpy", "onnxruntime")
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A row of both: new over old."""
+    """Ratios of a row that is in both benches: new over old."""
 
     name: str
     threads: int
@@ -29,13 +29,13 @@ class Compared:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two benches.
+    """Comparison of two benches.
 
     Attributes:
-        rows: that are in both.
+        rows: rows that are in both.
         only_old: rows that the new one lacks, as texts.
         only_new: rows that the old one lacks, as texts.
-        differences: what else is not the same, as texts.
+        differences: other differences, as texts.
         peak: threads to the ratio of the machine's peaks.
     """
 
@@ -47,10 +47,10 @@ class Comparison:
 
 
 def compared(new: Record, old: dict[str, Any], path: Path) -> Comparison:
-    """Hold a bench against an earlier one's JSON.
+    """Compare a bench with an earlier one's JSON.
 
     Raises:
-        BenchError: the JSON lacks a key; it is named.
+        BenchError: the JSON is damaged.
     """
     try:
         olds = {_key(row): row for row in old["run_times"]}
@@ -69,7 +69,7 @@ def compared(new: Record, old: dict[str, Any], path: Path) -> Comparison:
 
 
 def told(name: str, threads: int, load: bool) -> str:
-    """A row in words."""
+    """Return a row in words."""
     return f"{name}, {threads} thread{'s' * (threads > 1)}{', under load' * load}"
 
 

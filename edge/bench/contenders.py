@@ -1,4 +1,4 @@
-"""What is measured: a method without a network, a model with its contract, or a peer's network."""
+"""Subjects of a bench: methods without a network, models with their contracts, and peers' networks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ from edge.inference.onnx_session import ORT_ERRORS, ModelSession, load_session
 
 FROZEN_FILE: Final = BUNDLE_DIR / "frozen.npz"
 WEIGHTS_KEY: Final = "tactile.weights"
-"""Metadata key under which a network that nobody trained says so."""
+"""Metadata key that marks a network with untrained weights."""
 PEER_SEED: Final = 0
 _CLASSICAL_FILE: Final = BUNDLE_DIR / "classical.npz"
 
 Infer = Callable[[NDArray[np.float32]], object]
-"""Runs on a window (K, 3, rows, cols) in zeroed counts, of as many taps as it takes or more."""
+"""Inference on a window (K, 3, rows, cols) in zeroed counts, of as many taps as it takes or more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Something that can be measured.
+    """Method or network that can be measured.
 
     Attributes:
         name: as tables show it.
-        kind: a peer has no contract, so its error is not known.
+        kind: a peer has no contract, so its error cannot be computed.
         path: of the model or the peer; None for a classical method.
         scale: pattern pixels per taxel pitch that a classical method makes.
     """
@@ -41,17 +41,17 @@ class Subject:
 
 
 def classical_subjects(scale: int) -> list[Subject]:
-    """The methods without a network."""
+    """Return the methods without a network."""
     return [Subject(name, "classical", None, scale) for name in fitted_methods(_CLASSICAL_FILE, scale)]
 
 
 def bundled_subjects() -> list[Subject]:
-    """The bundled models."""
+    """Return the bundled models."""
     return [Subject(path.stem, "model", str(path)) for path in bundled_models()]
 
 
 def models_in(folder: Path, refused: Callable[[str], object]) -> list[Subject]:
-    """The user's own models, named FOLDER/NAME; a file that is no usable model is told to `refused`, in a line.
+    """Return the user's own models, named FOLDER/NAME; `refused` gets a line for each file that is no usable model.
 
     Raises:
         UsageError: no such folder, or no .onnx in it.
@@ -73,7 +73,7 @@ def models_in(folder: Path, refused: Callable[[str], object]) -> list[Subject]:
 
 
 def peer_subject(path: Path) -> Subject:
-    """A peer's network, of which nothing is asked but that it runs on floats.
+    """Return a peer's network, which only has to run on floats.
 
     Raises:
         ModelError: it cannot be loaded, or has an input that is not of floats.
@@ -83,15 +83,15 @@ def peer_subject(path: Path) -> Subject:
 
 
 def peer_weights(path: Path) -> str | None:
-    """What a network says of weights that nobody trained, or None."""
+    """Return a network's own note that its weights are untrained, or None."""
     return load_session(path).get_modelmeta().custom_metadata_map.get(WEIGHTS_KEY)
 
 
 def chosen(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
-    """Those of these names, all without.
+    """Return the subjects of these names, or all if there are no names.
 
     Raises:
-        UsageError: a name that none has; those there are are listed.
+        UsageError: no subject has this name; the names are listed.
     """
     if names is None:
         return subjects
@@ -103,7 +103,7 @@ def chosen(subjects: list[Subject], names: list[str] | None) -> list[Subject]:
 
 
 def opened(subject: Subject, threads: int) -> Infer:
-    """The subject ready to run.
+    """Return the subject ready to run.
 
     Raises:
         ModelError: it cannot be used.
@@ -138,7 +138,7 @@ def _opened_peer(path: Path, threads: int) -> Infer:
 
 
 def random_feeds(session: Any, path: Path) -> dict[str, NDArray[np.floating]]:
-    """Seeded normal numbers for every input; a dimension that is not fixed is 1.
+    """Return seeded normal numbers for every input; a dimension that is not fixed is 1.
 
     Raises:
         ModelError: an input is not of floats.

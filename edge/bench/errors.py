@@ -4,4 +4,4 @@ from edge.errors import EdgeError
 
 
 class BenchError(EdgeError, RuntimeError):
-    """A measurement that could not be made, or one of an earlier bench that cannot be used."""
+    """Error of a measurement that could not be made, or of an earlier bench that cannot be used."""

@@ -1,8 +1,8 @@
-"""What a scene spares, and what that costs in error: whole taps through the runtime, with more and more left out.
+"""Inference that a scene makes unnecessary, and its cost in error: whole taps through the runtime, with ever less work.
 
 The stream is made of the frozen test set: of every fourth tap the ends of the taps before, then its own frames, the
-last one held for a second, let go, and a second of rest, with a sensor's noise in every scan. Each scan in which the
-tap goes on is judged against its truth.
+last one held for a second, released, and a second of rest, with a sensor's noise in every scan. Each scan in which the
+tap goes on is evaluated against its truth.
 """
 
 import time
@@ -34,15 +34,15 @@ _UNJUDGED: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """A row of the table.
+    """Row of the table.
 
     Attributes:
-        left_out: what is not computed.
+        left_out: name of the work that is left out.
         model: its name.
         scans: of the stream.
         inferred: windows that the network was run on.
         cpu_us: processor time a scan, back to back, in [us].
-        taps_used: mean over the scans that are judged.
+        taps_used: mean over the evaluated scans.
         psnr_db: mean over the same, in [dB].
     """
 
@@ -56,7 +56,7 @@ class Saving:
 
 
 def savings(model: Model, frozen: FrozenSet) -> Iterator[Saving]:
-    """All rows of a model: first nothing is left out, then one thing more in each."""
+    """Yield all rows of a model: first nothing is left out, then one thing more in each."""
     scans, frames = stream(frozen, model.contract.taps)
     yield _measured("nothing", model, frozen, scans, frames, idle=True, every_scan=True, every_tap=True)
     yield _measured("where nothing touches", model, frozen, scans, frames, every_scan=True, every_tap=True)
@@ -66,7 +66,7 @@ def savings(model: Model, frozen: FrozenSet) -> Iterator[Saving]:
 
 
 def stream(frozen: FrozenSet, taps: int) -> tuple[list[Scan], list[int]]:
-    """Scans, and the frame of the set that each one shows, or -1 where it is not judged."""
+    """Return scans, and for each the frame of the set that it shows, or -1 where it is not evaluated."""
     series, rng = ScanSeries(SENSOR, USPA44), np.random.default_rng(SEED)
     scans: list[Scan] = []
     frames: list[int] = []
@@ -78,7 +78,7 @@ def stream(frozen: FrozenSet, taps: int) -> tuple[list[Scan], list[int]]:
 
 
 def _readings(frozen: FrozenSet, taps: int) -> Iterator[tuple[NDArray[np.int16], int]]:
-    """Zeroed counts (3, rows, cols) without noise, and the frame."""
+    """Yield zeroed counts (3, rows, cols) without noise, and the frame."""
     nothing = (np.zeros_like(frozen.newest[0]), _UNJUDGED)
     for tap in range(0, len(frozen.touched), _EVERY):
         for earlier in frozen.earlier[tap, : taps - 1][::-1]:
@@ -87,12 +87,12 @@ def _readings(frozen: FrozenSet, taps: int) -> Iterator[tuple[NDArray[np.int16],
         own = np.flatnonzero(frozen.tap == tap)
         for frame in (*own, *[own[-1]] * HELD_SCANS):
             yield frozen.newest[frame], int(frame)
-        # Longer than the runtime remembers a tap, so that the next object starts anew.
+        # Longer than the runtime remembers a tap, so that the next object starts without earlier taps.
         yield from [nothing] * HELD_SCANS
 
 
 class _Counted:
-    """A model that counts the windows it is run on."""
+    """Model that counts the windows it is run on."""
 
     def __init__(self, model: Model) -> None:
         self.name, self.contract, self.windows = model.name, model.contract, 0
@@ -128,7 +128,7 @@ def _measured(
     every_scan: bool = False,
     every_tap: bool = False,
 ) -> Saving:
-    """A row; `idle`: the network runs where nothing touches, too."""
+    """Measure a row; `idle`: the network runs where nothing touches, too."""
     counted = _Counted(model)
     baseline = Baseline.of(SENSOR, REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="file")
     runtime = Runtime(

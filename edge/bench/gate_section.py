@@ -1,4 +1,4 @@
-"""The bench's section on what a scene spares."""
+"""Section of the bench on the inference that a scene makes unnecessary."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _TEXT: Final = (
 
 
 def show_savings(everyone: Sequence[Subject], frozen: FrozenSet, record: Record, page: Page) -> None:
-    """Measure, show and keep it, for those of MODELS that are among `everyone`."""
+    """Measure, show and record the savings of those of MODELS that are among `everyone`."""
     shown = [Path(subject.path) for subject in everyone if subject.name in MODELS and subject.path is not None]
     if not shown:
         return
@@ -35,6 +35,6 @@ def show_savings(everyone: Sequence[Subject], frozen: FrozenSet, record: Record,
 
 
 def saving_line(row: Saving) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     shares = (f"{100 * row.inferred / row.scans:.1f}", f"{row.cpu_us:.0f}", f"{row.taps_used:.2f}")
     return line((row.left_out, row.model, str(row.scans), *shares, f"{row.psnr_db:.2f}"))

@@ -1,4 +1,4 @@
-"""Where a bench is shown while it goes on: the page on stdout, kept for the file, and one line of progress."""
+"""Live report of a bench: the page on stdout, kept for the file, and one line of progress."""
 
 from collections.abc import Iterable, Iterator, Sized
 from typing import Final, TextIO, TypeVar
@@ -10,10 +10,10 @@ _Thing = TypeVar("_Thing")
 
 
 class Page:
-    """Lines that are shown at once and kept; progress is shown on a terminal alone, and overwritten.
+    """Page of lines that are shown at once and kept; progress is shown on a terminal alone, and overwritten.
 
     Attributes:
-        lines: all that was said.
+        lines: all lines so far.
     """
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
@@ -37,7 +37,7 @@ class Page:
         self._write(self._err, f"edge-sr: {text}")
 
     def progress(self, text: str) -> None:
-        """Show what is being done: behind the bar where there is one, else over what was shown before."""
+        """Show the current step: after the bar where there is one, else over the step before."""
         if self._bar is not None:
             self._bar.note(text, at_once=True)
         elif self._watched:
@@ -47,7 +47,7 @@ class Page:
     def tracked(
         self, things: Iterable[_Thing], what: str, unit: str = "row", total: int | None = None
     ) -> Iterator[_Thing]:
-        """The things, one after the other, followed by a bar that makes room for what is said meanwhile."""
+        """Yield the things, one after the other, with a progress bar that makes room for lines shown meanwhile."""
         self.progress("")
         count = len(things) if total is None and isinstance(things, Sized) else total
         with Progress(what, count or 0, unit, stream=self._err) as bar:

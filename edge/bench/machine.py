@@ -1,4 +1,4 @@
-"""The machine that a bench ran on."""
+"""Machine that a bench ran on."""
 
 import os
 import platform
@@ -13,13 +13,13 @@ from edge.bench.processes import usable_cores
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What run times depend on.
+    """Facts on a machine that run times depend on.
 
     Attributes:
         cpu: model name.
         architecture: as the system calls it.
-        cores: that there are.
-        usable_cores: that the bench may use.
+        cores: number of cores.
+        usable_cores: number of cores that the bench may use.
         system: name and release.
         python: version.
         numpy: version.
@@ -43,7 +43,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """The one this runs on."""
+    """Return the machine that this process runs on."""
     return Machine(
         cpu=_cpu(),
         architecture=platform.machine(),
@@ -57,7 +57,7 @@ def this_machine() -> Machine:
 
 
 def _cpu() -> str:
-    """Its model name; on ARM, /proc/cpuinfo has none, and the board's name tells most."""
+    """Return the model name of the processor; on ARM, where /proc/cpuinfo has none, the board's name."""
     for path, prefix in (("/proc/cpuinfo", "model name"), ("/proc/device-tree/model", "")):
         try:
             lines = Path(path).read_text(errors="replace").replace("\0", "").splitlines()

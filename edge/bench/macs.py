@@ -1,7 +1,7 @@
-"""Multiply-accumulates of any ONNX file, by what onnxruntime says it did.
+"""Count of the multiply-accumulates of any ONNX file, from a profile by onnxruntime.
 
 The runtime has no ONNX library to read a graph with, and shapes are often not written in one. So the graph is run once
-as it is, with no optimisation that would fuse its nodes, and the profile tells the shapes of every one.
+as it is, with no optimisation that would fuse its nodes, and the profile holds the shapes of every node.
 """
 
 import json
@@ -28,7 +28,7 @@ class Macs:
 
     Attributes:
         count: of all convolutions and matrix products.
-        uncounted: operators that hold more of them which are not counted.
+        uncounted: operators with further multiply-accumulates, which are not counted.
     """
 
     count: int
@@ -93,11 +93,11 @@ def macs_of(path: Path) -> Macs:
 
 
 def counted(events: Sequence[dict[str, Any]]) -> Macs:
-    """What the events of a profile come to."""
+    """Return the multiply-accumulates in the events of a profile."""
     count, uncounted = 0, set[str]()
     for event in events:
         told = event.get("args", {})
-        # Only an event that is the work of a node tells shapes.
+        # Only the event of a node's own work holds shapes.
         if "input_type_shape" not in told:
             continue
         operator = told["op_name"]

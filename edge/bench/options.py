@@ -1,4 +1,4 @@
-"""What `edge-sr bench` may be asked, and its help; wide enough for 40 columns."""
+"""Options of `edge-sr bench`, and its help; narrow enough for 40 columns."""
 
 import argparse
 from pathlib import Path
@@ -24,7 +24,7 @@ was measured is written.
 
 
 def bench_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr bench`."""
+    """Return the parser of the options of `edge-sr bench`."""
     parser = Parser(
         prog="edge-sr bench",
         usage="edge-sr bench [options]",

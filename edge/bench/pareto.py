@@ -1,10 +1,10 @@
-"""The Pareto front: who is not beaten in both error and run time."""
+"""Pareto front: the points that no other point beats in both error and run time."""
 
 from collections.abc import Sequence
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Whether no other point is at least as small in both numbers and smaller in one, for each point."""
+    """Return, for each point, True if no other point is at least as small in both numbers and smaller in one."""
     return [not any(_beats(other, point) for other in points) for point in points]
 
 

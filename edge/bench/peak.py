@@ -1,4 +1,4 @@
-"""What the machine can do at most: large matrix products.
+"""Peak of the machine: large matrix products.
 
 numpy's BLAS may know less of a processor than onnxruntime does (on a new one it may fall back to instructions of half
 the width), and the largest product may wait for memory. So the best of both, over several sizes, is the peak.
@@ -21,7 +21,7 @@ _LEAST_TRIES: Final = 3
 
 
 def peak_gmac_s(threads: int, sizes: tuple[int, ...] = SIZES) -> float:
-    """Best of several square float32 products, in [10^9 multiply-accumulates per second].
+    """Return the best of several square float32 products, in [10^9 multiply-accumulates per second].
 
     Args:
         threads: of onnxruntime; numpy's BLAS takes those of the process's environment.
@@ -53,9 +53,9 @@ def _shortest_ns(work: Callable[[], object]) -> int:
 
 
 def product_model() -> bytes:
-    """An ONNX file of c = a b for matrices of any size, written by hand, as the runtime has no library that writes it.
+    """Return an ONNX file of c = a b for matrices of any size, written by hand because the runtime has no such library.
 
-    Source: onnx.proto, ModelProto and what it holds.
+    Source: onnx.proto, ModelProto and the messages in it.
     """
     two_dimensions = _field(2, _field(1, b"") * 2)
     float_tensor = _field(1, _number(1, 1) + two_dimensions)
@@ -68,10 +68,10 @@ def product_model() -> bytes:
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """A field of bytes, fewer than 128."""
+    """Encode a field of fewer than 128 bytes."""
     return bytes([number << 3 | 2, len(content)]) + content
 
 
 def _number(number: int, value: int) -> bytes:
-    """A field of a number below 128."""
+    """Encode a field of a number below 128."""
     return bytes([number << 3, value])

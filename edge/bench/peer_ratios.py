@@ -1,4 +1,4 @@
-"""Ratios to a peer's network: both in one process, in turn, so that what the machine does meets both."""
+"""Ratios to a peer's network: both run in one process, in turn, so that a disturbance of the machine affects both."""
 
 import time
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ _MOST_RUNS: Final = 50
 def alternated(
     one: Run, other: Run, rounds: int, clock: Clock = time.perf_counter_ns
 ) -> tuple[list[float], list[float]]:
-    """Median run times of two, block by block in turn, in [us]; who begins changes from round to round.
+    """Return median run times of two, block by block in turn, in [us]; the one that runs first alternates.
 
-    Each block lasts about 20 ms, its first run not counted: it finds the caches full of the other.
+    Each block lasts about 20 ms, its first run not counted, because the caches are full of the other's data.
     """
     runs = (one, other)
     lengths = [_block_runs(timed(run, range(3), clock)) for run in runs]
@@ -37,5 +37,5 @@ def _block_runs(took_ns: Sequence[int]) -> int:
 
 
 def job(subject: dict[str, Any], peer: dict[str, Any]) -> dict[str, Any]:
-    """What a child is asked."""
+    """Return the job for a child process."""
     return {"do": "against", "subject": subject, "peer": peer, "rounds": ROUNDS}

@@ -1,4 +1,4 @@
-"""The picture of a bench: PSNR against run time, the Pareto front drawn; needs matplotlib."""
+"""Picture of a bench: PSNR against run time, with the Pareto front; needs matplotlib."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from edge.bench.record import FrontRow
 from firmware_bridge.extras import how_to_install
 
 _LABELS: Final = 34
-"""As many labels, one above the other, as fill the picture's height."""
+"""Number of labels, one above the other, that fill the picture's height."""
 
 
 def draw(rows: Sequence[FrontRow], path: Path, title: str) -> None:
@@ -39,7 +39,7 @@ def draw(rows: Sequence[FrontRow], path: Path, title: str) -> None:
         axes.step(*zip(*on_front, strict=True), where="post", color="tab:orange", label="Pareto front", zorder=1)
         colours = ["tab:orange" if is_best else "tab:blue" for is_best in best]
         axes.scatter(*zip(*points, strict=True), c=colours, zorder=2)
-        # Names stand in a column at the right, in the order of their points, so that none hides another.
+        # Names stand in a column at the right, in the order of their points, so that they do not cover each other.
         order = sorted(range(len(rows)), key=lambda i: points[i][1])
         low, high = axes.get_ylim()
         heights = _spread([points[i][1] for i in order], gap=(high - low) / _LABELS)
@@ -68,7 +68,7 @@ def draw(rows: Sequence[FrontRow], path: Path, title: str) -> None:
 
 
 def _spread(values: Sequence[float], gap: float) -> list[float]:
-    """Rising values, moved apart until `gap` lies between neighbours, about the middle of each crowd."""
+    """Move rising values apart until `gap` lies between neighbours, about the middle of each crowd."""
     crowds: list[list[float]] = []
     for value in values:
         crowds.append([value])

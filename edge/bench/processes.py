@@ -1,4 +1,4 @@
-"""Processes of their own to measure in: threads, memory and start-up are properties of a process."""
+"""Processes of their own for measurements: threads, memory and start-up are properties of a process."""
 
 import contextlib
 import json
@@ -22,14 +22,14 @@ _THREAD_VARIABLES: Final = (
     "VECLIB_MAXIMUM_THREADS",
 )
 STARTS: Final = 5
-"""Of which a start-up is the median."""
+"""Number of starts whose median is the start-up."""
 
 
 def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
-    """What a child says of a job of `edge.bench.worker`, numpy's BLAS on as many threads.
+    """Return a child's result of a job of `edge.bench.worker`, with numpy's BLAS on as many threads.
 
     Raises:
-        BenchError: it failed; the last line that it said is in it.
+        BenchError: the child failed; its last line is in the message.
     """
     with _child(threads) as child:
         said, complaint = child.communicate(json.dumps(job))
@@ -40,10 +40,10 @@ def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
 
 
 def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None]:
-    """Median time from the spawn of a process to its first pattern, imports included, in [ms]; and its memory.
+    """Return the median time from the spawn of a process to its first pattern, imports included, and its memory.
 
     Returns:
-        Time in [ms], and the most memory resident until then, median, in [MB]; None where the system does not tell.
+        Time in [ms], and the most memory resident until then, median, in [MB]; None where the system does not show it.
     """
     took_ms: list[float] = []
     resident_mb: list[float] = []
@@ -58,12 +58,12 @@ def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None
 
 @contextlib.contextmanager
 def busy_core() -> Iterator[str]:
-    """Keeps the last core busy that this process may use; gives a line that says how.
+    """Keep the last core busy that this process may use; yields a line that describes the load.
 
-    Only the load is held to its core: what is measured goes where the scheduler puts it, as on a robot.
+    Only the load is held to its core: the measured process runs where the scheduler puts it, as on a robot.
 
     Raises:
-        UsageError: there is one core alone.
+        UsageError: this process may use only one core.
     """
     cores = usable_cores()
     if len(cores) < 2:
@@ -79,7 +79,7 @@ def busy_core() -> Iterator[str]:
 
 
 def usable_cores() -> list[int]:
-    """Numbers of the cores that this process may use."""
+    """Return the numbers of the cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
@@ -87,7 +87,7 @@ def usable_cores() -> list[int]:
 
 @contextlib.contextmanager
 def _child(threads: int) -> Iterator[subprocess.Popen[str]]:
-    # The same modules as here, whichever way this process came to find them.
+    # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.worker import main; sys.exit(main())"
     with subprocess.Popen(
         [sys.executable, "-c", script],
@@ -100,6 +100,6 @@ def _child(threads: int) -> Iterator[subprocess.Popen[str]]:
         try:
             yield child
         finally:
-            # Does nothing to one that has ended; after a Ctrl-C, Popen itself would leave one behind.
+            # This does nothing to a child that has ended; after a Ctrl-C, Popen itself would leave it running.
             child.kill()
             child.wait()

@@ -41,13 +41,13 @@ while True:
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """What sensors on one bus play.
+    """Scans that emulated sensors on one bus play.
 
     Attributes:
         rate_hz: scans a second of each, in [Hz].
         sensors: 1 or 2.
-        pressed: of 500 scans, how many are in contact; the others come first.
-        moving: what presses moves, so that no scan is like the one before.
+        pressed: of 500 scans, the number in contact; the others come first.
+        moving: the contact moves, so that each scan differs from the one before.
     """
 
     rate_hz: float = 100.0
@@ -57,20 +57,20 @@ class Play:
 
     @property
     def frame_us(self) -> float:
-        """What a frame takes: as on a bus of 1 Mbit/s, or as little as the rate leaves."""
+        """Time of a frame, in [us]: as on a bus of 1 Mbit/s, or as little as the rate leaves."""
         return min(130.0, 0.5e6 / (16 * self.sensors * self.rate_hz))
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A record as it came: when, in [ns], and what stands in it before its maps."""
+    """Record with the time of its arrival, in [ns], and its values before the maps."""
 
     time_ns: int
     record: dict[str, Any]
 
 
 class Program:
-    """A process that reads emulated sensors; its records where it writes any."""
+    """Process that reads emulated sensors, and its records where it writes any."""
 
     def __init__(self, process: subprocess.Popen[bytes], spawned_ns: int, stamps: Path) -> None:
         self.spawned_ns = spawned_ns
@@ -79,10 +79,10 @@ class Program:
         self._folder = Path(f"/proc/{process.pid}")
 
     def lines(self, seconds: float, most: int | None = None) -> list[Line]:
-        """The records of so long, or as many.
+        """Return the records of so long, or at most so many.
 
         Raises:
-            BenchError: it ended.
+            BenchError: the program ended.
         """
         if self._process.stdout is None:
             raise ValueError("the program's stdout is no pipe")
@@ -94,39 +94,39 @@ class Program:
             now_ns = time.monotonic_ns()
             if not line:
                 raise BenchError(f"edge-sr ended with {self._process.wait()} while it was measured")
-            # Nothing is parsed meanwhile: it would take the program's processor time away. An event has no maps.
+            # Parsing waits until the end: it would take the program's processor time away. An event has no maps.
             head, maps, _ = line.partition(_MAPS)
             if maps:
                 got.append((now_ns, head + b"}"))
         return [Line(time_ns, json.loads(head)) for time_ns, head in got]
 
     def first_pattern_s(self) -> float:
-        """From its spawn to the record of its first pattern, in [s]."""
+        """Return the time from its spawn to the record of its first pattern, in [s]."""
         while True:
             line = self.lines(60.0, most=1)[0]
             if line.record["state"] == "contact":
                 return (line.time_ns - self.spawned_ns) / 1e9
 
     def thread_cpu_s(self) -> dict[str, float]:
-        """Processor time of each of its threads, as the scheduler counts it, in [s]."""
+        """Return the processor time of each of its threads, as the scheduler counts it, in [s]."""
         tasks = (self._folder / "task").iterdir()
         return {task.name: int((task / "schedstat").read_text().split()[0]) / 1e9 for task in tasks}
 
     def preemptions(self) -> int:
-        """How often one of its threads lost its processor against its will."""
+        """Count the times that one of its threads lost its processor against its will."""
         told = [(task / "status").read_text() for task in (self._folder / "task").iterdir()]
         return sum(int(text.rpartition("nonvoluntary_ctxt_switches:")[2]) for text in told)
 
     def resident_mb(self) -> float:
-        """Memory it holds, in [MB]."""
+        """Return its resident memory, in [MB]."""
         return int((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def threads_and_descriptors(self) -> tuple[int, int]:
-        """How many it has of each."""
+        """Return the numbers of its threads and of its open descriptors."""
         return len(list((self._folder / "task").iterdir())), len(list((self._folder / "fd").iterdir()))
 
     def stamps_ns(self) -> dict[str, list[int]]:
-        """When the last byte of each scan was handed on, by sensor, once the emulator has ended, in [ns]."""
+        """Return the time of the last byte of each scan, by sensor, once the emulator has ended, in [ns]."""
         times: dict[str, list[int]] = {name: [] for name in CONTROLLERS}
         for line in self._stamps.read_text().splitlines():
             controller, time_ns = line.split()
@@ -136,14 +136,14 @@ class Program:
 
 @contextmanager
 def plain_loop(folder: Path, play: Play) -> Iterator[Program]:
-    """What reads the same bytes with pyserial and does nothing with them."""
+    """Run a program that reads the same bytes with pyserial and does nothing with them."""
     with _emulator(folder, play) as (port, stamps), _process(["-c", _PLAIN_LOOP, port], stamps) as program:
         yield program
 
 
 @contextmanager
 def edge_sr(folder: Path, play: Play, *options: str, sink: str = "jsonl:-") -> Iterator[Program]:
-    """`edge-sr` with stored baselines; files lie in `folder` meanwhile."""
+    """Run `edge-sr` with stored baselines; its files lie in `folder` meanwhile."""
     with _emulator(folder, play) as (port, stamps):
         command = ["-m", "edge.cli.main", "--source", f"slcan:{port}", "--baseline", str(folder / "zero.json")]
         with _process([*command, "--sink", sink, *options], stamps) as program:
@@ -163,10 +163,10 @@ def _emulator(folder: Path, play: Play) -> Iterator[tuple[str, Path]]:
 
 @contextmanager
 def emulating(*arguments: str) -> Iterator[str]:
-    """The port of an emulator in a process of its own, given these arguments.
+    """Run an emulator with these arguments in a process of its own, and yield its port.
 
     Raises:
-        BenchError: it did not start.
+        BenchError: the emulator did not start.
     """
     command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", *arguments]
     with subprocess.Popen(
@@ -184,7 +184,7 @@ def emulating(*arguments: str) -> Iterator[str]:
 
 @contextmanager
 def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
-    with uncollected():  # or a pause of ours would count as the program's
+    with uncollected():  # or a pause of our own collector would count as the program's
         spawned_ns = time.monotonic_ns()
         with subprocess.Popen(
             [sys.executable, *arguments],
@@ -197,12 +197,12 @@ def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
             try:
                 yield Program(process, spawned_ns, stamps)
             finally:
-                process.kill()  # its last records are of no interest, and nobody reads them
+                process.kill()  # its last records are of no interest
 
 
 def environment() -> dict[str, str]:
-    """For processes of the program's own parts."""
-    # The same packages as here, whichever way this process came to find them.
+    """Return the environment for processes of the program's own parts."""
+    # The child imports the same packages as this process, however they were located.
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])}
 
 

@@ -20,7 +20,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 SEARCHED: Final = ("", "tests/support/", "tests/system/")
 """Folders that modules are imported from, below ROOT."""
 DIGITS: Final = 12
-"""Kept of a SHA-256."""
+"""Number of digits kept of a SHA-256."""
 UNKNOWN: Final = "unknown"
 
 _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MULTILINE)
@@ -28,13 +28,13 @@ _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MU
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What a report was made from.
+    """Provenance of a report.
 
     Attributes:
         command: that makes it.
         date: ISO 8601, UTC.
         commit: checked out meanwhile, or UNKNOWN outside a checkout.
-        tree: "clean", "changed" beside that commit, or a note on how the commit is known.
+        tree: "clean", "changed" since that commit, or a note on the origin of the commit's id.
         machine: processor, cores and versions.
         seed: of all chance, or None where each source has its own.
         sources: files that make it, below ROOT; all they import counts, too.
@@ -144,14 +144,14 @@ def file_hash(path: Path) -> str:
 
 
 def changed_files(commit: str, paths: Iterable[str]) -> list[str]:
-    """Return those of the files that differ from a commit's; none where git or the commit lacks."""
+    """Return those of the files that differ from a commit's; an empty list where git or the commit lacks."""
     names = _git("diff", "--name-only", commit, "--")
     return sorted(set(paths) & set((names or "").splitlines()))
 
 
 @cache  # reports share most of their sources
 def _imports(text: str) -> frozenset[str]:
-    """Files that the modules a source imports may be; a name imported from a package may be a module, too."""
+    """Return the files that the imports of a source may stand for; a name from a package may be a module, too."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
@@ -186,7 +186,7 @@ def _below_root(path: Path) -> str:
 
 
 def _git(*arguments: str) -> str | None:
-    """Return what git answers in ROOT; None outside a checkout, or without git."""
+    """Return the output of git in ROOT; None outside a checkout, or without git."""
     try:
         done = subprocess.run(["git", "-C", ROOT, *arguments], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):

@@ -1,4 +1,4 @@
-"""Ratios of run times with 95 % intervals, by drawing whole blocks."""
+"""Ratios of run times with 95 % intervals, by resampling of whole blocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 SEED: Final = 0
 MOST_BLOCKS: Final = 10_000
-"""As many as resampling can hold: each is drawn a thousand times."""
+"""Most blocks that resampling can hold: each is drawn a thousand times."""
 LONGEST_US: Final = 1e12
 _RESAMPLES: Final = 2000
 _QUANTILES: Final = (0.025, 0.975)
@@ -17,7 +17,7 @@ _QUANTILES: Final = (0.025, 0.975)
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """A ratio of two medians, and its 95 % interval."""
+    """Ratio of two medians, and its 95 % interval."""
 
     ratio: float
     low: float
@@ -29,17 +29,17 @@ class Ratio:
 
     @property
     def differs(self) -> bool:
-        """Whether 1 lies outside the interval."""
+        """True where 1 lies outside the interval."""
         return not self.low <= 1 <= self.high
 
 
 def ratio_of(over: Sequence[float], under: Sequence[float], *, paired: bool) -> Ratio:
-    """Ratio of the medians of two measurements' blocks.
+    """Return the ratio of the medians of two measurements' blocks.
 
     Args:
         over: median run time of each block.
         under: the other's.
-        paired: whether the blocks of one place were measured together, and are drawn together.
+        paired: True where blocks of one place were measured together, and are drawn together.
 
     Raises:
         ValueError: a measurement without blocks, with one that is no run time, or pairs that do not match.

@@ -1,4 +1,4 @@
-"""What a bench keeps: one JSON file, which a later bench can be compared with."""
+"""Record of a bench: one JSON file, which a later bench can be compared with."""
 
 import csv
 import io
@@ -23,19 +23,19 @@ from firmware_bridge.bounded_read import read_bounded
 FORMAT: Final = "tactile bench"
 VERSION: Final = 1
 MOST_FILE_BYTES: Final = 1 << 26
-"""A hundred times a bench of all models."""
+"""Largest size of a record's file, in bytes: a hundred times a bench of all models."""
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What is true of a subject wherever it runs.
+    """Facts on a subject that do not depend on the machine.
 
     Attributes:
         name: of the subject.
         kind: "classical", "model" or "peer".
         macs: multiply-accumulates of one window.
-        uncounted: operators of which they are not counted.
-        weights: what a peer says of weights that nobody trained, or None.
+        uncounted: operators whose multiply-accumulates are not counted.
+        weights: a peer's own note that its weights are untrained, or None.
     """
 
     name: str
@@ -52,13 +52,13 @@ class RunTimeRow:
     Attributes:
         name: of the subject.
         threads: of one run.
-        load: whether the other core was kept busy.
+        load: True where the other core was kept busy.
         back_to_back: without a pause.
         paced: at the rate.
         gmac_s: back to back, in [10^9 multiply-accumulates per second].
         peak_percent: of the machine's peak on as many threads, in [%].
         start_up_ms: from the process's spawn to its first pattern, in [ms].
-        resident_mb: most memory resident until then, in [MB]; None where the system does not tell.
+        resident_mb: most memory resident until then, in [MB]; None where the system does not show it.
     """
 
     name: str
@@ -74,7 +74,7 @@ class RunTimeRow:
 
 @dataclass(frozen=True, slots=True)
 class FrontRow:
-    """A subject's error against its run time, and whether it is on the Pareto front of the two."""
+    """Error of a subject against its run time, and its place on the Pareto front of the two."""
 
     name: str
     given: int
@@ -87,7 +87,7 @@ class FrontRow:
 
 @dataclass(slots=True)
 class SystemRecord:
-    """The whole program, as far as it was measured: its rows, its starts, what both are held against, and a soak."""
+    """Measurements of the whole program so far: its rows, its starts, the verdicts on its targets, and a soak."""
 
     rows: list[SystemRow] = field(default_factory=list[SystemRow])
     start_up: StartUp | None = None
@@ -97,21 +97,21 @@ class SystemRecord:
 
 @dataclass(slots=True)
 class Record:
-    """All of a bench, as far as it came.
+    """Record of a bench, complete or up to where it stopped.
 
     Attributes:
-        date: when it began, ISO 8601 in UTC.
-        command: as it was called.
-        machine: where.
+        date: of its begin, ISO 8601 in UTC.
+        command: command line of the bench.
+        machine: machine that it ran on.
         settings: rate, ticks, threads, load, seeds.
-        complete: whether it came to its end.
+        complete: True if it came to its end.
         peak_gmac_s: threads to the machine's peak.
         force_floor_percent: force error of true patterns.
         facts: of each subject.
         errors: on the frozen test set.
         run_times: of each subject, on each number of threads, alone and under load.
         against: peer to subject to the ratio of the subject's run time to the peer's.
-        savings: what a scene spares.
+        savings: inference that a scene makes unnecessary.
         system: the whole program, if that was asked for.
     """
 
@@ -130,11 +130,11 @@ class Record:
     system: SystemRecord | None = None
 
     def fact(self, name: str) -> Facts:
-        """Of the subject of this name."""
+        """Return the facts of the subject of this name."""
         return next(fact for fact in self.facts if fact.name == name)
 
     def front_rows(self) -> list[FrontRow]:
-        """Every error with a run time on the fewest threads, alone; the fastest at the rate first."""
+        """Return every error with a run time on the fewest threads, alone; the fastest at the rate first."""
         if not self.run_times:
             return []
         fewest = min(row.threads for row in self.run_times)
@@ -156,13 +156,13 @@ class Record:
         return sorted(rows, key=lambda row: row.paced_p50_us)
 
     def to_json(self) -> str:
-        """The record, with the front in it."""
+        """Return the record as JSON, with the front in it."""
         told = {"format": FORMAT, "version": VERSION} | asdict(self)
         told["front"] = [asdict(row) for row in self.front_rows()]
         return json.dumps(told, indent=1) + "\n"
 
     def to_csv(self) -> str:
-        """A flat line for each error and run time of a subject, each row of the whole program and of a scene's savings.
+        """Return a flat line for each error and run time, each row of the whole program and each saving.
 
         A cell is empty where there is no figure.
         """
@@ -215,7 +215,7 @@ def _system_cells(row: SystemRow) -> dict[str, Any]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """An earlier bench's JSON.
+    """Read an earlier bench's JSON.
 
     Raises:
         BenchError: no such file, no bench, or one of another version.

@@ -1,4 +1,4 @@
-"""What a bench shows: Markdown, section by section, lines as they are measured."""
+"""Report of a bench: Markdown, section by section, with each line as it is measured."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,7 +10,7 @@ from edge.bench.record import Facts, FrontRow, Record, RunTimeRow
 from edge.bench.timing import Times
 
 FULL_TICKS: Final = 3000
-"""From so many on p99.9 is more than the longest few."""
+"""Fewest ticks for which p99.9 rests on more than the longest few."""
 ERROR_COLUMNS: Final = (
     *("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %"),
     "force error %",
@@ -22,17 +22,17 @@ COMPARE_COLUMNS: Final = ("method", "threads", "other core", "back to back p50, 
 
 
 def line(cells: Sequence[str]) -> str:
-    """A row of a Markdown table."""
+    """Return a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 
 def head(columns: Sequence[str]) -> str:
-    """The head of a Markdown table."""
+    """Return the head of a Markdown table."""
     return f"{line(columns)}\n{'|---' * len(columns)}|"
 
 
 def about(record: Record) -> str:
-    """What was measured where."""
+    """Describe the date, the command, the machine and the settings."""
     settings = record.settings
     few = "" if settings["ticks"] >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses say little)"
     return (
@@ -43,7 +43,7 @@ def about(record: Record) -> str:
 
 
 def error_text(floor_percent: float) -> str:
-    """What the table of errors says."""
+    """Describe the table of errors."""
     return (
         "Frozen test set, means over all frames. Force error is RMS in % of "
         f"{FORCE_RANGE_N:g} N, of what patterns sum up to, by the one factor that suits true patterns best: those "
@@ -52,7 +52,7 @@ def error_text(floor_percent: float) -> str:
 
 
 def error_line(row: ErrorRow) -> str:
-    """Errors as a row of the table."""
+    """Return errors as a row of the table."""
     error = row.error
     cells = (
         f"{error['psnr_db']:.2f}",
@@ -66,7 +66,7 @@ def error_line(row: ErrorRow) -> str:
 
 
 def surface_table(rows: Sequence[ErrorRow]) -> str:
-    """PSNR in [dB] of each surface, a column for each error."""
+    """Return PSNR in [dB] of each surface as a table, with a column for each error."""
     lines = [head(["surface, PSNR dB", *(f"{row.name} ({row.given})" for row in rows)])]
     for surface in rows[0].psnr_db_by_surface if rows else ():
         lines.append(line([surface, *(f"{row.psnr_db_by_surface[surface]:.1f}" for row in rows)]))
@@ -74,7 +74,7 @@ def surface_table(rows: Sequence[ErrorRow]) -> str:
 
 
 def run_time_columns(rate_hz: float) -> tuple[str, ...]:
-    """Of the table of run times."""
+    """Return the columns of the table of run times."""
     return (
         *("method", "threads", "other core", "MMAC"),
         *(f"back to back {figure}" for figure in _PERCENTILES),
@@ -85,7 +85,7 @@ def run_time_columns(rate_hz: float) -> tuple[str, ...]:
 
 
 def run_time_text(peak_gmac_s: dict[int, float]) -> str:
-    """What the table of run times says."""
+    """Describe the table of run times."""
     peaks = ", ".join(
         f"{peak:.0f} GMAC/s on {threads} thread{'s' * (threads > 1)}" for threads, peak in peak_gmac_s.items()
     )
@@ -98,7 +98,7 @@ def run_time_text(peak_gmac_s: dict[int, float]) -> str:
 
 
 def run_time_line(row: RunTimeRow, fact: Facts) -> str:
-    """Run times as a row of the table."""
+    """Return run times as a row of the table."""
     name = f"{row.name} (run time only{', weights ' + fact.weights if fact.weights else ''})"
     cells = (
         name if fact.kind == "peer" else row.name,
@@ -118,7 +118,7 @@ def run_time_line(row: RunTimeRow, fact: Facts) -> str:
 
 
 def front_text(rows: Sequence[RunTimeRow]) -> str:
-    """What the table of the front says."""
+    """Describe the table of the front."""
     threads = min(row.threads for row in rows)
     return (
         f"On {threads} thread{'s' * (threads > 1)}, the other core idle. * is on the Pareto front: none is at least as "
@@ -127,7 +127,7 @@ def front_text(rows: Sequence[RunTimeRow]) -> str:
 
 
 def front_line(row: FrontRow) -> str:
-    """Error against run time as a row of the table."""
+    """Return error against run time as a row of the table."""
     return line(
         (
             "*" if row.on_front else "",
@@ -142,7 +142,7 @@ def front_line(row: FrontRow) -> str:
 
 
 def against_text(peer: str, weights: str | None) -> str:
-    """What the table of ratios to the peer says."""
+    """Describe the table of ratios to the peer."""
     nobody = f" Its weights are {weights}: its run time is what it is, its patterns are nothing." if weights else ""
     return (
         f"Against {peer}, run time only.{nobody} Both in one process, block by block in turn, back to back on one "
@@ -151,12 +151,12 @@ def against_text(peer: str, weights: str | None) -> str:
 
 
 def against_line(name: str, ratio: Ratio) -> str:
-    """A ratio to the peer, both ways, as a row of the table."""
+    """Return a ratio to the peer, both ways, as a row of the table."""
     return line((name, str(ratio), str(Ratio(1 / ratio.ratio, 1 / ratio.high, 1 / ratio.low))))
 
 
 def compare_text(path: str, comparison: Comparison) -> str:
-    """What the table of ratios to an earlier bench says."""
+    """Describe the table of ratios to an earlier bench."""
     peaks = ", ".join(f"{ratio:.2f} on {threads}" for threads, ratio in comparison.peak.items()) or "not in both"
     lines = [
         f"New over old, {path}: medians with 95 % intervals of what varies within a run; * where 1 is outside. "
@@ -173,13 +173,13 @@ def compare_text(path: str, comparison: Comparison) -> str:
 
 
 def compare_line(row: Compared) -> str:
-    """Ratios to an earlier bench as a row of the table."""
+    """Return ratios to an earlier bench as a row of the table."""
     ratios = (f"{ratio}{' *' * ratio.differs}" for ratio in (row.back_to_back, row.paced))
     return line((row.name, str(row.threads), "busy" if row.load else "idle", *ratios))
 
 
 def progress_text(name: str, threads: int, load: bool) -> str:
-    """What is being measured."""
+    """Name the row that is being measured."""
     return f"run time of {told(name, threads, load)}"
 
 

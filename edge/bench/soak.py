@@ -2,7 +2,7 @@
 
     python -m edge.bench.soak MINUTES
 
-writes what it found as JSON.
+writes the result as JSON.
 """
 
 import argparse
@@ -23,21 +23,21 @@ from edge.bench.program import Play, Program, edge_sr
 from edge.terminal.progress_bar import tracked
 
 WARM_UP_S: Final = 6.0
-"""Both phases, so that everything has been used once."""
+"""Length of both phases, in [s], so that everything has been used once."""
 WINDOW_S: Final = 5.0
-"""One turn of rest and contact, so that windows can be compared."""
+"""Length of one turn of rest and contact, in [s], so that windows can be compared."""
 _PLAY: Final = Play(pressed=250, moving=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Some seconds of a soak.
+    """Measurement of some seconds of a soak.
 
     Attributes:
         end_s: since the first began, in [s].
         resident_mb: memory at its end, in [MB].
-        quiet_us: lower quartile of the latency from scan to pattern, in [us]: of what else the machine does it shows
-            the least.
+        quiet_us: lower quartile of the latency from scan to pattern, in [us]: it depends least on other work of the
+            machine.
         threads: at its end.
         descriptors: open ones, at its end.
         overruns: scans thrown away unseen, so far.
@@ -53,14 +53,14 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Soak:
-    """What a soak showed.
+    """Result of a soak.
 
     Attributes:
-        minutes: it lasted.
+        minutes: its length.
         memory_mb_per_minute: least-squares slope of the memory.
         memory_half: half of that slope's 95 % interval, in [MB per minute].
         latency_ratio: of quiet latencies, last third to first, medians of windows.
-        windows: what it is made from.
+        windows: measurements that it is computed from.
     """
 
     minutes: float
@@ -71,10 +71,10 @@ class Soak:
 
 
 def soak(minutes: float) -> Soak:
-    """Run the program for so long; at least three windows, followed by a bar.
+    """Run the program for so long, with a progress bar; at least three windows.
 
     Raises:
-        BenchError: it ended before.
+        BenchError: the program ended early.
     """
     with tempfile.TemporaryDirectory() as folder, edge_sr(Path(folder), _PLAY) as program:
         program.lines(WARM_UP_S)
@@ -84,7 +84,7 @@ def soak(minutes: float) -> Soak:
 
 
 def judged(windows: Sequence[Window]) -> Soak:
-    """What so many windows, three at least, say."""
+    """Compute the result of a soak from its windows, three at least."""
     third = len(windows) // 3
     first, last = (np.median([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))
     growth, half = slope([w.end_s / 60 for w in windows], [w.resident_mb for w in windows])
@@ -104,7 +104,7 @@ def _windows(program: Program, count: int) -> Iterator[Window]:
 
 
 def slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float]:
-    """Least-squares slope, and half of its 95 % interval."""
+    """Return the least-squares slope, and half of its 95 % interval."""
     centred = np.asarray(times) - np.mean(times)
     steepness = float(centred @ np.asarray(values) / (centred @ centred))
     rest = np.asarray(values) - np.mean(values) - steepness * centred
@@ -112,7 +112,7 @@ def slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; 0 when done, 1 on a clear error."""
+    """Run the command line; returns 0 when done, 1 on a clear error."""
     parser = argparse.ArgumentParser(prog="python -m edge.bench.soak", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("minutes", type=float, metavar="MINUTES", help="how long; a quarter of one at least")
     minutes: float = parser.parse_args(arguments).minutes

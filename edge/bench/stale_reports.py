@@ -22,7 +22,7 @@ from edge.bench.provenance import (
 )
 
 _NAMED: Final = 3
-"""Changed files that a line names; the others are counted."""
+"""Most changed files that a line names; the others are counted."""
 
 
 def reasons(made: Provenance) -> Iterator[str]:
@@ -63,7 +63,7 @@ def lines(folder: Path) -> Iterator[str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
+    """Run the command line."""
     summary = (__doc__ or "").splitlines()[0]
     parser = argparse.ArgumentParser(prog="python -m edge.bench.stale_reports", description=summary)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "reports", help="default: reports")

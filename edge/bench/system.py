@@ -1,4 +1,4 @@
-"""The whole program, last byte of a scan to record: processor time, latency, losses, start-up, memory; row by row."""
+"""Measurement of the whole program, row by row: processor time, latency, losses, start-up and memory."""
 
 import tempfile
 import time
@@ -25,7 +25,7 @@ TWO_BUSY = "two sensors, every scan new, recorded, other core busy"
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Of the scans of a row: records without a pattern of their own, or none at all.
+    """Numbers of scans, or taxels, that were late or lost in a row.
 
     Attributes:
         late: patterns later than one period after their scan.
@@ -42,21 +42,21 @@ class Losses:
 
 @dataclass(frozen=True, slots=True)
 class SystemRow:
-    """A run of the whole program.
+    """Measurement of one run of the whole program.
 
     Attributes:
-        name: what was played.
-        scans: in so many.
+        name: of the row.
+        scans: number of scans in the run.
         cpu_percent: processor time of all its threads, in [% of one core].
         thread_percent: the same of each thread that takes any, the most first.
         resident_mb: memory at the end, in [MB].
         run_time: of the inference; None where there was none.
-        latency: from the last byte of a scan handed on to its record read by the bench; None where no records are read,
-            or scans were lost, so that nobody knows which is which.
+        latency: from the last byte of a scan to its record read by the bench; None where no records are read, or scans
+            were lost, so that records cannot be matched.
         losses: None where no records are read.
-        preempted: how often a thread lost its processor against its will.
+        preempted: number of times a thread lost its processor against its will.
         others_percent: processor time of everything else on the machine, in [% of one core].
-        stolen_percent: what the host took away of all cores, in [% of one core].
+        stolen_percent: processor time that the host took away from all cores, in [% of one core].
     """
 
     name: str
@@ -81,11 +81,11 @@ class StartUp:
 
 
 ROWS: Final = 9
-"""That `rows` gives."""
+"""Number of rows that `rows` yields."""
 
 
 def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
-    """Every row, of so many scans at 100 Hz and as much time at 1000; `tell` hears what is being measured.
+    """Yield every row, of so many scans at 100 Hz and as much time at 1000; `tell` gets the name of each row first.
 
     Raises:
         BenchError: a process ended.
@@ -120,7 +120,7 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
 
 
 def start_up() -> StartUp:
-    """Median of some starts, one after the other."""
+    """Return several starts, one after the other, and the median of their memory."""
     took_s: list[float] = []
     resident_mb: list[float] = []
     with tempfile.TemporaryDirectory() as folder_name:
@@ -142,7 +142,7 @@ class _Used:
 
 
 class _Usage:
-    """What a process takes from now on."""
+    """Usage of a process from now on."""
 
     def __init__(self, program: Program) -> None:
         self._program = program
@@ -150,7 +150,7 @@ class _Usage:
         self._start_s = time.monotonic()
 
     def since(self) -> _Used:
-        """Until now."""
+        """Return the usage until now."""
         took_s = time.monotonic() - self._start_s
         now = self._program.thread_cpu_s()
         percent = sorted((100 * (cpu_s - self._threads.get(task, 0.0)) / took_s for task, cpu_s in now.items()))[::-1]
@@ -168,7 +168,7 @@ class _Usage:
 
 
 def _machine_s() -> tuple[float, float]:
-    """Time that all cores were busy for this machine, and that the host took away, in [s]."""
+    """Return the time that all cores were busy for this machine, and that the host took away, in [s]."""
     ticks = [int(text) for text in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
     user, nice, system, _, _, interrupts, soft_interrupts, stolen = (tick / 100 for tick in ticks[:8])
     return user + nice + system + interrupts + soft_interrupts, stolen
@@ -190,7 +190,7 @@ def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, li
 
 
 def latencies_ns(lines: list[Line], stamps_ns: dict[str, list[int]]) -> list[int]:
-    """From the handing on of each scan's last byte to its record, in [ns]; by number, so no scan may have been lost."""
+    """Return the time from each scan's last byte to its record, in [ns]; matched by number, so no scan may be lost."""
     return [line.time_ns - stamps_ns[line.record["sensor"]][line.record["scan"]] for line in lines]
 
 

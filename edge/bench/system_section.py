@@ -1,4 +1,4 @@
-"""The bench's section on the whole program."""
+"""Section of the bench on the whole program."""
 
 from typing import Final
 
@@ -26,7 +26,7 @@ _TEXT: Final = (
 
 
 def show_system(scans: int, soak_minutes: float | None, record: Record, page: Page) -> None:
-    """Measure, show and keep it.
+    """Measure the whole program, show it and keep it in the record.
 
     Raises:
         BenchError: a process ended.
@@ -51,7 +51,7 @@ def show_system(scans: int, soak_minutes: float | None, record: Record, page: Pa
 
 
 def row_line(row: SystemRow) -> str:
-    """A run as a row of the table."""
+    """Return a run as a row of the table."""
     losses = ("-",) * 4
     if row.losses is not None:
         losses = tuple(
@@ -75,12 +75,12 @@ def row_line(row: SystemRow) -> str:
 
 
 def verdict_line(verdict: Verdict) -> str:
-    """A target as a row of the table."""
+    """Return a target as a row of the table."""
     return line((verdict.target, verdict.measured, "yes" if verdict.held else "no", verdict.limited_by))
 
 
 def soak_text(found: Soak) -> str:
-    """What a soak showed, in a few sentences."""
+    """Describe a soak in a few sentences."""
     first, last = found.windows[0], found.windows[-1]
     return (
         f"{found.minutes:.1f} minutes, rest and a moving contact in turns of 2.5 s: memory {first.resident_mb:.1f} to "

@@ -1,4 +1,4 @@
-"""What the whole program is held against, and where it does not get there, what was measured of the reason."""
+"""Targets of the whole program, and for each one that is missed a measured reason."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ RESIDENT_MB: Final = 100.0
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A target, what was measured, whether that is within, and if not what was measured of the reason."""
+    """Verdict on a target: the measurement, whether it is within, and if not a measured reason."""
 
     target: str
     measured: str
@@ -25,7 +25,7 @@ class Verdict:
 
 
 def verdicts(rows: Mapping[str, SystemRow], start_up: StartUp | None) -> Iterator[Verdict]:
-    """On every target of which there is a figure.
+    """Yield a verdict on every target that has a figure.
 
     Args:
         rows: as far as they were measured, by name.

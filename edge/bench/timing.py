@@ -1,7 +1,7 @@
 """Run times, back to back and at the sensor's rate, on an injected clock.
 
-Of every measurement the medians of its blocks are kept: what varies slowly shows between them, and two measurements
-can be compared with an interval.
+Each measurement keeps the medians of its blocks: slow variation shows between them, and two measurements can be
+compared with an interval.
 """
 
 import time
@@ -14,13 +14,13 @@ import numpy as np
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
 BLOCKS: Final = 30
-"""Of so many consecutive runs each a measurement is made, where it has as many runs."""
+"""Number of blocks of consecutive runs in a measurement, if it has as many runs."""
 _BUDGET_NS: Final = 2_000_000_000
 _LEAST_RUNS: Final = 90
-"""Three a block, however long one takes."""
+"""Fewest runs of a measurement, three a block, however long one takes."""
 
 Run = Callable[[int], object]
-"""One inference; is given a number that tells which input."""
+"""One inference; its argument is a number that selects the input."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Times:
     """Run times.
 
     Attributes:
-        runs: how many were timed.
+        runs: number of timed runs.
         p50_us: median, in [us].
         p99_us: 99th percentile, in [us].
         p999_us: 99.9th percentile, in [us]; of fewer than 1000 runs it is the longest.
@@ -49,9 +49,9 @@ class Pace:
     """Run times at a rate.
 
     Attributes:
-        times: of the runs there were.
-        ticks: that there were.
-        missed: of them, those whose run was not done, or not even begun, when the next one was due.
+        times: of all runs.
+        ticks: number of ticks.
+        missed: number of ticks whose run was not done, or not even begun, when the next one was due.
         cpu_percent: processor time of the whole process, in [% of one core].
     """
 
@@ -62,7 +62,7 @@ class Pace:
 
 
 def summary(took_ns: Sequence[int]) -> Times:
-    """What run times in [ns] come to."""
+    """Return the percentiles of run times in [ns]."""
     took_us = np.asarray(took_ns, dtype=np.float64) / 1e3
     p50, p99, p999 = np.percentile(took_us, [50, 99, 99.9])
     blocks = np.array_split(took_us, min(BLOCKS, len(took_us)))
@@ -71,7 +71,7 @@ def summary(took_ns: Sequence[int]) -> Times:
 
 
 def timed(run: Run, numbers: Sequence[int], clock: Clock = time.perf_counter_ns) -> list[int]:
-    """Time of each of these runs, one after the other, in [ns]."""
+    """Return the time of each of these runs, one after the other, in [ns]."""
     took_ns: list[int] = []
     for number in numbers:
         start_ns = clock()
@@ -81,7 +81,7 @@ def timed(run: Run, numbers: Sequence[int], clock: Clock = time.perf_counter_ns)
 
 
 def back_to_back(run: Run, most_runs: int, clock: Clock = time.perf_counter_ns) -> Times:
-    """As many runs as fit into two seconds, 90 at least and `most_runs` at most, one right after the other."""
+    """Time as many runs as fit into two seconds, 90 at least and `most_runs` at most, one right after the other."""
     estimate_ns = max(1, min(timed(run, range(5), clock)))
     runs = min(most_runs, max(_LEAST_RUNS, _BUDGET_NS // estimate_ns))
     return summary(timed(run, range(runs), clock))
@@ -95,12 +95,12 @@ def paced(
     sleep: Sleep = time.sleep,
     cpu_clock: Clock = time.process_time_ns,
 ) -> Pace:
-    """One run at each tick, idle between; ticks that pass during a longer run have none.
+    """Time one run at each tick, idle between; ticks that pass during a longer run have none.
 
     Args:
-        run: is given the tick's number, from 1.
+        run: called with the tick's number, from 1.
         rate_hz: of the ticks, in [Hz].
-        ticks: how many.
+        ticks: number of ticks.
         clock: in [ns].
         sleep: to the next tick.
         cpu_clock: processor time of the process, in [ns].
@@ -109,7 +109,7 @@ def paced(
     in_time = 0
     cpu_before_ns, before_ns = cpu_clock(), clock()
     ticker = Ticker(rate_hz, clock, sleep)
-    tick = min(ticker.wait(), ticks)  # one at least, though the machine may stand still from the first on
+    tick = min(ticker.wait(), ticks)  # one at least, even if the machine stands still from the first on
     while tick <= ticks:
         start_ns = clock()
         run(tick)

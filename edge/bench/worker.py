@@ -1,4 +1,4 @@
-"""The process that is measured: one job as JSON on stdin, what came of it as JSON on stdout."""
+"""Process that is measured: it takes one job as JSON on stdin, and writes the result as JSON on stdout."""
 
 import json
 import os
@@ -19,7 +19,7 @@ _SPIN_SIZE: Final = 128
 
 
 def main() -> int:
-    """Do the job; 1 and a line on stderr where it cannot be done."""
+    """Do the job; returns 1, with a line on stderr, where it cannot be done."""
     job = json.load(sys.stdin)
     try:
         told = JOBS[job.pop("do")](**job)
@@ -31,7 +31,7 @@ def main() -> int:
 
 
 def _first(subject: dict[str, Any], threads: int, window: list[Any]) -> dict[str, Any]:
-    """When the first pattern was there, and what memory it took."""
+    """Return the time of the first pattern, and the memory that it took."""
     infer = opened(Subject(**subject), threads)
     infer(np.array(window, dtype=np.float32))
     return {"first_ns": time.monotonic_ns(), "resident_mb": resident_mb()}
@@ -58,7 +58,7 @@ def _peak(threads: int) -> dict[str, float]:
 
 
 def _spin(core: int | None) -> None:
-    """Keep a core busy until the process that asked for it has gone."""
+    """Keep a core busy until the parent process has gone."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     parent = os.getppid()
@@ -81,7 +81,7 @@ JOBS: Final[dict[str, Callable[..., Any]]] = {
 
 
 def _run(subject: dict[str, Any], threads: int) -> Run:
-    """Runs on the test set's windows in turn, with all taps that there are."""
+    """Return an inference on the test set's windows in turn, with all taps that there are."""
     from edge.evaluation.test_set import load_frozen_set
 
     frozen = load_frozen_set(FROZEN_FILE)
@@ -91,7 +91,7 @@ def _run(subject: dict[str, Any], threads: int) -> Run:
 
 
 def resident_mb() -> float | None:
-    """Most memory that this process has held at once, in [MB]; None where the system does not tell."""
+    """Return the most memory that this process has held at once, in [MB]; None where the system does not show it."""
     status = Path("/proc/self/status")
     if status.exists():
         lines = status.read_text().splitlines()

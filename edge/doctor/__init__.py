@@ -1,1 +1,1 @@
-"""Commissioning: is this sensor well, how does it sit, and what is to be done."""
+"""Commissioning of a sensor: its health, its orientation, and the remedies."""

@@ -1,4 +1,4 @@
-"""Which CAN ids are really on the bus, and whose they are."""
+"""Check of the CAN ids on the bus against the id maps."""
 
 from collections import Counter
 from collections.abc import Set as AbstractSet
@@ -10,12 +10,12 @@ _SHOWN = 8
 
 
 def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> Finding | None:
-    """Does the id map that was asked for know the sensors that speak? None where no CAN ids are seen at all.
+    """Return whether the chosen id map fits the sensors on the bus; None where no CAN ids are seen at all.
 
     Args:
         ids: the CAN ids that came.
-        model: asked for.
-        half_silent: of some sensor half of the taxels or more are silent.
+        model: the id map that the user chose.
+        half_silent: half of the taxels or more of some sensor are silent.
     """
     if not ids:
         return None
@@ -26,7 +26,7 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
         for name, other in ID_MAPS.items()
         if name != model.name and (sensors := _whole_sensors(ids, other))
     }
-    # The ids of a smaller pad may be among those of a larger one: then it is the larger one that speaks.
+    # The ids of a smaller pad may be among those of a larger one: then the larger one is on the bus.
     largest = max((ID_MAPS[name].geometry.taxel_count for name in others), default=0)
     others = {name: sensors for name, sensors in others.items() if ID_MAPS[name].geometry.taxel_count == largest}
     if whole and not half_silent and largest <= model.geometry.taxel_count:
@@ -45,6 +45,6 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
 
 
 def _whole_sensors(ids: AbstractSet[int], model: ModelMap) -> list[str]:
-    """Sensors of a model whose every id was heard."""
+    """Return the sensors of a model whose ids all came."""
     taxels: Counter[str] = Counter(sensor for can_id, (sensor, _) in model.taxels.items() if can_id in ids)
     return [sensor for sensor, count in taxels.items() if count == model.geometry.taxel_count]

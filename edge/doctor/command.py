@@ -1,4 +1,4 @@
-"""`edge-sr doctor`: watches a link, asks for presses, prints what is wrong, and keeps what it found."""
+"""Command `edge-sr doctor`: watches a link, asks for presses, prints the findings, and keeps the results."""
 
 import argparse
 import json
@@ -30,22 +30,22 @@ def run(
     clock_s: Callable[[], float] = time.monotonic,
     unix_time_s: Callable[[], float] = time.time,
 ) -> int:
-    """Do what `edge-sr doctor` is asked for; returns the exit code.
+    """Run `edge-sr doctor`; returns the exit code.
 
     Args:
         options: of edge.doctor.options.doctor_parser.
         out: for the findings.
-        err: for what is asked of a person; no press is asked for where it is no terminal.
+        err: for requests to a person; no press is asked for where it is no terminal.
         clock_s: the clock of the scans, monotonic, in [s].
         unix_time_s: dates the baselines, in [s] since 1970.
 
     Raises:
-        LinkLostError: after what was found until then was told.
+        LinkLostError: raised after the findings until then were printed.
         BridgeError: of the source.
         RecordingError: the baseline file cannot be used, or is of another order.
-        UsageError: several sources; the sensor file is for another id map than was asked for.
-        SensorFileError: the sensor file cannot be used; or not written, and if that turns out at the end, after what
-            was found was told.
+        UsageError: several sources; or the sensor file is for another id map than the chosen one.
+        SensorFileError: the sensor file cannot be used, or cannot be written; a failure at the end is raised after the
+            findings were printed.
     """
     known = settled(options.sensor, options.id_map)
     if options.out is not None:

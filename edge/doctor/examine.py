@@ -1,4 +1,4 @@
-"""Everything that was watched to all findings, and which of them only follow from others. No I/O, no clock."""
+"""Examination of a watch: all findings, and which of them only follow from others. No I/O, no clock."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,19 +32,19 @@ from firmware_bridge.zeroing.baseline import (
 
 @dataclass(frozen=True)
 class Watched:
-    """What came in while the pads were free.
+    """Data of a watch while the pads were free.
 
     Attributes:
         scans: of each sensor, in their order.
         counters: of the link.
-        duration_s: for which it was watched, in [s].
+        duration_s: length of the watch, in [s].
         facts: of the line.
         ids: the CAN ids that came; empty where the link sees none.
-        model: the id map that was asked for.
+        model: the id map that the user chose.
         rate_hz: that a user expects of each sensor, in [Hz].
-        references: what the free pads read before, by sensor.
-        until_ns: when the watching ended, on the clock of the scans in [ns]; None stands for the newest scan.
-        mountings: of the sensors, as far as they are known.
+        references: earlier baselines of the free pads, by sensor.
+        until_ns: end of the watch, on the clock of the scans in [ns]; None stands for the newest scan.
+        mountings: of the sensors, as far as they are available.
     """
 
     scans: Mapping[str, Sequence[Scan]]
@@ -61,14 +61,14 @@ class Watched:
 
 @dataclass(frozen=True)
 class Examined:
-    """The findings, and the baselines of the pads that may be zeroed, by sensor."""
+    """Findings, and baselines of the pads that may be zeroed, by sensor."""
 
     findings: list[Finding]
     baselines: dict[str, Baseline]
 
 
 def examine(watched: Watched, unix_time_s: float) -> Examined:
-    """All findings of what was watched; `unix_time_s` dates the baselines, in [s] since 1970."""
+    """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970."""
     samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
     enough = {name: one for name, one in samples.items() if one.enough}
     half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
@@ -113,13 +113,13 @@ def examine(watched: Watched, unix_time_s: float) -> Examined:
 def check_baseline(
     scans: Sequence[Scan], living: NDArray[np.bool_], spoiled: str | None, unix_time_s: float
 ) -> tuple[Baseline | None, Finding]:
-    """Can this pad be zeroed? The baseline of its last scans, and what there is to say of it.
+    """Return the baseline of the last scans if the pad can be zeroed, and the finding on it.
 
     Args:
         scans: of one sensor.
-        living: (taxels,), the baseline is for these; there is one only where all are.
-        spoiled: name of another finding that a refusal would follow from.
-        unix_time_s: when the last scan came, in [s] since 1970.
+        living: (taxels,), taxels that are zeroed; there is a baseline only if all are living.
+        spoiled: name of another finding that explains a refusal.
+        unix_time_s: time of the last scan, in [s] since 1970.
     """
     norm = f"{BASELINE_SCANS} scans that span at most {' / '.join(f'{limit:.0f}' for limit in SPREAD_LIMIT_COUNTS)}"
     if not living.any():
@@ -147,12 +147,12 @@ def check_baseline(
 def check_load(
     rest_counts: NDArray[np.float64], reference: Baseline | None, mounting: Mounting | None = None
 ) -> Finding:
-    """Does something lie on the pad? Only an earlier baseline can tell.
+    """Return whether something lies on the pad; only an earlier baseline can show it.
 
     Args:
         rest_counts: (3, taxels) now; NaN where silent.
         reference: of the free pad.
-        mounting: tells which way z points, and with it a load now from one then; None where it is as wired.
+        mounting: gives the direction of z, which separates a load now from one then; None where it is as wired.
     """
     norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
     if reference is None:

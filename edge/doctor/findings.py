@@ -1,4 +1,4 @@
-"""What the doctor found, line by line: a verdict, what was measured, and the remedy."""
+"""Findings of the doctor: each a verdict, a measurement and a remedy."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -15,15 +15,15 @@ _MARK_WIDTH: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing examined.
+    """Finding on one thing that was examined.
 
     Attributes:
-        name: what was examined.
-        verdict: "ok"; "look", for what works but may not for long; "wrong"; "not known", where it could not be told.
-        measured: what was found, with its unit.
-        norm: what is to be expected; empty where that goes without saying.
-        remedy: what to do, in plain words; empty where nothing is to be done.
-        sensor: of which sensor; None for the link.
+        name: of the thing.
+        verdict: "ok"; "look", for what works but may not for long; "wrong"; "not known", if it could not be examined.
+        measured: result of the measurement, with its unit.
+        norm: expected range; empty where that goes without saying.
+        remedy: advice in plain words; empty where there is nothing to do.
+        sensor: name of the sensor; None for the link.
     """
 
     name: str
@@ -34,18 +34,18 @@ class Finding:
     sensor: str | None = None
 
     def document(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the finding as a dictionary for JSON."""
         return {name: getattr(self, name) for name in ("sensor", "name", "verdict", "measured", "norm", "remedy")}
 
 
 def worst(findings: Iterable[Finding]) -> Verdict:
-    """The gravest verdict; what is not known counts as ok."""
+    """Return the gravest verdict; "not known" counts as ok."""
     verdicts = {finding.verdict for finding in findings}
     return "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
 
 
 def summary(findings: Iterable[Finding]) -> str:
-    """How many are not ok, in a few words; what is not known is no more well than wrong."""
+    """Return a short count of the findings that are not ok; "not known" is neither well nor wrong."""
     count = Counter(finding.verdict for finding in findings)
     unknown = [f"{count['not known']} not known"] if count["not known"] else []
     if count["wrong"] or count["look"]:
@@ -54,7 +54,7 @@ def summary(findings: Iterable[Finding]) -> str:
 
 
 def page(findings: Sequence[Finding], columns: int) -> str:
-    """All findings as text, those of the link first, in lines of `columns` at most but for words that are wider."""
+    """Return all findings as text, those of the link first, in lines of `columns` at most unless a word is wider."""
     lines: list[str] = []
     for sensor in dict.fromkeys(finding.sensor for finding in findings):
         lines.append("link" if sensor is None else f"sensor {sensor}")

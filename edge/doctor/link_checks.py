@@ -1,4 +1,4 @@
-"""Is the way from the adapter to here well: counters, line speed and latency. Pure but for one file that it reads."""
+"""Checks of the way from the adapter to here: counters, line speed and latency. Pure but for one file that it reads."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from firmware_bridge.links.base import Link
 LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 LATENCY_LIMIT_MS: Final = 2
 HELD_BACK_LIMIT_MS: Final = 5.0
-"""A timer at 16 ms makes it 10 to 12; half of a period is not to be lost before the reading."""
+"""Longest delay of a quarter of the scans, half of a period; a timer at 16 ms makes it 10 to 12."""
 LINE_BYTES: Final = 22
 STAMPED_LINE_BYTES: Final = 26
-"""An slcan line of a taxel, without and with a time stamp."""
+"""Length of an slcan line of a taxel with a time stamp; LINE_BYTES is without one."""
 BITS_PER_BYTE: Final = 10
-"""On a serial line: a start bit and a stop bit beside eight."""
+"""Bits of a byte on a serial line: eight, a start bit and a stop bit."""
 ANSWERS_BYTES: Final = 64
-"""Fewer are an adapter's answers to commands; noise of another line speed is more."""
+"""Fewer bytes are an adapter's answers to commands; noise of another line speed is more."""
 USUAL_RATE_HZ: Final = 100.0
 FULL_SHARE: Final = 0.9
 OVERFULL_SHARE: Final = 1.05
@@ -29,12 +29,12 @@ _TROUBLE: Final = ("overrun", "overflow", "error", "lost")
 
 @dataclass(frozen=True, slots=True)
 class LineFacts:
-    """What is known of the way to a sensor.
+    """Facts on the way to a sensor.
 
     Attributes:
         port: of a serial adapter; None for other links.
-        baud: that its line was opened with, in bit/s.
-        latency_ms: for which the adapter's driver says it holds bytes back; None where it does not say.
+        baud: speed at which its line was opened, in bit/s.
+        latency_ms: time for which the adapter's driver holds bytes back; None where it is not shown.
     """
 
     port: str | None = None
@@ -43,13 +43,13 @@ class LineFacts:
 
 
 def line_facts(link: Link, root: Path = LATENCY_ROOT) -> LineFacts:
-    """Of an open link; `root` is where the kernel shows USB serial ports."""
+    """Return the facts of an open link; `root` is where the kernel shows USB serial ports."""
     line = link.serial_line()
     return LineFacts() if line is None else LineFacts(line.port, line.baud, latency_timer_ms(line.port, root))
 
 
 def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
-    """How long the driver of a port lets bytes wait, in [ms]; None where it does not say.
+    """Return the time for which the driver of a port lets bytes wait, in [ms]; None where it is not shown.
 
     Source: Linux, drivers/usb/serial/ftdi_sio.c, latency_timer_show; 1 is shown while low latency was asked for.
     """
@@ -61,7 +61,7 @@ def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
 
 
 def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None:
-    """What the link's counters say of it; None where they count neither bytes nor frames."""
+    """Check the link by its counters; None where they count neither bytes nor frames."""
     received, frames = counters.get("received_bytes"), counters.get("frames")
     refusals = counters.get("refusals", 0)
     if received is None or frames is None:
@@ -101,7 +101,7 @@ def check_baud(
     rate_hz: float | None,
     taxel_count: int = USPA44.taxel_count,
 ) -> Finding | None:
-    """Does the serial line carry what the sensors send? None for what is no serial line.
+    """Check that the serial line carries what the sensors send; None where there is no serial line.
 
     Args:
         facts: of the line.
@@ -131,16 +131,16 @@ def check_baud(
 
 
 def capacity_hz(baud: int, line_bytes: int, sensors: int = 1, taxel_count: int = USPA44.taxel_count) -> float:
-    """Scans a second of each sensor that a serial line carries, in [Hz]."""
+    """Return the scans a second of each sensor that a serial line carries, in [Hz]."""
     return baud / BITS_PER_BYTE / (line_bytes * taxel_count * sensors)
 
 
 def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Finding:
-    """Are bytes handed on as they come?
+    """Check that bytes are passed on as they come.
 
     Args:
         facts: of the line.
-        held_back_ms: by how much a quarter of the scans came late, in [ms].
+        held_back_ms: delay of a quarter of the scans or more, in [ms].
         line_full: the serial line carries no more, so that everything is late.
     """
     timer = "" if facts.latency_ms is None else f"timer at {facts.latency_ms} ms, "
@@ -161,7 +161,7 @@ def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Fin
 
 
 def _trouble(counters: Mapping[str, int]) -> Finding | None:
-    """What other counters of an adapter say, whatever they are called."""
+    """Check the other counters of an adapter, by words in their names."""
     found = [f"{name} {n}" for name, n in counters.items() if n > 0 and any(word in name for word in _TROUBLE)]
     if not found:
         return None

@@ -1,4 +1,4 @@
-"""What `edge-sr doctor` may be asked, and its help; wide enough for 40 columns."""
+"""Options of `edge-sr doctor`, and its help; narrow enough for 40 columns."""
 
 import argparse
 from pathlib import Path
@@ -28,7 +28,7 @@ DOCTOR_DRIFT_S: Final = 60.0
 
 
 def doctor_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr doctor`."""
+    """Return the parser of the options of `edge-sr doctor`."""
     parser = Parser(
         prog="edge-sr doctor",
         usage="edge-sr doctor [options]",

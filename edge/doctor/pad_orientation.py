@@ -1,8 +1,8 @@
-"""From presses on the four corners to how the pad sits: the turn of its taxels, and which way its axes point.
+"""Orientation of a pad from presses on its four corners: the turn of its taxels, and the directions of its axes.
 
 Corners are those that a person sees; seen from above, as patterns are drawn, x points right and y down. Pushed towards
-the middle of the pad, its surface moves along both axes, and each corner has another pair of signs: so of two readings
-each can be only one axis, and either way round, and any three corners settle which.
+the middle of the pad, its surface moves along both axes, and each corner has another pair of signs: so each of the two
+readings fits only one axis and one direction, and any three corners settle which.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,27 +15,28 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import USPA44, SensorGeometry
 
 AS_MAPPED: Final = "as the id map says"
-"""Name of the way in which nothing is to be corrected."""
+"""Name of the orientation in which nothing is to be corrected."""
 CORNERS: Final = ("top left", "top right", "bottom right", "bottom left")
 TO_THE_MIDDLE: Final = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 """Signs of x and y of a push from each corner to the middle."""
 FEWEST_CORNERS: Final = 3
 AGREEING: Final = 0.8
-"""How much of what was pushed must point along one axis: 1 where every corner does, 0.5 or 0 where one of four or
-three contradicts, 0 for the other axis."""
+"""Least share of the pushes that must point along one axis: 1 where every corner agrees, 0.5 or 0 where one of four
+or three contradicts, 0 for the other axis.
+"""
 _OFF_THE_MIDDLE: Final = 0.4
-"""In pitches: a press nearer to a midline than this is on no corner."""
+"""Distance from a midline, in pitches, below which a press is on no corner."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """What one corner gave.
+    """Result of the press on one corner.
 
     Attributes:
         place: of the corner that was asked for, one of the geometry's corners.
         taxel: the corner of the taxels that answered, one of the same.
         z_counts: summed z.
-        push_counts: by how much the summed x and y changed when pushed to the middle; None where no push was felt.
+        push_counts: change of the summed x and y when pushed to the middle; None where no push was felt.
     """
 
     place: int
@@ -46,14 +47,14 @@ class Press:
 
 @dataclass(frozen=True)
 class Axes:
-    """Which way the axes point: `signs` of x and y, after the swap."""
+    """Directions of the axes: `signs` of x and y, after the swap."""
 
     swap_xy: bool
     signs: tuple[int, int]
 
 
 def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
-    """The ways in which a pad can lie, by name; each gives the taxel of every place.
+    """Return the orientations in which a pad can lie, by name; each gives the taxel of every place.
 
     There are eight, and four where the pad is not square: a quarter turn would make another grid of it.
     """
@@ -73,7 +74,7 @@ def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
 
 
 def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
-    """Which corner of the taxels z (rows, cols) lies on; None where it is none."""
+    """Return the corner of the taxels that z (rows, cols) lies on; None where it lies on no corner."""
     sizes = np.abs(z_counts)
     weights = np.clip(sizes - 0.2 * sizes.max(), 0, None)
     if not weights.sum() > 0:
@@ -89,7 +90,7 @@ def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
 
 
 def find_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str | None:
-    """Name of the way the pad lies, of `orders`; None where it is none of them."""
+    """Return the name of the pad's orientation in `orders`; None where no orientation fits."""
     for name, order in orders(geometry).items():
         if all(order[press.place] == press.taxel for press in presses):
             return name
@@ -97,13 +98,13 @@ def find_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> s
 
 
 def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> Axes | None:
-    """Which way x and y point; None where too few pushes were felt, or where they contradict each other."""
+    """Return the directions of x and y; None where too few pushes were felt, or where they contradict each other."""
     pushes = [press for press in presses if press.push_counts is not None]
     if len(pushes) < FEWEST_CORNERS:
         return None
     felt = np.array([press.push_counts for press in pushes])
     expected = np.array([TO_THE_MIDDLE[geometry.corners.index(press.place)] for press in pushes])
-    # A strong push at one corner must not outvote the others: a vote each.
+    # Each corner has one vote, so that a strong push at one corner does not outvote the others.
     votes = np.sign(felt).T @ expected / len(pushes)  # rows: the wire's x and y; columns: the pad's
     for swap in (False, True):
         along = votes[[1, 0]] if swap else votes
@@ -113,13 +114,13 @@ def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> Ax
 
 
 def z_sign(presses: Sequence[Press]) -> int | None:
-    """1 if z rises under every press, -1 if it falls under every one; None where they contradict each other."""
+    """Return 1 if z rises under every press, -1 if it falls under every one; None where they contradict each other."""
     signs = {int(np.sign(press.z_counts)) for press in presses}
     return signs.pop() if len(signs) == 1 else None
 
 
 def why_no_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str:
-    """What in these presses fits none of the ways."""
+    """Return the reason why no orientation fits these presses."""
     answered: Mapping[int, list[int]] = {
         taxel: [press.place for press in presses if press.taxel == taxel] for taxel in geometry.corners
     }

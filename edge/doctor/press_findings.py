@@ -1,4 +1,4 @@
-"""What the guided press tells, as findings, and the mounting that sets it right."""
+"""Findings of the guided press, and the mounting that corrects the sensor."""
 
 from dataclasses import replace
 from typing import Final
@@ -10,7 +10,7 @@ from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 
 USUAL_COUNTS_PER_NEWTON: Final = (900.0, 1700.0)
-"""Data sheets and a fit give 1150 to 1370."""
+"""Range of counts per newton, around the 1150 to 1370 of data sheets and of a fit."""
 _AGAIN: Final = "press again: run the doctor once more"
 _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 
@@ -18,11 +18,11 @@ _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 def judge_press(
     answer: Answer, kept: bool, weighed: bool, geometry: SensorGeometry = USPA44
 ) -> tuple[list[Finding], Mounting | None]:
-    """Findings, and the mounting that was found; None while order or axes are not known.
+    """Return the findings, and the mounting that they give; None while order or axes are not clear.
 
     Args:
         answer: of the guided press.
-        kept: what is found goes into a sensor file, so that nothing is left to be done.
+        kept: the results go into a sensor file, so that nothing is left to be done.
         weighed: a weight was asked for.
         geometry: of the sensor.
     """

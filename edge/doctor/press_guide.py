@@ -1,6 +1,6 @@
-"""The guided press: readings in, the next thing to ask or the answer out. No I/O, no clock.
+"""Guided press: takes readings, and gives the next request or the answer. No I/O, no clock.
 
-Written as a dialogue: each step says something, then waits for readings that fulfil it. Time is that of the scans.
+Written as a dialogue: each step makes a request, then waits for readings that fulfil it. Time is that of the scans.
 """
 
 from collections.abc import Callable, Generator
@@ -18,7 +18,7 @@ HOLD_SCANS: Final = 20
 FREE_SCANS: Final = 20
 PUSH_SCANS: Final = 10
 PUSH_COUNTS: Final = 300.0
-"""Of the summed x and y, which noise of two counts brings to eight: about .2 N."""
+"""Least change of the summed x and y, about .2 N; noise of two counts a taxel sums up to eight."""
 PATIENCE_S: Final = 60.0
 TRIES: Final = 3
 STEADY_SCANS: Final = 50
@@ -29,25 +29,25 @@ GRAVITY_M_S2: Final = 9.80665
 
 
 class Reading(NamedTuple):
-    """Readings over the baseline (3, rows, cols) in counts, and when, in [s]."""
+    """Readings over the baseline (3, rows, cols) in counts, and their time, in [s]."""
 
     zeroed: NDArray[np.float32]
     time_s: float
 
     @property
     def load_counts(self) -> float:
-        """Summed size of z, whichever way it points."""
+        """Sum of the sizes of z, in either direction."""
         return float(np.abs(self.zeroed[2]).sum())
 
     @property
     def shear_counts(self) -> NDArray[np.float32]:
-        """Summed x and y."""
+        """Sums of x and of y."""
         return self.zeroed[:2].sum(axis=(1, 2))
 
 
 @dataclass
 class Answer:
-    """What the presses told: those that were felt, and counts per newton where a weight was laid on."""
+    """Answer of the presses: those that were felt, and counts per newton where a weight was laid on."""
 
     presses: list[Press] = field(default_factory=list)
     counts_per_newton: float | None = None
@@ -58,15 +58,15 @@ Dialogue = Generator[str | None, Reading, T]
 
 
 class GuidedPress:
-    """Asks for four corners, one after the other, then for a weight.
+    """Dialogue that asks for four corners, one after the other, then for a weight.
 
     Attributes:
-        answer: what is known so far; whole when `done`.
-        done: nothing more is asked.
+        answer: results so far; complete when `done`.
+        done: True when there are no more requests.
     """
 
     def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
-        """Prepare to ask; a weight is asked for where its mass is given in [g]."""
+        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
         self._corners = geometry.corners
         self.answer = Answer()
         self.done = False
@@ -75,7 +75,7 @@ class GuidedPress:
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
-        """Take one more reading; what to say now, or None.
+        """Take one more reading; returns the next request, or None.
 
         Args:
             zeroed: (3, rows, cols), over the baseline, in counts; where it is NaN the taxel's last reading stands.
@@ -131,7 +131,7 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
 
 
 def _weigh(weight_g: float) -> Dialogue[float | None]:
-    """Counts of the summed z per [N]; None where nothing steady was laid on."""
+    """Return counts of the summed z per [N]; None where nothing steady was laid on."""
     steady: list[float] = []
 
     def lies_still(reading: Reading) -> bool:
@@ -153,7 +153,7 @@ def _leeway(counts: float) -> float:
 
 
 def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:
-    """Say it, and wait for so many readings in a row that fulfil it: these, or None when patience is at its end."""
+    """Make a request, and return as many readings in a row that fulfil it, or None when patience is at its end."""
     reading = yield say
     end_s = reading.time_s + PATIENCE_S
     held: list[Reading] = []

@@ -1,4 +1,4 @@
-"""What a sensor sent while it was watched, and what that comes to in figures. No I/O, no clock."""
+"""Statistics of the scans that one sensor sent while it was watched. No I/O, no clock."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -11,9 +11,9 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE
 
 PERIODS_TOGETHER: Final = 100
-"""A period is told from so many at once: an adapter that hands on in bunches makes single ones meaningless."""
+"""Number of periods that are averaged: an adapter that delivers scans in bunches makes single periods meaningless."""
 AROUND: Final = 16
-"""Scans before and after one that tell whether it alone was late."""
+"""Scans before and after a scan that show whether it alone was late."""
 FEWEST_SCANS: Final = 50
 _TRIMMED: Final = 0.02
 _TRIMMED_RMS: Final = 0.9346
@@ -22,15 +22,15 @@ _ENDS: Final = 0.1
 
 
 class Samples:
-    """The scans of one sensor, without the first, which may have been cut in mid-cycle.
+    """Scans of one sensor, without the first, which may have been cut in mid-cycle.
 
     Attributes:
-        scans: how many there are.
+        scans: number of scans.
         counts: (n, 3, taxels) raw counts, ABSENT where a taxel was silent.
-        fresh: (n, taxels), the taxel was heard.
-        renewed: (n, taxels), and its reading is new.
+        fresh: (n, taxels), True where the taxel sent a reading.
+        renewed: (n, taxels), True where that reading is new.
         time_s: (n,) from the first, in [s].
-        living: (taxels,), heard in half of the scans at least.
+        living: (taxels,), True for taxels that sent in at least half of the scans.
     """
 
     def __init__(self, scans: Sequence[Scan]) -> None:
@@ -44,27 +44,27 @@ class Samples:
 
     @property
     def enough(self) -> bool:
-        """There are enough scans to tell anything."""
+        """True if there are enough scans for any finding."""
         return self.scans >= FEWEST_SCANS
 
     def period_s(self) -> float:
-        """From scan to scan, in [s]."""
+        """Return the period from scan to scan, in [s]."""
         together = min(PERIODS_TOGETHER, self.scans // 2)
         return float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
 
     def held_back_ms(self) -> float:
-        """By how much a quarter of the scans or more came later than the most punctual ones around them, in [ms]."""
+        """Return the upper quartile of the scans' delays after the most punctual ones around them, in [ms]."""
         period_s = self.period_s()
         late_s = self.time_s - period_s * np.arange(self.scans)
         around = np.lib.stride_tricks.sliding_window_view(late_s, 2 * AROUND + 1)
         return 1000 * float(np.percentile(around[:, AROUND] - around.min(axis=1), 75))
 
     def lost(self) -> int:
-        """Scans that never came, by steps in time: a scan that is only late is followed by one that is less so."""
+        """Count the scans that never came, by steps in time; a scan that is only late is followed by less late ones."""
         period_s = self.period_s()
         behind = self.time_s / period_s - np.arange(self.scans)
         lost, last_gap = 0, 0
-        told = np.diff(self.time_s)[:-AROUND]  # of a gap at the very end nobody can say
+        told = np.diff(self.time_s)[:-AROUND]  # nothing can be concluded from a gap at the very end
         for gap in np.flatnonzero(told > 1.5 * period_s) + 1:
             before = behind[max(last_gap, gap - AROUND) : gap].min()
             step = round(float(behind[gap : gap + AROUND].min() - before))
@@ -73,21 +73,21 @@ class Samples:
         return lost
 
     def torn(self) -> NDArray[np.bool_]:
-        """(n,), scans in which a living taxel was not heard."""
+        """Return (n,), True for scans in which a living taxel was silent."""
         return ~self.fresh[:, self.living].all(axis=1)
 
     def half_old(self) -> NDArray[np.bool_]:
-        """(n,), scans in which a quarter of the living taxels or more sent an old reading again."""
+        """Return (n,), True for scans in which a quarter of the living taxels or more sent an old reading again."""
         old = (self.fresh & ~self.renewed)[:, self.living]
         return 4 * old.sum(axis=1) >= max(1, int(self.living.sum()))
 
     def stuck(self) -> NDArray[np.bool_]:
-        """(taxels,), heard, but one scan in a hundred at most is new, where others are."""
+        """Return (taxels,), True for living taxels with a new reading in one scan in a hundred at most."""
         heard = np.maximum(self.fresh.sum(axis=0), 1)
         return self.living & ((self.renewed & self.fresh).sum(axis=0) <= 0.01 * heard)
 
     def noise_counts(self) -> NDArray[np.float64]:
-        """(3, taxels) standard deviation from scan to scan, so that what creeps is none; NaN where too little came."""
+        """Return (3, taxels), the standard deviation from scan to scan, without creep; NaN where too little came."""
         noise = np.full(self.counts.shape[1:], np.nan)
         both = self.fresh[1:] & self.fresh[:-1]
         steps = around_counts(np.diff(self.counts, axis=0))
@@ -99,11 +99,11 @@ class Samples:
         return noise
 
     def rest_counts(self) -> NDArray[np.float64]:
-        """(3, taxels) median reading; NaN where a taxel is not living."""
+        """Return (3, taxels), the median reading; NaN where a taxel is not living."""
         return self._median(slice(None))
 
     def drift_counts(self) -> NDArray[np.float64]:
-        """(3, taxels) how far the last tenth lies from the first; NaN where a taxel is not living."""
+        """Return (3, taxels), the last tenth less the first; NaN where a taxel is not living."""
         part = max(1, int(_ENDS * self.scans))
         return around_counts(self._median(slice(-part, None)) - self._median(slice(part)))
 
@@ -117,6 +117,6 @@ class Samples:
 
 
 def around_counts(steps: NDArray[Any]) -> NDArray[Any]:
-    """Steps the short way round the circle."""
+    """Return steps the short way round the circle."""
     half = COUNTS_ON_CIRCLE // 2
     return (steps + half) % COUNTS_ON_CIRCLE - half

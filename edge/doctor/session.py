@@ -1,4 +1,4 @@
-"""The doctor's look at a link: watching free pads, then asking a person for presses."""
+"""Visit of the doctor to a link: it watches free pads, then asks a person for presses."""
 
 import argparse
 import threading
@@ -20,7 +20,7 @@ from firmware_bridge.zeroing.baseline import deformation
 
 
 class Visit:
-    """One look at a sensor, and what came in meanwhile.
+    """Visit to the sensors of one link.
 
     Attributes:
         newtons: counts per newton of the sensors that were weighed.
@@ -34,13 +34,13 @@ class Visit:
         stop: threading.Event,
         clock_s: Callable[[], float],
     ) -> None:
-        """Prepare to look.
+        """Prepare the visit.
 
         Args:
             options: of `edge-sr doctor`.
             watch: not begun yet.
-            err: for what is asked of a person.
-            stop: ends it when it is set.
+            err: for requests to a person.
+            stop: ends the visit when it is set.
             clock_s: the clock of the scans, monotonic, in [s].
         """
         self.newtons: dict[str, float] = {}
@@ -52,7 +52,7 @@ class Visit:
         self._link = watch.link
 
     def watch(self) -> None:
-        """Hear what comes while the pads are free.
+        """Watch the link while the pads are free.
 
         Raises:
             LinkLostError: the link is gone.
@@ -69,7 +69,7 @@ class Visit:
             self._watch.run(length_s, show)
 
     def press(self, examined: Examined) -> dict[str, Mounting]:
-        """Ask for presses on every pad that may be zeroed; what is to be corrected of their mountings.
+        """Ask for presses on every pad that may be zeroed; returns the corrections of their mountings.
 
         Raises:
             LinkLostError: the link is gone.

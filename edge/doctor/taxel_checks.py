@@ -1,4 +1,4 @@
-"""Are the taxels of one sensor well: silent, stuck, noisy, at rest where they can be, drifting."""
+"""Checks of the taxels of one sensor: silence, stuck readings, noise, rest levels and drift."""
 
 from typing import Final
 
@@ -14,16 +14,16 @@ from firmware_bridge.geometry import AXES
 from firmware_bridge.zeroing.baseline import CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 
 NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))
-"""Of x, y, z: to look at, and wrong. 1.1 to 2.8 and 2 to 4.7 are on record; four taps need under eight."""
+"""Limits of "look" and "wrong" for x, y, z. On record are 1.1 to 2.8 and 2 to 4.7; four taps need under eight."""
 STRAY_COUNTS: Final = 12_000.0
-"""How far from the others' a taxel's rest may lie on one axis: z of one model spans 9700 from end to end."""
+"""Largest distance of a taxel's rest from the others' on one axis: z of one model spans 9700 from end to end."""
 LONE_DRIFT_COUNTS: Final = 94.0
-"""So much in every taxel is a contact."""
+"""Largest drift of a single taxel, in counts; as much in every taxel is a contact."""
 _OVERLOADED: Final = "overloaded, too near a magnet or steel, or broken: free it, and exchange the sensor if it stays"
 
 
 def check_silent(samples: Samples, wrong_map: bool) -> Finding:
-    """Taxels not heard. Half of them silent are no defect where the id map is wrong."""
+    """Check for silent taxels. Half of them silent are no defect where the id map is wrong."""
     silent = np.flatnonzero(~samples.living)
     if not silent.size:
         return Finding("silent taxels", "ok", "none")
@@ -35,10 +35,10 @@ def check_silent(samples: Samples, wrong_map: bool) -> Finding:
 
 
 def check_stuck(samples: Samples) -> Finding:
-    """Taxels that repeat one reading, or stand at an end of their range."""
+    """Check for taxels that repeat one reading, or stand at an end of their range."""
     stuck = samples.stuck()
     rest = samples.rest_counts()
-    # What rests near an end and goes round the circle is noisy there; what has left the range is not.
+    # A rest near an end that goes round the circle is noisy there; a reading that has left the range is not.
     ends = samples.living & (np.isin(rest, RANGE_ENDS) & (samples.noise_counts() == 0)).any(axis=0)
     if ends.any():
         return Finding("stuck taxels", "wrong", f"{_named(ends)} at an end of its range", "none", _OVERLOADED)
@@ -51,7 +51,7 @@ def check_stuck(samples: Samples) -> Finding:
 
 
 def check_noise(samples: Samples) -> Finding:
-    """Standard deviation of each taxel at rest."""
+    """Check the standard deviation of each taxel at rest."""
     noise = np.where(samples.stuck(), np.nan, samples.noise_counts())
     if np.isnan(noise).all():
         return Finding("noise", "not known", "no taxel sends new readings")
@@ -77,7 +77,7 @@ def check_noise(samples: Samples) -> Finding:
 
 
 def check_rest(samples: Samples) -> Finding:
-    """What the free pad reads: of every model and axis something else, but alike within a pad."""
+    """Check the readings of the free pad: they differ between models and axes, but are alike within a pad."""
     rest = samples.rest_counts()
     if np.isnan(rest).all():
         return Finding("rest levels", "not known", "no taxel heard")
@@ -94,7 +94,7 @@ def check_rest(samples: Samples) -> Finding:
 
 
 def check_drift(samples: Samples) -> Finding:
-    """How far the rest moved from the first tenth of the time to the last."""
+    """Check the drift of the rest from the first tenth of the time to the last."""
     duration_s = float(samples.time_s[-1])
     drift = np.where(samples.stuck(), np.nan, samples.drift_counts())
     if np.isnan(drift).all():

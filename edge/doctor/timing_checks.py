@@ -1,4 +1,4 @@
-"""Does everything come, and in time: rate, torn and lost scans of one sensor."""
+"""Checks of the timing of one sensor: rate, torn scans and lost scans."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ from edge.doctor.scan_statistics import Samples
 from firmware_bridge.silence import LATEST_SCAN_S
 
 USUAL_HZ: Final = (70.0, 120.0)
-"""Sensors of sixteen taxels were seen at 74 to 113 scans a second."""
+"""Range of the rates measured on sensors of sixteen taxels, 74 to 113 scans a second, with a margin."""
 RATE_TOLERANCE: Final = 0.1
 _LOSS_LIMITS: Final = (0.001, 0.01)
 _OLD_LIMITS: Final = (0.1, 0.3)
@@ -20,7 +20,7 @@ _LOSS_REMEDY: Final = (
 
 
 def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Finding:
-    """Scans and new readings a second.
+    """Check the scans and the new readings a second.
 
     Args:
         samples: of the sensor.
@@ -46,7 +46,7 @@ def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Fi
 
 
 def check_torn(samples: Samples) -> Finding:
-    """Scans that lack a taxel, or in which part of the taxels are old readings."""
+    """Check the share of scans that lack a taxel, or in which part of the taxels are old readings."""
     torn, old = float(samples.torn().mean()), float(samples.half_old().mean())
     measured = f"{100 * torn:.2f} % lack a taxel, {100 * old:.2f} % hold old readings"
     norm = f"under {100 * _LOSS_LIMITS[0]:.1f} % and {100 * _OLD_LIMITS[0]:.0f} %"
@@ -63,11 +63,11 @@ def check_torn(samples: Samples) -> Finding:
 
 
 def check_lost(samples: Samples, silent_s: float) -> Finding:
-    """Scans that never came, by the gaps they left.
+    """Check the share of scans that never came, by the gaps they left.
 
     Args:
         samples: of the sensor.
-        silent_s: for which nothing more came at the end, in [s].
+        silent_s: time without a scan at the end, in [s].
     """
     if silent_s > LATEST_SCAN_S:
         remedy = "the sensor fell silent: see to its power and its plug"

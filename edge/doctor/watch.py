@@ -1,4 +1,4 @@
-"""What comes from a link while its pads are free."""
+"""Watch of a link while its pads are free."""
 
 import threading
 import time
@@ -17,13 +17,13 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 
 class Watch:
-    """Watches a link.
+    """Watch of a link.
 
     Attributes:
-        link: is watched; whoever watches opens and closes it.
-        known: of its sensors.
+        link: the link; the caller opens and closes it.
+        known: facts on its sensors, from the sensor file and the recording.
         scans: of each sensor, in their order.
-        duration_s: for how long it watched, in [s].
+        duration_s: length of the watch so far, in [s].
     """
 
     def __init__(
@@ -40,15 +40,15 @@ class Watch:
 
         Args:
             texts: the source, as in edge.pipeline.source_setup.links_to; one at most.
-            known: of the sensors.
-            references: what the free pads read before, by sensor.
-            rate_hz: to be expected of each sensor, in [Hz].
-            stop: ends it when it is set.
+            known: facts on the sensors.
+            references: earlier baselines of the free pads, by sensor.
+            rate_hz: expected of each sensor, in [Hz].
+            stop: ends the watch when it is set.
             clock_s: the clock of the scans, monotonic, in [s].
 
         Raises:
             BridgeError: as in edge.pipeline.source_setup.links_to.
-            UsageError: several sources; a rate or references that cannot be.
+            UsageError: several sources, or a rate or references that are not valid.
         """
         if len(texts) > 1:
             raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
@@ -69,7 +69,7 @@ class Watch:
 
         Args:
             length_s: in [s].
-            tell: is told after each read how many scans came and how much of it has passed, in [s].
+            tell: called after each read with the number of scans and the time that has passed, in [s].
 
         Raises:
             LinkLostError: the link is gone.
@@ -88,7 +88,7 @@ class Watch:
             tell(scans, self.duration_s)
 
     def watched(self) -> Watched:
-        """What has come so far; the link is still open."""
+        """Return everything that has come so far, while the link is still open."""
         return Watched(
             self.scans,
             self.link.counters(),

@@ -1,4 +1,4 @@
-"""What the doctor found, written into a sensor file, unless that would lose what the file holds already."""
+"""Writing of the doctor's results into a sensor file, unless that would lose what the file holds already."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,16 +16,16 @@ _AS_WIRED = frozenset({"mounting"})
 
 
 def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
-    """Find out whether a file may be written, before minutes are spent on what is to be in it.
+    """Check that a file may be written, before minutes are spent on its content.
 
     Args:
         path: of the file.
-        known: what the doctor was started with.
+        known: sensor file that the doctor started with.
         presses: presses will be asked for.
         weighs: a weight will be asked for.
 
     Raises:
-        SensorFileError: it cannot be written, or holds what this visit cannot find.
+        SensorFileError: the file cannot be written, or holds values that this visit cannot measure.
     """
     try:
         in_place.check_writable(path)
@@ -55,19 +55,19 @@ def keep(
     *,
     emulated: bool = False,
 ) -> SensorFile:
-    """Write what was known and what was found into a sensor file; returns what was written.
+    """Write the facts from before and the new results into a sensor file, and return it.
 
     Args:
         path: of the file.
-        known: what the doctor was started with.
+        known: sensor file that the doctor started with.
         port: of the adapter, whose serial number is kept where it has one.
         baselines: of the free pads as they were read, by sensor.
-        found: what is to be corrected of the mounting, by sensor.
+        found: corrections of the mounting, by sensor.
         counts_per_newton: of the sensors that were weighed.
-        emulated: all of it was found of emulated sensors.
+        emulated: all results are of emulated sensors.
 
     Raises:
-        SensorFileError: the file cannot be written, or holds what was not found this time.
+        SensorFileError: the file cannot be written, or holds values that were not measured this time.
     """
     entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
     for name in sorted({*baselines, *found, *counts_per_newton}):
@@ -98,7 +98,7 @@ def keep(
 
 
 def _before(path: Path) -> SensorFile:
-    """What the file holds; nothing where it is none, or one that edge-sr would refuse."""
+    """Return the content of the file; an empty one where there is no file, or edge-sr would refuse it."""
     try:
         return load_sensor_file(path)
     except SensorFileError:
@@ -121,7 +121,7 @@ def _refuse_loss(path: Path, before: SensorFile, written: SensorFile) -> None:
 
 
 def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
-    """What one entry holds and the other does not, or only of an emulated sensor."""
+    """Name the values of one entry that the other lacks, or has only of an emulated sensor."""
 
     def lost(part: str, held: bool, holds: bool) -> bool:
         return held and (not holds or part in written.emulated - entry.emulated)

@@ -1,1 +1,1 @@
-"""One file per sink: where records go."""
+"""Sinks of records, one file each."""

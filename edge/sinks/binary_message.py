@@ -1,8 +1,8 @@
-"""A message as bytes: a header of JSON and maps of float32, as the live page and zenoh carry it.
+"""Binary message of a JSON header and float32 maps, as the live page and zenoh carry it.
 
     4 bytes     n, length of the header, little-endian
     n bytes     header, JSON in UTF-8, padded with spaces until 4 + n is a multiple of 4
-    the rest    maps, float32 little-endian in C order, one behind the other
+    the rest    maps, float32 little-endian in C order, one after the other
 
 The header's "maps" lists them: [[name, [size, ...]], ...].
 """
@@ -23,10 +23,10 @@ _FLOAT32: Final = np.dtype("<f4")
 
 
 def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) -> bytes:
-    """One message.
+    """Return one message.
 
     Args:
-        header: what JSON can say, and arrays; "maps" is added.
+        header: values that JSON can hold, and arrays; "maps" is added.
         maps: by name, of any shape.
     """
     listed = [[name, values.shape] for name, values in maps.items()]
@@ -37,10 +37,10 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
 
 
 def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """Header and maps of a message; the maps are read-only views of it.
+    """Return header and maps of a message; the maps are read-only views of it.
 
     Raises:
-        MessageError: it is not one.
+        MessageError: the bytes are no packed message.
     """
     try:
         (length,) = _LENGTH.unpack_from(message)

@@ -1,4 +1,4 @@
-"""Events as lines on stderr, above the live line where there is one."""
+"""Printer of events as lines on stderr, above the live line where there is one."""
 
 import sys
 import time
@@ -11,11 +11,11 @@ from edge.pipeline.sink import Sink
 
 CLEAR_LINE: Final = "\r\x1b[K"
 FIRST_HINT_S: Final = 5.0
-"""After so long without a scan, then after twice, four times, ... as long."""
+"""Time without a scan before the first hint, in [s]; the next hints come after twice, four times, ... as long."""
 
 
 class MessageSink(Sink):
-    """Writes each event as a line."""
+    """Printer of each event as a line."""
 
     def __init__(
         self,
@@ -27,8 +27,8 @@ class MessageSink(Sink):
         """Begin without an event.
 
         Args:
-            stream: written to; stderr unless given.
-            hint: what to do while no scan has come at all; it is said ever more seldom.
+            stream: output; stderr by default.
+            hint: advice while no scan has come at all; it is printed at growing intervals.
             clock_s: monotonic, in [s].
         """
         self._stream = sys.stderr if stream is None else stream
@@ -38,24 +38,24 @@ class MessageSink(Sink):
         self._patience_s = FIRST_HINT_S
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Print what happened before this scan."""
+        """Print the events before this scan."""
         self._hint = ""
         for event in result.events:
             self.say(event)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Say what happened."""
+        """Print one event."""
         self.say(event)
 
     def wait(self) -> None:
-        """Say that nothing has come, and what to do."""
+        """Print that no scan has come, with the hint."""
         silent_s = self._clock_s() - self._begun_s
         if self._hint and silent_s >= self._patience_s:
             self._patience_s *= 2
             self._say(f"no scan in {silent_s:.0f} s: {self._hint}")
 
     def say(self, event: Event) -> None:
-        """Say it without counters."""
+        """Print an event without counters."""
         self._say(event.text)
 
     def _say(self, text: str) -> None:
@@ -68,9 +68,9 @@ class MessageSink(Sink):
             self._stream = None  # the window was closed; that ends no recording
 
     def close(self) -> None:
-        """Nothing to finish."""
+        """Do nothing: there is nothing to finish."""
 
 
 def _harmless(text: str) -> str:
-    """Text that moves no cursor and sets no title: what devices and files say is in it."""
+    """Escape control characters, because text from devices and files could move the cursor or set the title."""
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

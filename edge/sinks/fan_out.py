@@ -1,4 +1,4 @@
-"""The sinks a user asked for, as one; a sink that fails is given up while the others go on."""
+"""Fan-out to all sinks of a run; a sink that fails is given up while the others go on."""
 
 import sys
 import time
@@ -17,7 +17,7 @@ _UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
-    """Hands everything on to its sinks.
+    """Fan-out of results and events to several sinks.
 
     Attributes:
         failures: of sinks given up, in their order.
@@ -27,7 +27,7 @@ class Fan(Sink):
         """Begin without a sink.
 
         Args:
-            tell: is told of a sink that is given up, or reports trouble, before the others.
+            tell: called first with the event of a sink that is given up or reports trouble.
             clock_ns: monotonic, in [ns].
         """
         self.failures: list[SinkError] = []
@@ -40,16 +40,16 @@ class Fan(Sink):
         self._known_trouble: set[str] = set()
 
     def add(self, sink: Sink) -> None:
-        """Take one more sink, which is open; the last to fail ends the run."""
+        """Add one open sink; the failure of the last sink ends the run."""
         self._sinks.append(sink)
 
     @property
     def trouble(self) -> str | None:
-        """What any of its sinks reports."""
+        """Trouble that any of the sinks reports, or None."""
         return "; ".join(sorted(self._troubles())) or None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Hand on one result.
+        """Pass on one result.
 
         Raises:
             SinkError: no sink is left; SinkClosedError if none failed and their readers have gone.
@@ -65,7 +65,7 @@ class Fan(Sink):
         self._each(methodcaller("wait"), self._counters)
 
     def close(self) -> None:
-        """Close what is left, each whatever becomes of the others.
+        """Close every sink that is left, even if others fail to close.
 
         Raises:
             SinkError: of the first sink that failed, now or before, unless another error ends the run.
@@ -76,13 +76,13 @@ class Fan(Sink):
             except SinkError as error:
                 self.failures.append(error)
         self._sinks = []
-        if self.failures and sys.exception() is None:  # else what ended the run is what is to be told
+        if self.failures and sys.exception() is None:  # else the error that ended the run is reported
             raise self.failures[0]
 
     def _each(self, act: Callable[[Sink], None], counters: Mapping[str, int]) -> None:
-        self._counters = counters  # of a sink that fails while nothing comes, these are still true
+        self._counters = counters  # still true for a sink that fails while no scan comes
         for sink in tuple(self._sinks):
-            if sink not in self._sinks:  # given up meanwhile, when it was told that another was
+            if sink not in self._sinks:  # given up by an earlier call of this loop
                 continue
             try:
                 act(sink)

@@ -1,4 +1,4 @@
-"""What a record says of a result, or of an event: one dictionary for every sink that writes them."""
+"""Record of a result, or of an event: one dictionary for every sink that writes them."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -15,7 +15,7 @@ _LEFT_OUT: Final = tuple(field.name for field in _FIELDS if field.left_out)
 
 
 def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
-    """All of a result but its maps; absent is None, masks have bit i for taxel i. Counts may be an array."""
+    """Return a result without its maps; absent is None, masks have bit i for taxel i. Counts may be an array."""
     said: dict[str, Any] = dict(zip(_NAMES, _COLUMNS.of(result), strict=True))
     for name in _LEFT_OUT:
         if said[name] is None:
@@ -25,7 +25,7 @@ def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
 
 
 def event_record(event: Event, counters: Mapping[str, int], source: str | None) -> dict[str, Any]:
-    """An event, told apart from results by its state; `source` is the kind of what is read."""
+    """Return an event, marked by its state "event"; `source` is the kind of the source."""
     return {
         "time_ns": event.time_ns,
         "sensor": event.sensor,
@@ -38,5 +38,5 @@ def event_record(event: Event, counters: Mapping[str, int], source: str | None) 
 
 
 def encodable(text: str) -> str:
-    """What JSON can say of it: a file may be called by any bytes, and JSON is UTF-8."""
+    """Replace characters that UTF-8 cannot hold: the name of a file may be any bytes, and JSON is UTF-8."""
     return text.encode(errors="replace").decode()

@@ -25,14 +25,14 @@ _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _MAP_NAMES: Final = tuple(field.name for field in MAPS)
 _MAPS: Final = Columns(field.in_record() for field in MAPS)
 _ROOM_S: Final = 0.002
-"""Between two looks whether a slow reader has made room; a pipe holds more than is made meanwhile."""
+"""Pause between two checks for room in a slow reader's pipe, in [s]; a pipe holds more than comes in meanwhile."""
 
 
 class JsonLinesSink(Sink):
-    """Writes records into a file, or with "-" to stdout.
+    """Writer of records into a file, or with "-" to stdout.
 
-    Where a robot waits, a reader that is too slow for a pipe must hold up nothing: its records are left out, counted,
-    and told in the first it takes again. Nor does anything wait for one that does not read once the run is to end.
+    In a robot's run a slow reader must delay nothing: records that do not fit into its pipe are left out and counted,
+    and its next record carries the count. A run that ends waits for no reader.
     """
 
     def __init__(
@@ -43,11 +43,11 @@ class JsonLinesSink(Sink):
         Args:
             target: path, or "-".
             patient: wait for a slow reader, rather than leave records out.
-            source: kind of what is read, told with every event.
+            source: kind of the source, written with every event.
             stop: set when the run is to end, which ends all patience.
 
         Raises:
-            SinkError: it cannot be opened.
+            SinkError: the target cannot be opened.
         """
         self._target = "stdout" if target == "-" else target
         self._stop = threading.Event() if stop is None else stop
@@ -85,7 +85,7 @@ class JsonLinesSink(Sink):
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
 
     def close(self) -> None:
-        """Close the file. Every record is on its way already; what an error kept back is lost and was told."""
+        """Close the file. Every record is on its way already; what an error kept back is lost and was reported."""
         try:
             self._file.close()
         except OSError:
@@ -94,14 +94,14 @@ class JsonLinesSink(Sink):
 
 
 def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
-    """A result as one line of JSON, its maps last."""
+    """Return a result as one line of JSON, its maps last."""
     line = record(result, counters)
     line.update(zip(_MAP_NAMES, _MAPS.of(result), strict=True))
     return orjson.dumps(line, option=_OPTIONS)
 
 
 def event_line(event: Event, counters: Mapping[str, int], source: str | None) -> bytes:
-    """An event as one line of JSON."""
+    """Return an event as one line of JSON."""
     return orjson.dumps(event_record(event, counters, source), option=orjson.OPT_APPEND_NEWLINE)
 
 
@@ -109,11 +109,11 @@ def _open(target: str) -> BufferedWriter:
     if target == "-":
         if sys.stdout is None:
             raise OSError(0, "it is closed")
-        # A writer of our own: what is left in sys.stdout after an error would be tried again at exit.
+        # A writer of our own: Python would try again at exit to write what an error leaves in sys.stdout.
         return os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     path = Path(target)
     if not path.is_fifo():
         return path.open("wb")
-    descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # else it would wait for a reader, however long
+    descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # a blocking open would wait for a reader
     os.set_blocking(descriptor, True)
     return os.fdopen(descriptor, "wb")

@@ -42,10 +42,9 @@ _PROFILE: Final = "ros2"
 
 
 class McapSink(Sink):
-    """Records into a new file; times on the wall are those of the clock at the start, however it is set later.
+    """Writer of records into a new file; their wall times follow the clock at the start, however it is set later.
 
-    Where a robot waits, a disk that is too slow must hold up nothing: after some seconds records are left out, and
-    counted.
+    In a robot's run a slow disk must delay nothing: after some seconds records are left out, and counted.
     """
 
     def __init__(
@@ -66,14 +65,14 @@ class McapSink(Sink):
             path: of the file; one that exists is left alone.
             contract: of the model that the run begins with.
             patient: wait for a slow disk, rather than leave records out.
-            mountings: of the sensors, by name: without them, axes would point elsewhere when it is played again.
+            mountings: of the sensors, by name: without them, axes would point elsewhere when the file is played again.
             geometry: of the sensors.
-            unix_offset_ns: what is added to the time of a scan for [ns] since 1970; by default as the clocks are now.
-            origin: what kind of source the scans come from, where results are of a recording; else as they say.
+            unix_offset_ns: added to the time of a scan gives [ns] since 1970; by default as the clocks are now.
+            origin: kind of source that the scans come from, where results are of a recording; else that of the results.
             clock_s: monotonic, in [s].
 
         Raises:
-            SinkError: it exists, or cannot be written.
+            SinkError: the file exists, or cannot be written.
         """
         self._path = path
         self._offset_ns = time.time_ns() - time.monotonic_ns() if unix_offset_ns is None else unix_offset_ns
@@ -95,7 +94,7 @@ class McapSink(Sink):
                 )
                 for name, mounting in (mountings or {}).items():
                     said = asdict(mounting)
-                    del said["taxel_count"]  # which the geometry tells
+                    del said["taxel_count"]  # the geometry holds it
                     text = json.dumps(said)
                     self._file.add_metadata(MOUNTING_METADATA, {"sensor": name, "mounting": text})
             except OSError:
@@ -108,17 +107,17 @@ class McapSink(Sink):
 
     @property
     def scans(self) -> int:
-        """On the disk so far, of all sensors."""
+        """Number of scans on the disk so far, of all sensors."""
         numbers = [number for (_, name), number in self._channels.items() if name == "scan"]
         return sum(self._file.written.get(number, 0) for number in numbers)
 
     @property
     def size_bytes(self) -> int:
-        """On the disk so far."""
+        """Size on the disk so far, in bytes."""
         return self._file.size_bytes
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Add the messages of one scan: the baseline if it is another than before comes first."""
+        """Add the messages of one scan; a new baseline comes first."""
         if not self._has_room():
             return
         scan = result.scan
@@ -141,7 +140,7 @@ class McapSink(Sink):
                 self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
             for event in result.events:
                 self._log(event)
-            self._file.look()  # once all of the scan is there
+            self._file.look()  # after the last message, so that a due chunk does not end in mid-scan
         except OSError as error:
             raise self._failure(error) from error
 
@@ -156,7 +155,7 @@ class McapSink(Sink):
             raise self._failure(error) from error
 
     def wait(self) -> None:
-        """Let nothing lie about while no scan comes."""
+        """Pass on the open chunk when it is due, while no scan comes."""
         try:
             self._file.look()
         except OSError as error:
@@ -176,7 +175,7 @@ class McapSink(Sink):
             self._path.unlink(missing_ok=True)
 
     def _has_room(self) -> bool:
-        """Whether there is for one more record, which is counted as left out else."""
+        """Return True if there is room for one more record; else count it as left out."""
         try:
             full = self._file.full()
             if full and self._patient:

@@ -1,8 +1,8 @@
-"""An MCAP file that is whole up to the last quarter of a second, whatever ends its writer.
+"""Writer of an MCAP file that stays whole up to the last quarter of a second, however its process ends.
 
-The public Writer closes a chunk by its size alone unless it is told, compresses where its caller waits, and keeps a
-large object for each chunk until the end, which over a day of small chunks is hundreds of megabytes. This one is made
-of the package's public records; it compresses and writes in a thread of its own, which nobody waits for.
+The public Writer closes a chunk by its size alone unless asked to, compresses in the caller's thread, and keeps a
+large object for each chunk until the end, which over a day of small chunks is hundreds of megabytes. This writer is
+made of the package's public records; it compresses and writes in a thread of its own, so that no caller waits.
 """
 
 import os
@@ -38,12 +38,12 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 CHUNK_S: Final = 0.25
-"""The most that a crash costs; a power cut costs what the system had not put on the disk yet, too."""
+"""Longest stretch that a crash costs, in [s]; a power cut also costs what the system had not put on the disk yet."""
 MOST_CHUNK_BYTES: Final = 1 << 22
 MOST_WAITING_BYTES: Final = 1 << 24
-"""Before compression: five seconds of two sensors' patterns, for which a disk may do something else."""
+"""Most bytes that wait, before compression: five seconds of two sensors' patterns while the disk is busy elsewhere."""
 _LEVEL: Final = 1
-"""Of zstd: the next ones take twice the time for some percent of noise."""
+"""Level of zstd: the next levels take twice the time for some percent of noise."""
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS_BYTES: Final = 22
 _FOOTER_BYTES: Final = 20
@@ -51,12 +51,12 @@ _PART_BYTES: Final = 1 << 16
 
 
 class McapFile:
-    """Schemas, channels, messages and metadata into one new file.
+    """Writer of schemas, channels, messages and metadata into one new file.
 
     Attributes:
-        messages: added so far.
-        written: of these on the disk, by channel.
-        size_bytes: on the disk so far.
+        messages: number of messages added so far.
+        written: number of messages on the disk, by channel.
+        size_bytes: size on the disk so far.
     """
 
     def __init__(self, path: Path, profile: str, library: str, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -65,13 +65,13 @@ class McapFile:
         Args:
             path: of the file, which must not exist yet.
             profile: of MCAP, such as "ros2".
-            library: that writes it.
+            library: name of the library that writes the file.
             clock_s: monotonic, in [s].
 
         Raises:
-            OSError: it cannot be written; FileExistsError if it exists.
+            OSError: the file cannot be written; FileExistsError if it exists.
         """
-        # What the summary is to say of each chunk, megabytes an hour, on the disk and not in memory; it has no name.
+        # The index of the chunks grows by megabytes an hour, so it waits on the disk, in a file without a name.
         self._chunks = TemporaryFile(dir=path.parent)  # noqa: SIM115 - `abandon` closes it
         self._file = path.open("xb", buffering=0)
         self.size_bytes = 0
@@ -102,14 +102,14 @@ class McapFile:
         return sum(self._counts.values())
 
     def add_schema(self, name: str, encoding: str, text: str) -> int:
-        """The id of a new schema."""
+        """Add a schema and return its id."""
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=text.encode())
         self._schemas.append(schema)
         schema.write(self._head)
         return schema.id
 
     def add_channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """The id of a new channel."""
+        """Add a channel and return its id."""
         number = len(self._channels) + 1
         channel = Channel(id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata=dict(metadata))
         self._channels.append(channel)
@@ -117,19 +117,19 @@ class McapFile:
         return number
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add facts that hold for the whole file; they are on their way to the disk at once.
+        """Add facts that hold for the whole file, and pass them to the writing thread at once.
 
         Raises:
-            OSError: what was added before cannot be written.
+            OSError: an earlier record cannot be written.
         """
         self._flush()
         self._hand_over(0, self._write_metadata, name, _bytes_of(Metadata(name=name, metadata=dict(values))))
 
     def add_message(self, channel: int, unix_ns: int, data: bytes) -> None:
-        """Add one message; it is on its way to the disk within CHUNK_S, if `look` is called by then.
+        """Add one message; it is passed to the writing thread within CHUNK_S, if `look` is called by then.
 
         Raises:
-            OSError: what was added before cannot be written.
+            OSError: an earlier record cannot be written.
         """
         sequence = self._counts.get(channel, 0)
         if not self._payload:
@@ -148,10 +148,10 @@ class McapFile:
             self._flush()
 
     def full(self) -> bool:
-        """Whether so much waits for the disk that nothing should be added.
+        """Return True if so much waits for the disk that nothing should be added.
 
         Raises:
-            OSError: what was added before cannot be written.
+            OSError: an earlier record cannot be written.
         """
         self._look_back()
         return self._waiting_bytes + len(self._payload) >= MOST_WAITING_BYTES
@@ -160,17 +160,17 @@ class McapFile:
         """Close the chunk if it is due.
 
         Raises:
-            OSError: what was added before cannot be written.
+            OSError: an earlier record cannot be written.
         """
         self._look_back()
         if self._payload and self._clock_s() >= self._due_s:
             self._flush()
 
     def close(self) -> None:
-        """Write what is left, and the summary that lets a reader find its way.
+        """Write the rest, and the summary that lets a reader seek in the file.
 
         Raises:
-            OSError: it cannot be written. The file is closed, and what it holds can be read.
+            OSError: the rest cannot be written. The file is closed, and its content can be read.
         """
         try:
             self._flush()
@@ -183,14 +183,14 @@ class McapFile:
         """Close the file as it is."""
         self._executor.shutdown()
         self._file.close()
-        with suppress(OSError):  # what was still to be written of it nobody needs
+        with suppress(OSError):  # the index of chunks is of no use any more
             self._chunks.close()
 
     def drain(self) -> None:
-        """Wait until nothing waits for the disk but the chunk that is open.
+        """Wait until only the open chunk is not on the disk yet.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: a record cannot be written.
         """
         while self._handed_over:
             self._handed_over[0][0].exception()
@@ -203,7 +203,7 @@ class McapFile:
         self._hand_over(len(payload), self._write, head, payload, index, self._times_ns)
 
     def _hand_over(self, waiting_bytes: int, write: Callable[..., None], *given: object) -> None:
-        """To the writing thread; it writes in this order, and no more once something could not be written."""
+        """Queue a job for the writing thread, which works in order and writes nothing more after a failure."""
         self._look_back()
         self._handed_over.append((self._executor.submit(self._unless_failed, write, *given), waiting_bytes))
         self._waiting_bytes += waiting_bytes
@@ -265,7 +265,7 @@ class McapFile:
             self.written[channel] = self.written.get(channel, 0) + len(records)
 
     def _put(self, data: bytes) -> None:
-        """All of it, or nothing: a disk that fills takes a part and refuses the rest."""
+        """Write all of the data or nothing: a disk that fills takes a part and refuses the rest."""
         left = memoryview(data)
         try:
             while left:
@@ -277,7 +277,7 @@ class McapFile:
         self.size_bytes += len(data)
 
     def _write_summary(self) -> None:
-        """All of it, or nothing."""
+        """Write the whole summary or nothing."""
         whole_bytes = self.size_bytes
         try:
             self._put(_bytes_of(DataEnd(data_section_crc=0)))
@@ -302,7 +302,7 @@ class McapFile:
             raise
 
     def _summary(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
-        """Groups of records, each in parts that fit into memory."""
+        """Yield groups of records, each in parts that fit into memory."""
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(self._channels),

@@ -1,8 +1,8 @@
 """Scans and patterns in one .npz, which `--source replay:` plays again.
 
-A zip archive cannot be written side by side, so while the run lasts a row a scan grows in `FILE.npz.parts`; closing
-turns rows into arrays. Memory stays flat however long the run is. Each row is written at once, so that a crash, or
-kill -9, costs no scan that was recorded: `python -m edge.sinks.npz FILE.npz` makes the .npz then.
+A zip archive cannot grow at several places, so during the run `FILE.npz.parts` grows by a row a scan; `close` turns the
+rows into arrays. Memory stays flat however long the run is. Each row is written at once, so that a crash, or kill -9,
+costs no recorded scan: afterwards `python -m edge.sinks.npz FILE.npz` makes the .npz.
 """
 
 import argparse
@@ -34,7 +34,7 @@ CHUNK_SCANS: Final = 256
 
 
 class NpzSink(Sink):
-    """Records into `path`, by way of parts beside it.
+    """Writer of records into `path`, by way of parts next to it.
 
     Arrays have one row a scan; docs/formats.md lists them.
     """
@@ -57,10 +57,10 @@ class NpzSink(Sink):
             pattern_shape: (H, W).
             deviations: patterns come with deviations.
             traction_shape: (3, h, w), where patterns come with tractions.
-            origin: what kind of source the scans come from, where results are of a recording; else as they say.
+            origin: kind of source that the scans come from, where results are of a recording; else that of the results.
 
         Raises:
-            SinkError: it exists, or its parts cannot be written, or lie there from a run that did not end.
+            SinkError: the file exists, or its parts cannot be written, or parts of an unfinished run lie there.
         """
         self._path = path
         self._scans = 0
@@ -129,12 +129,12 @@ class NpzSink(Sink):
 
 
 def parts_dir(path: Path) -> Path:
-    """Where the rows of `path` grow."""
+    """Return the folder in which the rows of `path` grow."""
     return path.with_name(path.name + ".parts")
 
 
 def draft_of(path: Path) -> Path:
-    """Name under which the .npz grows until it is whole."""
+    """Return the name under which the .npz grows until it is whole."""
     return path.with_name(path.name + ".draft")
 
 

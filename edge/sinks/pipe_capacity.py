@@ -1,4 +1,4 @@
-"""How much a pipe takes before its writer would have to wait; on Linux."""
+"""Capacity of a pipe before its writer would have to wait; on Linux."""
 
 import fcntl
 import os
@@ -11,19 +11,19 @@ from contextlib import suppress
 from typing import Final
 
 PIPE_BYTES: Final = 1 << 20
-"""As much as Linux gives to anybody: a quarter of a second of two sensors' patterns for certain, usually the double."""
+"""Most that Linux gives to any user: at least a quarter of a second of two sensors' patterns, usually the double."""
 PAGE_BYTES: Final = 4096
 
 
 def widen(descriptor: int) -> None:
-    """Let a pipe hold as much as it may; anything else stays as it is."""
+    """Enlarge a pipe to PIPE_BYTES if that is allowed; anything else stays as it is."""
     if sys.platform == "linux" and _is_pipe(descriptor):
-        with suppress(OSError):  # others have taken the pages that a user may have
+        with suppress(OSError):  # other pipes have taken the pages that a user may have
             fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
 def has_room(descriptor: int, wanted_bytes: int) -> bool:
-    """Whether so many bytes can be written without waiting for a reader. A pipe whose reader has gone has room."""
+    """Return True if so many bytes can be written without waiting. A pipe whose reader has gone has room."""
     poll = select.poll()
     poll.register(descriptor, select.POLLOUT)
     events = poll.poll(0)
@@ -33,8 +33,8 @@ def has_room(descriptor: int, wanted_bytes: int) -> bool:
         return True
     waiting_bytes = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))[0]
     if waiting_bytes == 0:
-        return True  # it could not be widened and a record may not fit: a reader that has taken all is not slow
-    # A pipe holds pages, and a record may begin a new one: up to half of what they have room for stays empty.
+        return True  # the pipe may be too small for a record, and a reader that has taken everything is not slow
+    # A pipe holds pages, and a record may begin a new page, so up to half of their room stays empty.
     return 2 * waiting_bytes + wanted_bytes + 2 * PAGE_BYTES <= fcntl.fcntl(descriptor, fcntl.F_GETPIPE_SZ)
 
 

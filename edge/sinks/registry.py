@@ -1,4 +1,4 @@
-"""Sinks as a user writes them."""
+"""Registry of the sinks, by the names that a user writes."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -22,10 +22,10 @@ _TARGETED: Final = ("jsonl", "npz", "mcap", "shm", "zenoh", "ros2")
 
 
 def check_sink(text: str) -> tuple[str, str]:
-    """Form and target of the sink that `text` names; nothing is opened.
+    """Return form and target of the sink that `text` names; nothing is opened.
 
     Raises:
-        UsageError: no such form; the forms are listed. Or no target of this form.
+        UsageError: no such form (the forms are listed), or no target of this form.
     """
     form, _, target = text.partition(":")
     ending = f".{form}" if form in ("npz", "mcap") else ""
@@ -43,10 +43,10 @@ def check_sink(text: str) -> tuple[str, str]:
 
 
 def check_apart(texts: Sequence[str]) -> None:
-    """Each sink once: two would write into one place what is the same, or both.
+    """Check that each sink is there once: two would write to the same place.
 
     Raises:
-        UsageError: one is there twice.
+        UsageError: a sink is there twice.
     """
     for text in texts:
         if texts.count(text) > 1:
@@ -69,20 +69,20 @@ def open_sink(
 
     Args:
         text: one of FORMS.
-        contract: says which maps will come, and their shapes.
+        contract: names the maps that will come, and their shapes.
         patient: wait for slow readers, rather than leave records out.
         mountings: of the sensors, by name.
         geometry: of the sensors.
         unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
-        source: kind of what is read, told with events.
-        origin: what kind of source the scans come from, where they are of a recording that tells.
+        source: kind of the source, written with events.
+        origin: kind of source that the scans come from, where a recording names it.
         stop: set when the run is to end: then no slow reader is waited for.
 
     Raises:
         UsageError: no such form; the forms are listed.
-        SinkError: it cannot be opened.
+        SinkError: the sink cannot be opened.
     """
-    # Each loaded only where it is used: start-up time and memory are for what runs.
+    # Each is imported only where it is used, which saves start-up time and memory.
     form, target = check_sink(text)
     if form == "status":
         from edge.sinks.status_line import StatusSink

@@ -1,4 +1,4 @@
-"""The latest result of each sensor in shared memory, for a control loop on the same machine. Linux."""
+"""Latest result of each sensor in shared memory, for a control loop on the same machine. Linux."""
 
 import fcntl
 import math
@@ -44,7 +44,7 @@ _WORD: Final = 8
 
 
 class SharedMemorySink(Sink):
-    """Writes what `edge.sinks.shm_layout` describes; readers cost it nothing, however many and slow they are."""
+    """Writer of the layout in `edge.sinks.shm_layout`; readers cost it nothing, however many and slow they are."""
 
     def __init__(
         self,
@@ -53,16 +53,16 @@ class SharedMemorySink(Sink):
         folder: Path = Path(FOLDER),
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Make the segment; one that a crash left behind is taken over.
+        """Make the segment; one that a crash left over is replaced.
 
         Args:
             name: of the file in `folder`.
-            contract: says the shapes.
+            contract: gives the shapes.
             folder: of shared memory.
             clock_ns: monotonic, the scans' own, in [ns].
 
         Raises:
-            SinkError: it cannot be made, or another program writes it.
+            SinkError: the segment cannot be made, or another program writes it.
         """
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name):
             raise SinkError(f"shm:{name} cannot be a name: expected letters, digits, '_', '.' and '-', 100 at most")
@@ -78,7 +78,7 @@ class SharedMemorySink(Sink):
             if isinstance(error, SinkError):
                 raise
             raise SinkError(f"cannot make shared memory {self._path}: {error.strerror}") from error
-        # Numbers of eight bytes are stored by this in one piece, which struct does only byte by byte.
+        # This view stores eight bytes in one piece, where struct stores byte by byte.
         self._words = memoryview(self._memory).cast("Q")
         self._slots: dict[str, int] = {}
         self._draft = bytearray(self._layout.half_bytes)
@@ -91,7 +91,7 @@ class SharedMemorySink(Sink):
         )
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Replace what there is of this sensor.
+        """Replace the sensor's values.
 
         Raises:
             SinkError: there are too many sensors.
@@ -107,15 +107,15 @@ class SharedMemorySink(Sink):
         self._beat()
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Events have no place here: of an outage the age of the values tells."""
+        """Store the heartbeat only: events have no place here, and the age of the values shows an outage."""
         self._beat()
 
     def wait(self) -> None:
-        """Tell that the writer is there, though no scan comes."""
+        """Store the heartbeat, which shows that the writer lives while no scan comes."""
         self._beat()
 
     def close(self) -> None:
-        """Let go of the name; readers that still see the memory see that it ended."""
+        """Free the name; readers that still see the memory see that the run ended."""
         if self._file < 0:
             return
         self._words[HEARTBEAT_AT // _WORD] = 0
@@ -136,20 +136,20 @@ class SharedMemorySink(Sink):
 
     def _fill(self, result: Result, sequence: int) -> None:
         _HEAD.pack_into(self._draft, 0, 0, 0, sequence, *_COLUMNS.flat(result))
-        # Where there is none, none must be left standing from before.
+        # A map that this result lacks is filled with NaN, so that no older values stay.
         for place, values in zip(self._maps.values(), self._map_columns.of(result), strict=True):
             place[:] = values
         checksum = zlib.crc32(memoryview(self._draft)[_CHECKED_FROM:])
         self._draft[:4] = checksum.to_bytes(4, "little")
 
     def _create(self, pattern_unit: str) -> tuple[int, mmap.mmap]:
-        """Make it whole under another name first: nobody ever sees a part of it."""
+        """Make the segment whole under another name first, so that no reader sees a part of it."""
         draft = self._path.with_name(f".{self._path.name}.{os.getpid()}")
         draft.unlink(missing_ok=True)
         descriptor = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # held as long as this process lives
-            os.posix_fallocate(descriptor, 0, self._layout.total_bytes)  # later there would be a signal, no error
+            os.posix_fallocate(descriptor, 0, self._layout.total_bytes)  # no memory: an error here, a signal later
             memory = mmap.mmap(descriptor, self._layout.total_bytes)
             header = self._layout.header(os.getpid(), pattern_unit)
             memory[: len(header)] = header
@@ -171,10 +171,10 @@ class SharedMemorySink(Sink):
         return True
 
     def _take_over(self) -> None:
-        """Remove what a writer left that has died.
+        """Remove the segment of a writer that has died.
 
         Raises:
-            SinkError: it lives, or what lies there is no segment of ours.
+            SinkError: the writer lives, or the file is no segment of ours.
         """
         try:
             descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW)

@@ -1,10 +1,9 @@
-"""The layout of `shm:NAME`: latest values in shared memory. docs/middleware.md holds it as tables.
+"""Layout of `shm:NAME`: latest values in shared memory. docs/middleware.md holds it as tables.
 
-A slot a sensor, and two halves a slot: the writer fills the half that is not the newest and then counts `sequence` up,
-so that a reader never waits, not even for a writer that was stopped or killed half-way. What a reader has copied is
-whole where the half tells that sequence and its checksum holds. On x86-64 stores and loads keep their order and the
-checksum never fails but for a copy that took longer than a period; elsewhere it stands for the barriers that Python
-does not have.
+Each sensor has a slot, and each slot two halves: the writer fills the half that is not the newest and then counts
+`sequence` up, so that a reader never waits, not even for a writer that was stopped or killed half-way. A reader's copy
+is whole if the half holds that sequence and its checksum is right. On x86-64 stores and loads keep their order and the
+checksum fails only for a copy that took longer than a period; elsewhere it replaces the barriers that Python lacks.
 """
 
 import struct
@@ -21,7 +20,7 @@ MAGIC: Final = b"TESR-SHM"
 VERSION: Final = 1
 SLOTS: Final = 32
 LINE_BYTES: Final = 64
-"""Of a cache line: what different processes write and read often lies in lines of its own."""
+"""Size of a cache line: values that different processes write and read often lie in lines of their own."""
 HEADER_BYTES: Final = 192
 HEARTBEAT_AT: Final = 128
 
@@ -47,10 +46,10 @@ HEADER: Final = (
     ("traction_height", "I"),
     ("traction_width", "I"),
 )
-"""Name and struct's character of each field from byte 0 on; behind them, at HEARTBEAT_AT, `heartbeat_ns`, a q.
+"""Name and struct's character of each field from byte 0 on; then, at HEARTBEAT_AT, `heartbeat_ns`, a q.
 
-`traction_at` is 0 where the model gives no traction, and with writers that know of none, whose halves lack the fields
-from `wrench_origin` on.
+`traction_at` is 0 where the model gives no traction, and with writers from before tractions, whose halves lack the
+fields from `wrench_origin` on.
 """
 
 IN_MEMORY: Final = sorted((field for field in FIELDS if (field.byte or 0) > 0), key=lambda field: field.byte or 0)
@@ -64,18 +63,18 @@ MAPS_IN_MEMORY: Final = tuple(field for field in FIELDS if field.byte == PLACE_I
 
 
 def struct_of(fields: tuple[tuple[str, str], ...]) -> struct.Struct:
-    """Fields side by side, little-endian."""
+    """Return the struct of fields side by side, little-endian."""
     return struct.Struct("<" + "".join(kind for _, kind in fields))
 
 
 def offsets_of(fields: tuple[tuple[str, str], ...]) -> dict[str, int]:
-    """Where each field begins, in bytes."""
+    """Return the byte at which each field begins."""
     return {name: struct_of(fields[:index]).size for index, (name, _) in enumerate(fields)}
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where everything lies for a sensor of rows x cols taxels and patterns of height x width pixels.
+    """Places of all values for a sensor of rows x cols taxels and patterns of height x width pixels.
 
     Attributes:
         traction_shape: (3, h, w), where there is a traction.
@@ -121,7 +120,7 @@ class Layout:
         return HEADER_BYTES + SLOTS * self.slot_bytes
 
     def header(self, writer_pid: int, pattern_unit: str) -> bytes:
-        """The header's fields, without the heartbeat."""
+        """Return the header's fields, without the heartbeat."""
         return struct_of(HEADER).pack(
             *(MAGIC, VERSION, HEADER_BYTES, SLOTS, self.slot_bytes, self.half_bytes, LINE_BYTES),
             *(self.rows, self.cols, self.height, self.width),

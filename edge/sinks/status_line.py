@@ -16,7 +16,7 @@ CLEAR_TO_END: Final = "\x1b[K"
 
 
 class StatusSink(Sink):
-    """Rewrites one line, at most ten times a second; writes nothing where there is no terminal."""
+    """Live line, rewritten at most ten times a second; nothing is written where there is no terminal."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class StatusSink(Sink):
         self._refresh()
 
     def wait(self) -> None:
-        """Show for how long no scan came."""
+        """Show the time without a scan."""
         self._refresh()
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class StatusSink(Sink):
             self._terminal = False  # the window was closed; that ends no recording
 
     def line(self) -> str:
-        """The line, what matters most first."""
+        """Return the line, the most important part first."""
         parts = []
         sources = {result.source for result in self._latest.values()} - {"device"}
         parts += sorted(source.upper() for source in sources)

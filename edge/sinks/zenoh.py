@@ -1,7 +1,7 @@
 """Scans, patterns and events over zenoh, from many grippers to one place. docs/middleware.md describes the messages.
 
-zenoh's own threads send: `put` hands over and returns. What the network does not take in time zenoh drops, without
-telling; readers tell by the gaps in `scan`.
+zenoh's own threads send: `put` queues a message and returns. zenoh drops silently what the network does not take in
+time; readers notice the gaps in `scan`.
 """
 
 import json
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import zenoh
 
 PLACE: Final = "tcp/127.0.0.1:7447"
-"""Where a router listens on this machine, with zenoh's usual port."""
+"""Endpoint of a router on this machine, at zenoh's usual port."""
 CLOSED: Final = {
     "mode": "peer",
     "listen/endpoints": [],
@@ -36,7 +36,7 @@ CLOSED: Final = {
     "scouting/gossip/enabled": False,
     "transport/shared_memory/enabled": False,
 }
-"""Nobody is let in, looked for or heard of, unless a configuration says so: zenoh's own defaults would do it all."""
+"""Settings that keep discovery and listening off unless a configuration turns them on; zenoh's defaults turn all on."""
 CLOSE_S: Final = 0.5
 _JSON: Final = "application/json"
 _PACKED: Final = "application/octet-stream"
@@ -44,23 +44,23 @@ _REMEDY: Final = "expected zenoh:KEY, zenoh:KEY?connect=tcp/HOST:7447 or zenoh:K
 
 
 class ZenohSink(Sink):
-    """Puts KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, and lives as KEY/alive/ID.
+    """Publisher of KEY/SENSOR/scan, KEY/SENSOR/pattern and KEY/event, alive as KEY/alive/ID.
 
     Attributes:
         zid: the session's id, which the time stamp of every message holds, too.
     """
 
     def __init__(self, target: str, *, patient: bool = False, source: str | None = None) -> None:
-        """Open a session; whether anybody is there, now or later, is all the same.
+        """Open a session; it does not matter whether a subscriber is there, now or later.
 
         Args:
             target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
             patient: wait for a slow network, rather than leave messages out.
-            source: kind of what is read, told with every event.
+            source: kind of the source, published with every event.
 
         Raises:
-            UsageError: the target cannot be understood.
-            SinkError: no zenoh, or it cannot be opened.
+            UsageError: the target has another form.
+            SinkError: zenoh is not installed, or the session cannot be opened.
         """
         key, configuration = understood(target)
         self._target = target
@@ -76,7 +76,7 @@ class ZenohSink(Sink):
             self._session = zenoh.open(_config(configuration))
             self.zid = str(self._session.zid())
             self._events = self._publisher(f"{key}/event", _JSON)
-            self._read = True  # until a result shows that nobody subscribes
+            self._read = True  # until a result shows that there is no subscriber
             self._alive = self._session.liveliness().declare_token(f"{key}/alive/{self.zid}")
         except zenoh.ZError as error:
             raise SinkError(f"zenoh cannot be opened: {_reason(error)}") from error
@@ -84,7 +84,7 @@ class ZenohSink(Sink):
 
     @property
     def trouble(self) -> str | None:
-        """That nobody subscribed when the last result was put."""
+        """Trouble where there was no subscriber when the last result was put, else None."""
         return None if self._read else f"nobody subscribes to zenoh:{self._target}: see to its reader, or the router"
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -109,16 +109,16 @@ class ZenohSink(Sink):
         self._put(self._events, orjson.dumps(event_record(event, counters, self._source)))
 
     def close(self) -> None:
-        """Send what is under way, and end; subscribers to KEY/alive/* are told.
+        """Send what is under way, and end; subscribers to KEY/alive/* are notified by zenoh.
 
-        A subscriber that stands still would hold zenoh up for ten seconds: it is left alone after CLOSE_S.
+        A subscriber that stands still would delay zenoh for ten seconds, so `close` waits for CLOSE_S at most.
         """
         closing = threading.Thread(target=self._close, name="zenoh-close", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
 
     def _close(self) -> None:
-        with suppress(self._zenoh.ZError):  # that it took too long, which is no fault of what was done
+        with suppress(self._zenoh.ZError):  # it took too long, after everything was put without an error
             self._session.close()
 
     def _declare(self, sensor: str) -> "tuple[zenoh.Publisher, zenoh.Publisher]":
@@ -138,15 +138,15 @@ class ZenohSink(Sink):
 
 
 def chunks(sensor: str) -> str:
-    """A sensor's name as part of a key: as in a web address, so that `urllib.parse.unquote` gives it back."""
+    """Return a sensor's name as part of a key, quoted as in a web address: `urllib.parse.unquote` gives it back."""
     return quote(sensor, safe="/" if all(sensor.split("/")) else "")
 
 
 def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
-    """Key and configuration that a target asks for.
+    """Return key and configuration of a target.
 
     Raises:
-        UsageError: it cannot be understood.
+        UsageError: the target has another form.
     """
     key, asked, option = target.partition("?")
     if not all(key.split("/")) or set(key) & set("*$#") or key.startswith("@") or "/@" in key:
@@ -164,7 +164,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
 
 
 def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
-    """Zenoh's own, with all doors closed that the user does not open."""
+    """Return zenoh's configuration, with everything off in CLOSED that the user does not turn on."""
     import zenoh
 
     config = zenoh.Config()
@@ -181,11 +181,11 @@ def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
 
 
 def _matched(publisher: "zenoh.Publisher") -> bool:
-    # An object, whatever zenoh's own stubs say of it, and always true.
+    # A property, although zenoh's own stubs make it a method, which would always be true.
     return publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _reason(error: Exception) -> str:
-    """What zenoh says, without where in its source, which comes behind " at "."""
+    """Return zenoh's reason without the place in its source, which follows " at "."""
     said = str(error).strip().partition(f" at {os.sep}")[0]
     return said.strip().splitlines()[-1].lstrip(" =")

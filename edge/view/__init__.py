@@ -1,1 +1,1 @@
-"""The live page: what the loop hears, sampled and shown in browsers."""
+"""Live page: results and events of the loop, sampled and shown in browsers."""

@@ -1,8 +1,8 @@
-"""Who may look: which requests the live page's server takes. No I/O.
+"""Access to the live page: the requests that its server accepts. No I/O.
 
 A browser runs pages of strangers, which can reach a server on loopback, too. Three things keep them out: the name that
-the browser was asked to reach (a stranger's name may be made to point here), the page that a socket is asked for by,
-and, where others than this machine can reach the server, a token.
+the browser was asked to reach (a stranger's name may resolve to this machine), the origin of the page that opens a
+socket, and, where other machines can reach the server, a token.
 """
 
 import hmac
@@ -26,7 +26,7 @@ _TOKEN: Final = re.compile(rf"[A-Za-z0-9_-]{{{SHORTEST_TOKEN},200}}")
 
 
 class Refusal(NamedTuple):
-    """Why a request is not answered as wanted."""
+    """Refusal of a request: status and reason."""
 
     status: HTTPStatus
     text: str
@@ -34,12 +34,12 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What a request must know.
+    """Conditions that a request must meet.
 
     Attributes:
         host: name or address that the server listens at.
-        name: what this machine is called, with or without a domain.
-        token: or None where none is needed.
+        name: of this machine, with or without a domain.
+        token: or None where it is not needed.
     """
 
     host: str
@@ -47,7 +47,7 @@ class Access:
     token: str | None
 
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
-        """Why a request is refused; None for one that is granted.
+        """Return the refusal of a request; None if it is granted.
 
         Args:
             path: with its query.
@@ -63,21 +63,21 @@ class Access:
         if place not in (PAGE, SOCKET):
             return Refusal(HTTPStatus.NOT_FOUND, f"there is only {PAGE}")
         given = parse_qs(query).get("token", [""])
-        # The page alone shows nothing, and keeps the token out of the address bar: it must open again without.
+        # The page alone shows nothing, and removes the token from the address bar: it must open again without it.
         if place == SOCKET and self.token is not None and not _same(given[-1], self.token):
             text = "the token is missing or wrong: open the address that edge-sr printed when it started"
             return Refusal(HTTPStatus.FORBIDDEN, text)
         return None
 
     def url(self, port: int) -> str:
-        """The page's address for a person on this machine, or on another where others can reach it."""
+        """Return the page's address for a person on this machine, or on another where others can reach it."""
         host = self.name if _is_everything(self.host) else self.host
         shown = f"[{host}]" if ":" in host else host
         return f"http://{shown}:{port}{PAGE}" + ("" if self.token is None else f"?token={self.token}")
 
     def _is_ours(self, host: str) -> bool:
         matched = _HOST.fullmatch(host)
-        if matched is None:  # also one with a user's name in front of ours
+        if matched is None:  # also a host with a user's name in front of ours
             return False
         name = (matched["address"] or matched["name"]).lower()
         if name in ("localhost", self.host.lower()):
@@ -85,15 +85,15 @@ class Access:
         address = _address(name)
         if address is not None:
             return address.is_loopback or _is_everything(self.host)
-        # In whatever domain: a stranger can call his so, too, but where others can reach it he needs the token.
+        # Any domain will do: a stranger may use this name too, but needs the token where other machines can reach us.
         return not is_loopback(self.host) and name.partition(".")[0] == self.name.lower().partition(".")[0]
 
 
 def grant(host: str, name: str, token: str | None) -> Access:
-    """What is asked of requests to a server at `host`, on a machine called `name`: a token unless it is on loopback.
+    """Return the conditions for a server at `host`, on a machine called `name`: a token unless it is on loopback.
 
     Raises:
-        UsageError: the token is too easy, or no part of an address.
+        UsageError: the token is too easy, or cannot be part of an address.
     """
     if token is not None and not _TOKEN.fullmatch(token):
         expected = f"expected at least {SHORTEST_TOKEN} letters, digits, - or _"
@@ -104,7 +104,7 @@ def grant(host: str, name: str, token: str | None) -> Access:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach it."""
+    """Return True if only this machine can reach the host."""
     address = _address(host)
     return host.lower() == "localhost" if address is None else address.is_loopback
 

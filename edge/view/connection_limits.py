@@ -1,7 +1,7 @@
-"""Connections of the live page's server: how many there may be, and how much is taken of each.
+"""Limits of the live page's connections: their number, and the bytes that each may send.
 
-Who sends more than a person asks for is cut off: what it sends takes the loop's time, and answers to one that does not
-read them are kept for it.
+A client that sends more than a person would is cut off: its messages take the loop's time, and answers that it does not
+read take memory.
 """
 
 import asyncio
@@ -13,25 +13,25 @@ from websockets.asyncio.server import ServerConnection
 
 MOST_VIEWERS: Final = 16
 MOST_CONNECTIONS: Final = 64
-"""Of viewers, of browsers that fetch the page, and of clients that say nothing for OPEN_S."""
+"""Most connections of viewers, of browsers that fetch the page, and of clients that are silent for OPEN_S."""
 MOST_BYTES: Final = 1 << 14
-"""From one connection in PACE_S: a browser's request with its cookies, or some hundred commands."""
+"""Most bytes from one connection in PACE_S: a browser's request with its cookies, or some hundred commands."""
 PACE_S: Final = 1.0
 _GET: Final = b"GET "
 
 
 class Connections:
-    """All that there are. Viewers keep their places; of all others the oldest makes room for the newest.
+    """All connections. Viewers keep their places; of all others the oldest makes room for the newest.
 
     Attributes:
         gone: connections lost since this was last set to 0.
     """
 
     def __init__(self, lost: Callable[[], object]) -> None:
-        """Begin without one; `lost` is called after each that is lost."""
+        """Begin without a connection; `lost` is called after each that is lost."""
         self.gone = 0
         self._lost = lost
-        self._all: dict[Connection, None] = {}  # in the order of their coming
+        self._all: dict[Connection, None] = {}  # in order of arrival
         self._granted: set[Connection] = set()
 
     def __len__(self) -> int:
@@ -39,23 +39,23 @@ class Connections:
 
     @property
     def granted(self) -> int:
-        """Places of viewers that are taken."""
+        """Number of viewers' places that are taken."""
         return len(self._granted)
 
     def grant(self, connection: "Connection") -> bool:
-        """Give it a viewer's place, if there is one."""
+        """Give a connection a viewer's place, if one is free."""
         if len(self._granted) >= MOST_VIEWERS or connection not in self._all:
             return False
         self._granted.add(connection)
         return True
 
     def abort(self) -> None:
-        """End all at once, whatever is on its way to them."""
+        """End all connections at once, whatever is on its way to them."""
         for connection in tuple(self._all):
             connection.transport.abort()
 
     def add(self, connection: "Connection") -> None:
-        """Count one more, from before its first byte."""
+        """Count one more connection, from before its first byte."""
         self._all[connection] = None
         if len(self._all) > MOST_CONNECTIONS:
             oldest = next(other for other in self._all if other not in self._granted)
@@ -63,7 +63,7 @@ class Connections:
             oldest.transport.abort()
 
     def lose(self, connection: "Connection") -> None:
-        """Count one less."""
+        """Count one connection less."""
         self._all.pop(connection, None)
         self._granted.discard(connection)
         self.gone += 1
@@ -71,7 +71,7 @@ class Connections:
 
 
 class Connection(ServerConnection):
-    """One connection, counted by `every`; to be inherited once for each server."""
+    """Connection that is counted by `every`; each server has a subclass of its own."""
 
     every: ClassVar[Connections]
     _since_s = 0.0
@@ -79,17 +79,17 @@ class Connection(ServerConnection):
     _head: bytes | None = b""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Count it."""
+        """Count the connection."""
         super().connection_made(transport)
         self.every.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Count it no longer."""
+        """Count the connection no longer."""
         super().connection_lost(exc)
         self.every.lose(self)
 
     def data_received(self, data: bytes) -> None:
-        """Take what came, unless it is too much or no request for a page."""
+        """Pass on the data, unless it is too much or no request for a page."""
         now_s = self.loop.time()
         if now_s - self._since_s >= PACE_S:
             self._since_s, self._taken_bytes = now_s, 0

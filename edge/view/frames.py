@@ -1,4 +1,4 @@
-"""Frames of the live page: what was heard, packed for those who look. No I/O, no clock."""
+"""Frames of the live page: results and events, packed for the viewers. No I/O, no clock."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,18 +14,18 @@ from firmware_bridge.silence import SENSOR_SILENT_NS
 
 VERSION: Final = 1
 MAX_FPS: Final = 25
-"""Result frames a second of one sensor: as many as an eye takes in."""
+"""Most result frames a second of one sensor: more is not visible to the eye."""
 
 
 class Run(NamedTuple):
-    """What does not change while a run lasts.
+    """Facts that do not change during a run.
 
     Attributes:
         name: of the source.
         kind: of the source.
         model: name of the model that it begins with.
         contract: of that model.
-        id: this run's alone, by which a viewer that comes again knows whether it is another one.
+        id: of this run alone, by which a viewer that reconnects notices another run.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Run(NamedTuple):
 
 
 class Frames:
-    """Frames of one moment; who looks at the same gets the same bytes.
+    """Frames of one moment; viewers at the same state get the same bytes.
 
     Attributes:
         now_ns: the moment, in [ns].
@@ -55,18 +55,18 @@ class Frames:
         return {sensor: newest.number for sensor, newest in self._newest.items()}
 
     def result(self, sensor: str, since: int) -> bytes:
-        """The newest result of a sensor, with the trace behind number `since`."""
+        """Return the newest result of a sensor, with the trace after number `since`."""
         packed = self._packed.get((sensor, since))
         if packed is None:
             packed = self._packed[sensor, since] = self._pack(self._newest[sensor], since)
         return packed
 
     def events(self, since: int) -> list[tuple[int, bytes]]:
-        """The latest events behind number `since`, with their numbers."""
+        """Return the latest events after number `since`, with their numbers."""
         return [(told.number, self._event(told)) for told in self._heard.events(since)]
 
     def silent(self) -> dict[str, float]:
-        """Sensors of which nothing is heard, and for how long, in [s]."""
+        """Return the silent sensors, and for how long each has been silent, in [s]."""
         away_ns = {sensor: self.now_ns - newest.heard_ns for sensor, newest in self._newest.items()}
         return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SENSOR_SILENT_NS}
 
@@ -83,7 +83,7 @@ class Frames:
             "note_kinds": [note.kind for note in result.notes],
             "rate_hz": None if newest.rate_hz is None else round(newest.rate_hz, 2),
             "age_s": _seconds(self.now_ns - newest.heard_ns),
-            # Heard meanwhile may be more than what is packed here; the next frame begins behind this one.
+            # The loop may have added points since; they belong to the next frame, which begins after this one.
             "trace": [
                 _drawn(point, first_ns)
                 for point in self._heard.points(result.scan.sensor, since)
@@ -96,7 +96,7 @@ class Frames:
 
 
 def hello(run: Run, recording: Path | None) -> bytes:
-    """The first frame that a viewer gets."""
+    """Return the first frame that a viewer gets."""
     contract = run.contract
     height, width = contract.pattern_shape
     header = {
@@ -123,12 +123,12 @@ def hello(run: Run, recording: Path | None) -> bytes:
 
 
 def state(recording: Path | None, viewers: int, silent: dict[str, float]) -> bytes:
-    """What is true of the run beside its results."""
+    """Return the frame of the run's state apart from its results."""
     return pack({"kind": "state", "recording": _path(recording), "viewers": viewers, "silent": silent}, {})
 
 
 def refused(time_ns: int, why: str, source: SourceKind | None) -> bytes:
-    """The answer to what was no command: without a number, since it is none of the run's events."""
+    """Return the answer to a message that is no command: without a number, since it is no event of the run."""
     return _event(event_record(Event(time_ns, "refused", None, why), {}, source), 0, {})
 
 

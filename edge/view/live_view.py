@@ -1,4 +1,4 @@
-"""The live page of a run: what it hears, who may look, who serves, and the recording that a viewer may ask for."""
+"""Live page of a run: its store, its access, its server, and the recorder that a viewer may start."""
 
 import contextlib
 import secrets
@@ -25,10 +25,10 @@ LOOPBACK: Final = "127.0.0.1"
 
 
 class LiveView:
-    """A run's live page; the port is taken at once, and pages are answered from `begin` on.
+    """Live page of a run; the port is taken at once, and pages are answered from `begin` on.
 
     Attributes:
-        sinks: what the loop writes to; none of them fails.
+        sinks: sinks that the loop writes to; they never fail.
         url: the page's address.
     """
 
@@ -46,21 +46,21 @@ class LiveView:
         Args:
             host: name or address to listen at.
             port: 0 for any free one.
-            token: that requests must know; None makes one where others than this machine can reach `host`.
-            record_dir: where recordings are made.
+            token: that requests must carry; None makes one where other machines can reach `host`.
+            record_dir: folder in which recordings are made.
             contract: of the run's model.
-            commands: gets those of viewers; those to record are done by this page's recorder.
+            commands: queue for the viewers' commands; this page's recorder does those to record.
 
         Raises:
-            UsageError: the token cannot be one.
-            SinkError: the port cannot be had.
+            UsageError: the token is not valid.
+            SinkError: the port cannot be taken.
         """
         access = grant(host, socket.gethostname(), token)
         self._heard = Heard()
         self._messages: Callable[[Event], object] = lambda event: None
         self._recorder = Recorder(record_dir, self._tell)
         commands.record = self._recorder.record
-        import_module(f"edge.sinks.{FORM}")  # now, rather than between two scans: it may take a fifth of a second
+        import_module(f"edge.sinks.{FORM}")  # now, not between two scans: the import may take a fifth of a second
         self._server = Server(self._heard, commands, access, port, lambda: self._recorder.path, self._failed)
         self._view = ViewSink(self._heard, lambda: self._server.watched, self._server.wake)
         self._contract = contract
@@ -84,14 +84,14 @@ class LiveView:
         open_sink: Callable[[str], Sink],
         messages: Callable[[Event], object],
     ) -> None:
-        """Answer from now on.
+        """Answer requests from now on.
 
         Args:
             name: of the source.
             kind: of the source.
             model: name of the model that the run begins with.
             open_sink: opens the sink that a text names, to record into.
-            messages: is told of recordings, as viewers are.
+            messages: called with the events of recordings, which viewers get too.
         """
         self._messages = messages
         self._recorder.open_sink = open_sink

@@ -1,4 +1,4 @@
-"""A recording that is begun and ended while the run goes on."""
+"""Recorder that begins and ends a recording while the run goes on."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -13,18 +13,18 @@ from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 
 FORM: Final = "mcap"
-"""Of the sink that is recorded into, and the ending of its files."""
+"""Form of the sink that is recorded into, and the ending of its files."""
 
 
 class Recorder(Sink):
-    """Records into a new file each time it is asked to; what fails is told, and ends no run.
+    """Recorder into a new file for each recording; a failure is reported as an event, and does not end the run.
 
-    A thread of its own opens and closes, and nobody waits for a disk while the run goes on: what comes before the file
-    is open is not recorded. The thread is begun here: one that the loop begins later would have its processor, and what
-    a sink begins has this one's.
+    A thread of its own opens and closes the file, so that the run never waits for a disk: scans that come before the
+    file is open are not recorded. The thread starts in the constructor, because one that the loop starts later would
+    inherit the loop's processor. Threads that a sink starts inherit this thread's processors.
 
     Attributes:
-        path: of the file that is recorded into; None while none is.
+        path: of the file that is recorded into; None while there is no recording.
         open_sink: opens the sink that a text names; to be set before anything is recorded.
     """
 
@@ -35,11 +35,11 @@ class Recorder(Sink):
         clock_ns: Callable[[], int] = time.monotonic_ns,
         local_time: Callable[[], time.struct_time] = time.localtime,
     ) -> None:
-        """Wait to be asked.
+        """Start the thread, without a recording.
 
         Args:
-            directory: where files are made.
-            tell: is told what begins, ends and fails.
+            directory: folder in which files are made.
+            tell: called with an event for what begins, ends and fails.
             clock_ns: monotonic, in [ns].
             local_time: names the files.
         """
@@ -63,7 +63,7 @@ class Recorder(Sink):
         return self._unwritten + (0 if self._sink is None else self._sink.unwritten)
 
     def record(self, on: bool) -> None:
-        """Begin a recording, or end it; asked for what is so already it does nothing."""
+        """Begin a recording, or end it; does nothing where that is so already."""
         self._look_back()
         if on and self._closing is not None:
             self._say("refused", "not recording: the file before is still being written; ask again")
@@ -75,15 +75,15 @@ class Recorder(Sink):
             self._end(self.path)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Record one result, if it is recorded."""
+        """Record one result, if a recording is open."""
         self._do(lambda sink: sink.write(result, counters))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Record an event, if it is recorded."""
+        """Record an event, if a recording is open."""
         self._do(lambda sink: sink.tell(event, counters))
 
     def wait(self) -> None:
-        """Hand on that nothing comes."""
+        """Pass on that no scan came."""
         self._do(lambda sink: sink.wait())
 
     def close(self) -> None:
@@ -112,14 +112,14 @@ class Recorder(Sink):
             self._say("sink", f"the recording has ended: {error}")
 
     def _end(self, whole: Path | None) -> None:
-        """Have the file closed; `whole` is told once it is, None is told already."""
+        """Close the file in the thread and then report `whole`, which is None where an error was reported already."""
         sink, self._sink, self.path = self._sink, None, None
         if sink is not None:
             self._unwritten += sink.unwritten
             self._closing = self._aside.submit(sink.close), whole
 
     def _look_back(self) -> None:
-        """See what the thread has done meanwhile."""
+        """Take over what the thread has finished."""
         if self._opening is not None and self._opening.done():
             self._begin(self._opening)
         if self._closing is None or not self._closing[0].done():
@@ -149,7 +149,7 @@ class Recorder(Sink):
 
 
 def _unused(stem: Path) -> Path:
-    """A file of this name, or with a number behind it, that is not there yet."""
+    """Return a file name from this stem, with a number if needed, that does not exist yet."""
     path, count = stem.with_name(f"{stem.name}.{FORM}"), 1
     while path.exists():
         count += 1

@@ -1,7 +1,7 @@
-"""What a run was heard to say, for those who look now and then.
+"""Snapshot of a run for its viewers, who read it now and then.
 
-The loop writes and never waits; others read meanwhile. What is written is replaced as a whole or appended to a bounded
-deque, and a deque is copied in one step, so no reader sees half of anything, and no lock is needed.
+The loop writes and never waits; viewers read meanwhile. A value is replaced as a whole or appended to a bounded deque,
+and a deque is copied in one step, so no reader sees half of anything, and no lock is needed.
 """
 
 import time
@@ -15,17 +15,17 @@ from edge.pipeline.scan_rate import Rate
 
 TRACE_S: Final = 60.0
 TRACE_POINTS: Final = 1200
-"""Of the last TRACE_S: one in 50 ms, which a page some hundred pixels wide cannot tell from all."""
+"""Most points of the last TRACE_S: one in 50 ms, which on a page some hundred pixels wide looks like all of them."""
 RECENT_SCANS: Final = 256
 EVENTS: Final = 20
 _POINT_NS: Final = round(TRACE_S / TRACE_POINTS * 1e9)
 
 
 class Point(NamedTuple):
-    """What is drawn of one scan against time.
+    """Values of one scan that are drawn against time.
 
     Attributes:
-        number: of the results heard of its sensor, from 1.
+        number: of the sensor's results, from 1.
         time_ns: of the scan, in [ns].
         force_counts: or None.
         area_mm2: or None.
@@ -40,13 +40,13 @@ class Point(NamedTuple):
 
 
 class Newest(NamedTuple):
-    """The newest result of a sensor.
+    """Newest result of a sensor.
 
     Attributes:
-        number: of the results heard of this sensor, from 1.
+        number: of the sensor's results, from 1.
         result: as it came.
         counters: up to it.
-        heard_ns: when it was heard, in [ns].
+        heard_ns: time of its arrival, in [ns].
         rate_hz: smoothed rate of the sensor's scans; None before the second.
     """
 
@@ -58,13 +58,13 @@ class Newest(NamedTuple):
 
 
 class Told(NamedTuple):
-    """An event.
+    """Event with its number and time of arrival.
 
     Attributes:
-        number: of the events heard, from 1.
-        event: as it was told.
+        number: of the run's events, from 1.
+        event: as it came.
         counters: up to it.
-        heard_ns: when, in [ns].
+        heard_ns: time of its arrival, in [ns].
     """
 
     number: int
@@ -74,7 +74,7 @@ class Told(NamedTuple):
 
 
 class Heard:
-    """The newest of every sensor, a trace of each, and the latest events, in memory that does not grow with the run.
+    """Newest result and trace of every sensor, and the latest events, in memory that does not grow with the run.
 
     Attributes:
         newest: by sensor.
@@ -90,14 +90,14 @@ class Heard:
         self._told = 0
 
     def add(self, result: Result, counters: Mapping[str, int]) -> int:
-        """Take a result; returns the time it was heard at, in [ns]."""
+        """Add a result; returns the time of its arrival, in [ns]."""
         scan = result.scan
         if self.first_ns is None:
             self.first_ns = scan.time_ns
         trace = self._traces.get(scan.sensor)
         if trace is None:
             trace = _Trace()
-            # Replaced, not added to: who iterates over the one before is not disturbed.
+            # Replaced, not added to, so that a reader can iterate over the old one.
             self._traces = {**self._traces, scan.sensor: trace}
         trace.add(result)
         for event in result.events:
@@ -111,21 +111,21 @@ class Heard:
         return heard_ns
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Take an event."""
+        """Add an event."""
         self._told += 1
         self._events.append(Told(self._told, event, counters, self._clock_ns()))
 
     def events(self, since: int) -> list[Told]:
-        """The latest events behind number `since`."""
+        """Return the latest events after number `since`."""
         return [told for told in self._events.copy() if told.number > since]
 
     def points(self, sensor: str, since: int) -> list[Point]:
-        """What to draw of a sensor's scans behind number `since`: all, or if these are too many, one in 50 ms."""
+        """Return the points of a sensor after number `since`: all, or if these are too many, one in 50 ms."""
         return self._traces[sensor].points(since)
 
 
 class _Trace:
-    """Scans of one sensor against time."""
+    """Values of one sensor against time."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -143,7 +143,7 @@ class _Trace:
         if not past or time_ns // _POINT_NS != past[-1].time_ns // _POINT_NS:
             past.append(point)
         elif (result.force_counts or 0.0) > (past[-1].force_counts or 0.0):
-            past[-1] = point  # the highest of its 50 ms: a short touch is seen, too
+            past[-1] = point  # the highest of its 50 ms, so that a short tap is seen, too
 
     def points(self, since: int) -> list[Point]:
         recent = [point for point in self._recent.copy() if point.number > since]

@@ -1,6 +1,6 @@
-"""The live page's server: one thread, which sleeps until there is something to send and somebody who looks.
+"""Server of the live page: one thread, which sleeps until there is something to send and a viewer to send it to.
 
-What it does in one go is short, since the loop cannot run meanwhile: it packs a frame, and sends it.
+Each of its steps is short, since the loop cannot run meanwhile: it packs a frame, and sends it.
 """
 
 import asyncio
@@ -38,20 +38,20 @@ from firmware_bridge.links.base import SourceKind
 STATE_S: Final = 1.0
 TIDY_S: Final = 10.0
 TIDY_CONNECTIONS: Final = 64
-"""Before so many have left something behind, it is tidied without waiting for TIDY_S."""
+"""Number of lost connections that are tidied up at once, without waiting for TIDY_S."""
 OPEN_S: Final = 5.0
 CLOSE_S: Final = 1.0
 END_S: Final = 0.5
-"""For viewers to hear that the run has ended; nobody waits for one that does not read."""
+"""Longest wait for viewers to read that the run has ended, in [s]."""
 COMMAND_PAUSE_S: Final = 0.02
-"""Between two commands of a viewer: one that never stops asking must not keep the loop from its work."""
+"""Pause between two commands of a viewer, in [s], so that a viewer that never stops asking does not delay the loop."""
 
 
 class Server:
-    """Shows a run to whoever looks.
+    """Server that shows a run to its viewers.
 
     Attributes:
-        watched: somebody looks.
+        watched: True while there is a viewer.
         port: that it listens at.
     """
 
@@ -67,12 +67,12 @@ class Server:
         """Take the port; pages are answered from `begin` to `close`.
 
         Args:
-            heard: what to show.
-            commands: gets what viewers ask for.
-            access: who may look.
+            heard: store of what is shown.
+            commands: queue for the viewers' commands.
+            access: conditions that a request must meet.
             port: 0 for any free one.
-            recording: file that is recorded into, or None.
-            failed: is told why there is no page any more, from the server's thread.
+            recording: returns the file that is recorded into, or None.
+            failed: called with the reason when the page ends early, from the server's thread.
 
         Raises:
             SinkError: the page cannot be served there.
@@ -95,7 +95,7 @@ class Server:
         self._source: SourceKind | None = None
 
     def begin(self, run: Run) -> None:
-        """Answer pages and sockets; `run` is what they are told of it first."""
+        """Answer pages and sockets; `run` is the first that a viewer gets."""
         self._source = run.kind
         ready = threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(run, ready), name="live-view")
@@ -103,7 +103,7 @@ class Server:
         ready.wait()
 
     def close(self) -> None:
-        """Tell whoever looks that the run has ended, and give the port back."""
+        """Inform viewers that the run has ended, and free the port."""
         self._ending = True
         self.wake()
         if self._thread is not None:
@@ -111,21 +111,21 @@ class Server:
         self._socket.close()
 
     def wake(self) -> None:
-        """There is something new. Never waits."""
+        """Wake the server, because there is something new. Never waits."""
         loop = self._loop
         if loop is not None:
-            with contextlib.suppress(RuntimeError):  # it has ended, that moment
+            with contextlib.suppress(RuntimeError):  # it has ended at that moment
                 loop.call_soon_threadsafe(self._news.set)
 
     @property
     def viewers(self) -> int:
-        """How many look."""
+        """Number of viewers."""
         return len(self._viewers)
 
     def _serve(self, run: Run, ready: threading.Event) -> None:
         try:
             asyncio.run(self._show(run, ready))
-        finally:  # also of what nobody thought of, which ends this thread and no run
+        finally:  # also after an unforeseen error, which ends this thread and not the run
             self._loop, self.watched = None, False
             ready.set()
             if not self._ending:
@@ -142,7 +142,7 @@ class Server:
             sock=self._socket,
             process_request=self._answer,
             create_connection=Counted,
-            compression=None,  # a frame is made 25 times a second and read beside it
+            compression=None,  # it would cost time 25 times a second, for a reader close by
             server_header=None,
             open_timeout=OPEN_S,
             ping_interval=None,
@@ -174,7 +174,7 @@ class Server:
             self._loop.call_later(END_S, self._connections.abort)
 
     def _look_round(self) -> None:
-        """Have the time looked at when a first connection has gone, and tidy at once when many have."""
+        """Wake the server when a first connection has gone, to start its time, and when many have, to tidy at once."""
         if self._connections.gone in (1, TIDY_CONNECTIONS):
             self._news.set()
 
@@ -205,7 +205,7 @@ class Server:
                 self._news.set()
                 async for message in connection:
                     if connection.state is not State.OPEN:
-                        break  # what was asked before it closed may be much, and takes its time
+                        break  # many commands may wait from before it closed, and each takes its time
                     why = hear(message, attended.viewer, self._commands)
                     if why is not None:
                         broadcast([connection], refused(time.monotonic_ns(), why, self._source))
@@ -218,7 +218,7 @@ class Server:
 
 
 def _tidy() -> None:
-    """Collect what connections leave behind, since nobody else does while the loop runs."""
+    """Collect the garbage of lost connections, since the collector is off while the loop runs."""
     if not gc.isenabled():
         gc.collect()
 
@@ -227,7 +227,7 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listening = socket.create_server((str(address[0]), port), family=family)
-        # Handed down to connections: else a small frame behind another waits 40 ms for the first to be acknowledged.
+        # Inherited by connections: else a small frame waits 40 ms for the one before it to be acknowledged.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as error:

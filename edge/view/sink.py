@@ -1,4 +1,4 @@
-"""What the loop gives the live page: it is stored, and the server woken now and then."""
+"""Sink of the live page: it stores results and events, and wakes the server now and then."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -14,10 +14,10 @@ PERIOD_NS: Final = round(1e9 / MAX_FPS)
 
 
 class ViewSink(Sink):
-    """Stores, and never waits.
+    """Store of results and events that never waits.
 
-    The server is woken from here, behind a scan's last work and not by a clock of its own: it then runs while the loop
-    sleeps, and not in its way.
+    The server is woken from here, after a scan's last work and not by a clock of its own: so it runs while the loop
+    sleeps, and does not delay it.
     """
 
     def __init__(
@@ -30,9 +30,9 @@ class ViewSink(Sink):
         """Begin without a result.
 
         Args:
-            heard: stores.
-            watched: whether somebody looks.
-            wake: tells those who look that there is something new; never waits.
+            heard: store of results and events.
+            watched: returns True while there is a viewer.
+            wake: wakes the server, which has something new to send; never waits.
             clock_ns: monotonic, in [ns].
         """
         self._heard = heard
@@ -52,17 +52,17 @@ class ViewSink(Sink):
         self._news(self._clock_ns())
 
     def wait(self) -> None:
-        """Show what came last, now that nothing comes."""
+        """Show the newest result, once no scan follows it."""
         if self._unseen:
             self._news(self._clock_ns())
 
     def close(self) -> None:
-        """Nothing to finish."""
+        """Do nothing: there is nothing to finish."""
 
     def _news(self, now_ns: int) -> None:
         self._unseen = now_ns < self._due_ns
         if not self._unseen and self._watched():
-            # Every fourth of a hundred scans a second, though they come a little early or late.
+            # Every fourth of a hundred scans a second, even if they come a little early or late.
             behind = now_ns - self._due_ns < PERIOD_NS
             self._due_ns = (self._due_ns if behind else now_ns) + PERIOD_NS
             self._wake()

@@ -1,4 +1,4 @@
-"""The page as a browser is given it, and what the browser lets it do."""
+"""Static page as it is sent to a browser, with the policy that limits it."""
 
 import base64
 import hashlib
@@ -9,11 +9,11 @@ FOLDER: Final = Path(__file__).with_name("page")
 STYLE_LINK: Final = b'<link rel="stylesheet" href="page.css">'
 SCRIPT_LINK: Final = b'<script type="module" src="page.js"></script>'
 SCRIPTS: Final = ("words.js", "link.js", "traces.js", "marks.js", "sensor.js", "page.js")
-"""Joined in this order into one script, in which they see each other's names."""
+"""Files of the script in the order in which they are joined, so that they share one scope."""
 
 
 class Page(NamedTuple):
-    """An answer's headers and body."""
+    """Headers and body of an answer."""
 
     headers: tuple[tuple[str, str], ...]
     body: bytes
@@ -32,7 +32,7 @@ def load_page() -> Page:
         ("Cache-Control", "no-store"),
         ("X-Content-Type-Options", "nosniff"),
         ("Referrer-Policy", "no-referrer"),  # the address may hold the token
-        ("X-Frame-Options", "DENY"),  # or a stranger's page lets one press a button unseen
+        ("X-Frame-Options", "DENY"),  # or a stranger's page could make a user press a button unseen
     )
     return Page(headers, body)
 
@@ -43,7 +43,7 @@ def page_script() -> bytes:
 
 
 def _policy(script: bytes) -> str:
-    """Let the page run its own script, by its hash, and talk to this server."""
+    """Return a policy that lets the page run its own script, by its hash, and talk to this server."""
     digest = base64.b64encode(hashlib.sha256(script).digest()).decode()
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:; "

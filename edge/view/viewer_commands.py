@@ -1,4 +1,4 @@
-"""What viewers ask for: JSON as on stdin, and what belongs to the page alone."""
+"""Commands of viewers: JSON as on stdin, and commands that belong to the page alone."""
 
 import json
 from typing import Any, Final
@@ -14,7 +14,7 @@ FORMS: Final = (
 
 
 def hear(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
-    """Put what a viewer's message asks for; returns why it is refused, if it is."""
+    """Queue the command in a viewer's message; returns the reason if it is refused."""
     why = _hear(message, viewer, commands)
     if why is not None:
         commands.refuse()

@@ -1,4 +1,4 @@
-"""One viewer's connection, followed by pings: an answer says that all before it was read."""
+"""Connection of one viewer, checked by pings: an answer shows that the viewer has read everything before it."""
 
 import asyncio
 import contextlib
@@ -13,15 +13,15 @@ from edge.view.viewer_state import Viewer
 
 PING_S: Final = 0.25
 LATE_S: Final = 0.5
-"""Since a ping that a viewer has not answered: what lies on its way is old, and nothing is put behind it."""
+"""Age of an unanswered ping, in [s], from which nothing more is sent: the frames on their way are old already."""
 GONE_S: Final = 10.0
 
 
 class Attended:
-    """A viewer that is sent what it keeps up with.
+    """Connection that sends no more than its viewer keeps up with.
 
     Attributes:
-        viewer: what it has seen.
+        viewer: state of what it has seen.
     """
 
     def __init__(self, connection: ServerConnection) -> None:
@@ -31,13 +31,13 @@ class Attended:
         self._asked_s: float | None = None
 
     def send(self, frames: Frames, now_s: float) -> None:
-        """Send what is due, unless the viewer is behind."""
+        """Send what is due, unless the viewer is too slow."""
         if self._asked_s is None or now_s - self._asked_s < LATE_S:
             for frame in self.viewer.due(frames):
                 broadcast([self._connection], frame)
 
     async def follow(self) -> None:
-        """Ask again and again whether the viewer has read everything; end the connection of one that does not."""
+        """Ping the viewer again and again; end the connection of one that does not answer."""
         with contextlib.suppress(ConnectionClosed):
             while True:
                 self._asked_s = time.monotonic()
@@ -45,7 +45,7 @@ class Attended:
                     async with asyncio.timeout(GONE_S):
                         await (await self._connection.ping())
                 except TimeoutError:
-                    self._connection.transport.abort()  # to close it would wait until it has read
+                    self._connection.transport.abort()  # a regular close would wait for the viewer to read
                     return
                 self._asked_s = None
                 await asyncio.sleep(PING_S)

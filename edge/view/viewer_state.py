@@ -1,10 +1,10 @@
-"""What one viewer has seen, and is to be sent next. No I/O, no clock."""
+"""State of one viewer: what it has seen, and the frames that are due. No I/O, no clock."""
 
 from edge.view.frames import Frames
 
 
 class Viewer:
-    """One who looks; every frame is the newest there is, however long ago the one before was sent.
+    """Viewer of the page; every frame holds the newest values, however long ago the frame before was sent.
 
     Attributes:
         paused: no results meanwhile; events go on.
@@ -16,7 +16,7 @@ class Viewer:
         self._told = 0
 
     def due(self, frames: Frames) -> list[bytes]:
-        """What is new since the last call: events, and unless paused one frame a sensor."""
+        """Return the frames that are new since the last call: events, and unless paused one frame a sensor."""
         due: list[bytes] = []
         for number, frame in frames.events(self._told):
             self._told = number

@@ -1,7 +1,7 @@
-"""What edge-sr says as ROS 2 messages: of the usual types where there is one, of its own where there is none. No I/O.
+"""Encoding of results and events as ROS 2 messages, of the usual types where one fits, else of our own. No I/O.
 
 The texts of sensor_msgs, geometry_msgs, std_msgs, builtin_interfaces and rcl_interfaces are those of ROS 2's interface
-definitions (Apache-2.0), without their comments. What is not known is not made up: NaN stands where a number would.
+definitions (Apache-2.0), without their comments. A value that is not available is NaN, never made up.
 """
 
 import math
@@ -61,15 +61,15 @@ _LEVELS: Final[Mapping[EventKind, int]] = {
 
 
 def frame_of(result: Result) -> str:
-    """The frame_id of what is said of a sensor: its name, behind what it is where it is none, as in emulated/4."""
+    """Return the frame_id of a sensor: its name, after the kind of source where it is no device, as in emulated/4."""
     return result.scan.sensor if result.source == "device" else f"{result.source}/{result.scan.sensor}"
 
 
 def force_and_torque(result: Result) -> tuple[Vector, Vector] | None:
-    """Force on the pad in [N] and torque about its middle in [N m]; x to the right, y down, z into the pad.
+    """Return force on the pad in [N] and torque about its middle in [N m]; x to the right, y down, z into the pad.
 
-    All of it where the model gives traction. Else torques are NaN, and force is that which is known: our own
-    calibration is of z alone, so x and y are NaN, unless all of it is the vendor's; None where counts alone are known.
+    Force and torque are complete where the model gives traction. Else torques are NaN, and so are x and y of the force,
+    because our own calibration is of z alone; the vendor's force has all three. None where there are only counts.
     """
     if result.wrench is not None:
         x, y, z = result.wrench.torque_n_mm
@@ -82,7 +82,7 @@ def force_and_torque(result: Result) -> tuple[Vector, Vector] | None:
 
 
 def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
-    """A map (H, W) as an Image of encoding 32FC1, in the map's unit, x to the right and y down.
+    """Return a map (H, W) as an Image of encoding 32FC1, in the map's unit, x to the right and y down.
 
     A map (3, H, W) of vectors becomes one of 32FC3, with x, y, z of a pixel side by side.
     """
@@ -102,11 +102,11 @@ def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
 
 
 def image_map(data: bytes) -> NDArray[np.float32]:
-    """The map (H, W), or (3, H, W), in an Image that `image` made.
+    """Return the map (H, W), or (3, H, W), in an Image that `image` made.
 
     Raises:
         CdrError: it is no Image.
-        ValueError: it is one of another kind.
+        ValueError: the Image is of another encoding or byte order.
     """
     said = IMAGE.decode(data)
     if said["encoding"] not in ("32FC1", "32FC3") or said["is_bigendian"]:
@@ -118,7 +118,7 @@ def image_map(data: bytes) -> NDArray[np.float32]:
 
 
 def wrench(result: Result, unix_ns: int) -> bytes | None:
-    """Force on the pad and torque; None where force is not known in [N]."""
+    """Return force on the pad and torque as a message; None where the force is not available in [N]."""
     known = force_and_torque(result)
     if known is None:
         return None
@@ -128,7 +128,7 @@ def wrench(result: Result, unix_ns: int) -> bytes | None:
 
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
-    """A result without its maps; `record` is what edge.sinks.json_record says of it."""
+    """Return a result without its maps as a message; `record` is its record from edge.sinks.json_record."""
     values = dict(zip(_NAMES, _COLUMNS.flat(result), strict=True))
     values["header"] = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
     values["record"] = orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode()
@@ -136,7 +136,7 @@ def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> b
 
 
 def log_message(event: Event, unix_ns: int) -> bytes:
-    """An event as a line of ROS's log: `function` is its kind, `name` its sensor or "edge-sr"."""
+    """Return an event as a line of ROS's log: `function` is its kind, `name` its sensor or "edge-sr"."""
     return LOG.encode(
         {
             "stamp": stamp(unix_ns),

@@ -1,4 +1,4 @@
-"""The DDS domain that ROS 2 nodes of this machine and its network would meet in."""
+"""DDS domain in which the ROS 2 nodes of this machine and its network meet."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -11,18 +11,18 @@ from cyclonedds.domain import Domain, DomainParticipant
 from edge.errors import SinkError, UsageError
 
 LARGEST_DOMAIN: Final = 232
-"""Beyond it there are no ports left."""
+"""Largest domain number that still has ports."""
 _LOOPBACK: Final = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
-# Else each writer waits a second at its end for a reader that has stopped.
+# The default lets each writer wait a second at its end for a reader that has stopped.
 _QUICK_END: Final = "<Internal><WriterLingerDuration>100ms</WriterLingerDuration></Internal>"
 _OPEN: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 
 
 def domain_id(environment: Mapping[str, str]) -> int:
-    """ROS_DOMAIN_ID, 0 by default.
+    """Return ROS_DOMAIN_ID, 0 by default.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is not a valid domain number.
     """
     text = environment.get("ROS_DOMAIN_ID") or "0"
     if not (text.isascii() and text.isdigit() and int(text) <= LARGEST_DOMAIN):
@@ -31,10 +31,10 @@ def domain_id(environment: Mapping[str, str]) -> int:
 
 
 def configuration(environment: Mapping[str, str]) -> str:
-    """What Cyclone DDS is asked for, as ROS asks by the same variables; what CYCLONEDDS_URI says comes last, and wins.
+    """Return the configuration of Cyclone DDS, from the variables that ROS reads; CYCLONEDDS_URI comes last, and wins.
 
     Raises:
-        UsageError: nobody could ever hear us.
+        UsageError: discovery is switched off, so that no node could receive a message.
     """
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
@@ -46,7 +46,7 @@ def configuration(environment: Mapping[str, str]) -> str:
     elif environment.get("ROS_LOCALHOST_ONLY") == "1":
         general, peers = _LOOPBACK, []
     discovery = "".join(f"<Peer Address={quoteattr(peer)}/>" for peer in peers)
-    if peers:  # they are tried on the ports of so many participants of a machine, the number that ROS takes
+    if peers:  # peers are tried on the ports of so many participants of a machine, the number that ROS takes
         auto = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
         discovery = f"{auto}<Peers>{discovery}</Peers>"
     parts = f"<General>{general}</General><Discovery>{discovery}</Discovery>{_QUICK_END}"
@@ -55,13 +55,13 @@ def configuration(environment: Mapping[str, str]) -> str:
 
 
 def join(environment: Mapping[str, str]) -> tuple[Domain | None, DomainParticipant]:
-    """Take part in the domain, which is left as soon as nothing holds what is returned.
+    """Take part in the domain; it is left as soon as nothing holds the returned objects.
 
     Returns:
         The domain, None where this process had opened it by other means, and a participant.
 
     Raises:
-        UsageError: the environment asks for what cannot be.
+        UsageError: a variable of the environment has a value that cannot be used.
         SinkError: the domain cannot be joined.
     """
     number, wanted = domain_id(environment), configuration(environment)

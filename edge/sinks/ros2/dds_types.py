@@ -1,4 +1,4 @@
-"""The ROS 2 messages that are published, as DDS knows them: names, order and types are those of ROS's .msg files.
+"""ROS 2 messages as DDS types: names, order and types are those of ROS's .msg files.
 
 All are final, so that they are encoded as plain CDR.
 """
@@ -116,4 +116,4 @@ TYPE_HASHES: Final[dict[type[IdlStruct], str]] = {
     DiagnosticArray: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     String: "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
 }
-"""SHA-256 of each type's description, as ROS makes it (RIHS01); from Iron on ROS warns of publishers without."""
+"""SHA-256 of each type's description, as ROS makes it (RIHS01); from Iron on ROS warns of publishers without one."""

@@ -1,4 +1,4 @@
-"""How a sensor is, in the terms of ROS's diagnostics: a level, a line, and what is behind it."""
+"""State of a sensor in the terms of ROS's diagnostics: a level, a line of text, and values."""
 
 from collections.abc import Mapping
 from enum import IntEnum
@@ -12,7 +12,7 @@ _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten"
 
 
 class Level(IntEnum):
-    """As diagnostic_msgs/DiagnosticStatus numbers them."""
+    """Level of a status, numbered as in diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -21,11 +21,11 @@ class Level(IntEnum):
 
 
 class Diagnosis(NamedTuple):
-    """How a sensor is.
+    """State of a sensor.
 
     Attributes:
-        level: the worst that is known.
-        text: all that is wrong, or what state it is in.
+        level: the worst of all findings.
+        text: every finding, or the state of the result where there is no finding.
         values: by name, with their units in the names.
     """
 
@@ -37,14 +37,14 @@ class Diagnosis(NamedTuple):
 def diagnose(
     result: Result, counters: Mapping[str, int], before: Mapping[str, int], silence_s: float | None, trouble: str | None
 ) -> Diagnosis:
-    """How a sensor is.
+    """Return the state of a sensor.
 
     Args:
-        result: its last.
+        result: newest result of the sensor.
         counters: up to now, of the whole run.
-        before: the same a diagnosis ago; what was lost since is told.
-        silence_s: how long ago its last scan came, in [s]; None where scans are of another time.
-        trouble: what the link has said and not taken back.
+        before: counters at the previous diagnosis; losses since then are reported.
+        silence_s: time since its last scan, in [s]; None where scans are of another time.
+        trouble: what the link has reported and not withdrawn.
     """
     findings = list(_findings(result, silence_s, trouble))
     lost = {name: counters.get(name, 0) - before.get(name, 0) for name in _LOSSES}

@@ -41,7 +41,7 @@ from edge.sinks.ros2.topic_names import base_topic, sensor_topic
 
 DIAGNOSTICS_S: Final = 1.0
 _DIAGNOSTICS_TOPIC: Final = "diagnostics"
-"""ROS's tools listen there, whatever a robot is called."""
+"""Topic that ROS's tools subscribe to, independent of a robot's name."""
 _EVENTS_KEPT: Final = 100
 _UNKNOWN: Final = math.nan
 _VECTOR_UNKNOWN: Final = (_UNKNOWN, _UNKNOWN, _UNKNOWN)
@@ -51,12 +51,12 @@ _Message = TypeVar("_Message", bound=IdlStruct)
 
 @dataclass(slots=True)
 class _Sensor:
-    """What is published of one sensor, and what was said of it last.
+    """Writers of one sensor, and what they published last.
 
     Attributes:
         shown: writers whose last message was a map that still holds, and its shape.
         force_shown: the last wrench was a force that still holds.
-        trouble: what the link said of it and has not taken back, by the kind of event.
+        trouble: what the link has reported and not withdrawn, by the kind of event.
     """
 
     pattern: "DataWriter[Image]"
@@ -70,10 +70,10 @@ class _Sensor:
 
 
 class Ros2Sink(Sink):
-    """Publishes patterns, forces, diagnostics and events.
+    """Publisher of patterns, forces, diagnostics and events.
 
-    Writers are reliable, for the subscriptions that ROS makes by default take nothing less, but wait for nobody: of
-    each topic the newest message alone is kept for a reader that is behind.
+    Writers are reliable, because the subscriptions that ROS makes by default accept nothing less, but they never wait:
+    each topic keeps only its newest message for a slow reader.
     """
 
     def __init__(
@@ -89,15 +89,15 @@ class Ros2Sink(Sink):
         """Join the domain.
 
         Args:
-            topic: what all topics begin with, but that of the diagnostics.
+            topic: first part of all topics except that of the diagnostics.
             environment: ROS_DOMAIN_ID and others are read from it.
             unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
-            source: kind of what is read, told with every event.
+            source: kind of the source, published with every event.
             clock_ns: the clock of the scans that are of now, in [ns].
-            unix_ns: wall time, in [ns]; asked once, for it may be set meanwhile.
+            unix_ns: wall time, in [ns]; read once, because the clock may be set during the run.
 
         Raises:
-            UsageError: the topic, or the environment, is none of ROS.
+            UsageError: the topic, or the environment, is not valid in ROS.
             SinkError: the domain cannot be joined.
         """
         self._base = base_topic(topic)
@@ -115,10 +115,10 @@ class Ros2Sink(Sink):
         self._events = self._writer(f"{self._base}/events", String, _EVENTS_KEPT)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Publish one result: its pattern if it has one, its force in newtons if that is known.
+        """Publish one result: its pattern if it has one, and its force if that is available in newtons.
 
         Raises:
-            SinkError: it cannot be published.
+            SinkError: the result cannot be published.
         """
         sensor = self._sensors.get(result.scan.sensor)
         if sensor is None:
@@ -131,7 +131,7 @@ class Ros2Sink(Sink):
             self._show(sensor, sensor.pattern, time_ns, result.pattern)
             if result.deviation is not None:
                 self._show(sensor, sensor.deviation, time_ns, result.deviation)
-        elif result.state != "dropped":  # a newer scan, which has one, is already there
+        elif result.state != "dropped":  # a newer scan has already published a pattern
             self._withdraw(sensor, time_ns, 0.0 if result.contact is False else _UNKNOWN)
         force = force_and_torque(result)
         if force is not None:
@@ -143,7 +143,7 @@ class Ros2Sink(Sink):
         self._diagnose_if_due()
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Publish an event; what an outage makes unknown is said to be so."""
+        """Publish an event; values that an outage makes unknown are published as NaN."""
         self._counters = counters
         for name, sensor in self._sensors.items():
             if event.sensor not in (None, name):
@@ -158,16 +158,16 @@ class Ros2Sink(Sink):
         self._diagnose_if_due()
 
     def wait(self) -> None:
-        """Go on saying how the sensors are."""
+        """Publish the diagnostics while no scan comes."""
         self._diagnose_if_due()
 
     def close(self) -> None:
-        """Say that nothing more will come, and leave the domain."""
+        """Publish that the run has ended, and leave the domain."""
         for sensor in self._sensors.values():
             self._withdraw_all(sensor, self._now_ns())
         self._diagnose(ended=True)
         self._sensors.clear()
-        # Each goes when nothing holds it: the writers before the participant, the participant before its domain.
+        # Each is deleted with its last reference: writers before the participant, the participant before its domain.
         del self._diagnostics, self._events, self._participant, self._domain
 
     def _begin(self, result: Result) -> _Sensor:
@@ -216,14 +216,14 @@ class Ros2Sink(Sink):
         sensor.shown[writer] = values.shape
 
     def _withdraw(self, sensor: _Sensor, time_ns: int, pattern_value: float) -> None:
-        """Say once, where there were maps, that they hold no more."""
+        """Publish once, where there were maps, that they no longer hold."""
         for writer, shape in sensor.shown.items():
             value = pattern_value if writer is sensor.pattern else _UNKNOWN
             self._publish(writer, self._image(sensor, time_ns, np.full(shape, value, dtype=np.float32)))
         sensor.shown.clear()
 
     def _withdraw_force(self, sensor: _Sensor, time_ns: int) -> None:
-        """Say once, where there was a force, that it holds no more."""
+        """Publish once, where there was a force, that it no longer holds."""
         if sensor.force_shown:
             self._publish_wrench(sensor, time_ns, _VECTOR_UNKNOWN, _VECTOR_UNKNOWN)
             sensor.force_shown = False
@@ -259,7 +259,7 @@ class Ros2Sink(Sink):
         self._publish(self._diagnostics, DiagnosticArray(self._header(now_ns, ""), statuses))
 
     def _now_ns(self) -> int:
-        """By the clock of the scans; where that is of another time, when the last scan came."""
+        """Return the time on the scans' clock; where that is of another time, the time of the newest scan."""
         if self._of_now:
             return self._clock_ns()
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)

@@ -1,4 +1,4 @@
-"""Names that ROS 2 can hold, for topics that users and sensors name."""
+"""Valid ROS 2 names for topics that users and sensors name."""
 
 import re
 from typing import Final
@@ -6,17 +6,17 @@ from typing import Final
 from edge.errors import SinkError, UsageError
 
 LONGEST_TOPIC: Final = 247
-"""Of ROS; DDS takes 255, of which some are for prefixes."""
+"""Limit of ROS; DDS takes 255, some of which are for prefixes."""
 _ALLOWED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLAIN: Final = re.compile(r"(?!s[0-9])(?!x_)[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
 _FROM_DIGIT: Final = re.compile(r"[0-9][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
 
 
 def base_topic(text: str) -> str:
-    """A topic as a user writes it, without the slash that it may begin with.
+    """Return a topic as a user writes it, without a leading slash.
 
     Raises:
-        UsageError: ROS cannot hold it.
+        UsageError: it is no valid topic of ROS.
     """
     topic = text.removeprefix("/")
     if not all(_ALLOWED.fullmatch(token) for token in topic.split("/")):
@@ -28,19 +28,19 @@ def base_topic(text: str) -> str:
 
 
 def sensor_path(sensor: str) -> str:
-    """The part of a topic that stands for a sensor; no two sensors share one.
+    """Return the part of a topic that stands for a sensor; no two sensors share one.
 
-    "4" becomes s4, "left/4" left/s4; what ROS cannot hold, or could be taken for another, becomes x_ and its UTF-8 in
-    hexadecimal digits.
+    "4" becomes s4, "left/4" left/s4; a name that is not valid in ROS, or could be taken for another, becomes x_ and its
+    UTF-8 in hexadecimal digits.
     """
     return "/".join(map(_token, sensor.split("/")))
 
 
 def sensor_topic(base: str, sensor: str, what: str) -> str:
-    """The topic of one thing that is published of a sensor.
+    """Return the topic of one thing that is published of a sensor.
 
     Raises:
-        SinkError: it is too long for ROS.
+        SinkError: the topic is too long for ROS.
     """
     topic = "/".join((base, sensor_path(sensor), what))
     if len(topic) >= LONGEST_TOPIC:

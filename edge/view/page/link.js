@@ -1,18 +1,18 @@
-// ---- What is kept between visits; a browser may refuse it ----
+// ---- Settings kept between visits; a browser may refuse to store them ----
 
 const memory = {
   get: (key) => { try { return localStorage.getItem(`edge-sr.${key}`); } catch { return null; } },
-  set: (key, value) => { try { localStorage.setItem(`edge-sr.${key}`, value); } catch { /* it is only forgotten */ } },
+  set: (key, value) => { try { localStorage.setItem(`edge-sr.${key}`, value); } catch { /* the setting is lost at the next visit, no more */ } },
 };
 
-/** The token opens the socket; it is kept for this tab's reloads, and not left in the address bar. */
+/** Return the token that opens the socket; it is stored for this tab's reloads and removed from the address bar. */
 function takeToken() {
   const address = new URL(location.href);
   const given = address.searchParams.get("token");
   try {
     if (given === null) return sessionStorage.getItem("edge-sr.token");
     sessionStorage.setItem("edge-sr.token", given);
-  } catch { /* a reload will need the whole address again */ }
+  } catch { /* without storage a reload needs the whole address again */ }
   if (given !== null) {
     address.searchParams.delete("token");
     history.replaceState(null, "", address);
@@ -22,7 +22,7 @@ function takeToken() {
 
 // ---- Frames ----
 
-/** A frame as the program packs it (edge/sinks/binary_message.py): {header, maps by name}. */
+/** Unpack a frame of the program (edge/sinks/binary_message.py): {header, maps by name}. */
 function unpack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -38,11 +38,11 @@ function unpack(buffer) {
 
 // ---- The link ----
 
-const SILENT_S = 2.5; // the program says something every second
+const SILENT_S = 2.5; // the program sends a frame every second
 const WAITS_S = [0.25, 0.5, 1, 2, 4];
 const VERSION = 1;
 const GOING_AWAY = 1001; // the run has ended
-const REFUSED = [403, 503]; // not who asks; not so many
+const REFUSED = [403, 503]; // access refused; too many viewers
 
 class Link {
   constructor({ onFrame, onChange }) {
@@ -68,7 +68,7 @@ class Link {
     if (socket !== this.socket || typeof data === "string") return;
     this.heardS = nowS();
     if (!this.up) {
-      this.up = true; // first of all: what hears the first frame may answer it
+      this.up = true; // set first, because the handler of the first frame may send an answer
       this.tries = 0;
       this.why = null;
       this.onChange();
@@ -89,19 +89,19 @@ class Link {
     this.onChange();
   }
 
-  /** Why a socket is refused only a plain request is told. */
+  /** Ask for the reason of a refused socket by a plain request: a browser does not show it for a socket. */
   async inquire() {
     let why = null;
     try {
       const answer = await fetch(this.path, { signal: AbortSignal.timeout(1000 * SILENT_S) });
       if (REFUSED.includes(answer.status)) why = (await answer.text()).trim();
-    } catch { /* nobody answers */ }
+    } catch { /* no server answers */ }
     if (this.up || why === this.why) return;
     this.why = why;
     this.onChange();
   }
 
-  /** A program that says nothing is gone, whatever the socket believes. */
+  /** Drop a silent socket: a program that sends nothing is gone, even if the socket still looks open. */
   look() {
     if (this.socket === null || nowS() - this.heardS < SILENT_S) return;
     const socket = this.socket;

@@ -1,6 +1,6 @@
 // ---- Marks on maps ----
 
-/** A path in one ink over a wider one, so that it is seen on any ground. */
+/** Draw a path in one ink over a wider one, so that it is visible on any background. */
 function haloed(context, [ink, halo], width, path) {
   for (const [strokeStyle, lineWidth] of [[halo, width + 2], [ink, width]]) {
     Object.assign(context, { strokeStyle, lineWidth });
@@ -36,7 +36,7 @@ function arrow(context, ink, x, y, dx, dy) {
   context.fill();
 }
 
-/** A taxel that is not believed is covered, not only marked: its colour says nothing. */
+/** Cover a taxel that is left out, rather than only mark it: its colour means nothing. */
 function cross(context, width, height, rows, cols, taxel) {
   const [w, h] = [width / cols, height / rows];
   const [x, y] = [(taxel % cols) * w, Math.floor(taxel / cols) * h];
@@ -61,7 +61,7 @@ function thumb(tap) {
   return item;
 }
 
-// ---- What a sensor shows ----
+// ---- Numbers of a sensor ----
 
 const NUMBERS = {
   Touch: [
@@ -84,7 +84,7 @@ const LEAST_SHEAR_COUNTS = 100;
 const LEAST_MM = 0.02;
 const LEAST_DEVIATION_MM = 0.01;
 const FRESH_S = 0.3;
-const SHEAR_SHARE = 0.4; // of the pattern's width, the arrow of a force that is all shear
+const SHEAR_SHARE = 0.4; // length of the arrow of a force that is all shear, as a share of the pattern's width
 
 function wrenchTexts({ wrench, wrench_origin: origin }) {
   const list = (values, decimals, unit) => (values ? `${values.map((value) => number(value, decimals)).join(", ")}${THIN}${unit}` : "\u2013");

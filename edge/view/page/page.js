@@ -1,4 +1,4 @@
-// ---- Painting: only what changed, only when it can be seen ----
+// ---- Painting: only changes, only while the page is visible ----
 
 const painter = {
   asked: 0,
@@ -20,19 +20,19 @@ const painter = {
 
 const MOST_LINES = 100;
 const COUNTED = ["reset", "zeroing", "in_contact", "given_up", "rest_level"]; // events that differ by numbers alone
-const REFUSAL_S = 10; // so long a refusal is shown, and may be forced
+const REFUSAL_S = 10; // time for which a refusal is shown, and may be forced
 
 const page = {
   hello: null,
   sensors: new Map(),
   state: { recording: false },
-  told: 0, // number of the run's latest event that was told here
+  told: 0, // number of the run's latest event that is in the log
   paused: false,
   pausedS: 0,
   auto: memory.get("scale") === "auto",
   spanS: memory.get("span") === "60" ? 60 : 10,
-  asked: null, // what this page asked to zero last: {sensor, or undefined for all; untilS}
-  forcible: new Set(), // sensors of which that was refused, while it may be forced
+  asked: null, // latest request of this page to zero: {sensor, or undefined for all; untilS}
+  forcible: new Set(), // sensors whose zeroing was refused, while it may be forced
   refusalTimer: 0,
   lostS: null,
   link: null,
@@ -40,7 +40,7 @@ const page = {
 
 function announce(text) { say(byId("live"), text); }
 
-/** One more line; one of the same key as the line before is counted, since it may differ by its numbers alone. */
+/** Add a line; one of the same key as the line before is counted instead, since only its numbers may differ. */
 function log(what, { key = what, bad = false, ageS = 0 } = {}) {
   const list = byId("log");
   const clock = new Date(Date.now() - 1000 * ageS).toLocaleTimeString();
@@ -111,7 +111,7 @@ function titleText(source) {
   return `${mark}${page.link.up ? [...new Set(words)].join(", ") || "waiting" : lostWord()} \u2013 edge-sr`;
 }
 
-// ---- What comes ----
+// ---- Frames from the program ----
 
 const hear = {
   hello(header) {
@@ -126,12 +126,12 @@ const hear = {
   result(header, maps) {
     if (page.hello === null) return;
     const sensor = sensorOf(header.sensor);
-    if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the program heard of the pause, and not again
+    if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the pause reached the program, and not again
     else sensor.hear(header, maps);
   },
   event({ note, event, sensor, number, age_s = 0 }) {
-    if (number <= page.told) return; // a newcomer is told the latest again, and after a reconnect this page is one
-    page.told = number ?? page.told; // the answer to this page alone has none
+    if (number <= page.told) return; // a new connection, also a reconnect, gets the latest events again
+    page.told = number ?? page.told; // the answer to this page alone has no number
     const refused = ["refused", "in_contact", "given_up"].includes(event);
     const key = COUNTED.includes(event) ? `${event} ${sensor}` : note;
     log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink"].includes(event), ageS: age_s });
@@ -148,11 +148,11 @@ const hear = {
   },
 };
 
-/** What was refused is told where it is seen; where a touched sensor is why, this page may force what it asked for, by another button and only for a while. */
+/** Show a refusal where it is seen at once; if a touched sensor is the reason, this page may force its own request, by another button and for a limited time. */
 function refuse(text, touchedSensor) {
   const { asked, forcible } = page;
   if (touchedSensor !== null && asked !== null && nowS() < asked.untilS && (asked.sensor ?? touchedSensor) === touchedSensor) forcible.add(touchedSensor);
-  else if (forcible.size > 0) return; // what stands there is to be decided; the log has this one, too
+  else if (forcible.size > 0) return; // the user has to decide on the refusal shown; the log has this one, too
   clearTimeout(page.refusalTimer);
   page.refusalTimer = setTimeout(forgetRefusal, 1000 * REFUSAL_S);
   const touched = [...forcible].map((name) => `sensor ${name} is in contact`);
@@ -181,7 +181,7 @@ function sensorOf(name) {
   return page.sensors.get(name);
 }
 
-/** Nothing that was seen of one run, and nothing that was stopped to look at, is of the next. */
+/** Forget the sensors, the pause and the events of a run: they do not belong to the next. */
 function forgetRun() {
   for (const sensor of page.sensors.values()) sensor.remove();
   page.sensors.clear();
@@ -191,7 +191,7 @@ function forgetRun() {
   log("another run has begun");
 }
 
-// ---- What is done ----
+// ---- Commands ----
 
 function command(what) {
   const sent = page.link.send(what);
@@ -235,15 +235,15 @@ const KEYS = { z: "zero", "shift z": "force", r: "reset", "shift r": "record", "
 
 function pressed(event) {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || byId("manual").open) return;
-  if (event.key === " " && event.target instanceof HTMLButtonElement) return; // it presses that button
-  const letter = event.key.toLowerCase(); // whatever Caps Lock makes of it
+  if (event.key === " " && event.target instanceof HTMLButtonElement) return; // the space bar presses that button
+  const letter = event.key.toLowerCase(); // independent of Caps Lock
   const action = KEYS[event.shiftKey && letter !== "?" ? `shift ${letter}` : letter];
   if (action === undefined) return;
   event.preventDefault();
   act[action]();
 }
 
-// ---- Beginning ----
+// ---- Start ----
 
 page.link = new Link({
   onFrame({ header, maps }) {
@@ -269,7 +269,7 @@ for (const id of ["zero", "force", "reset", "record", "pause", "scale", "help"])
 document.addEventListener("keydown", pressed);
 document.addEventListener("visibilitychange", () => { page.link.hurry(); painter.all(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => painter.all());
-// Ages and waits are the only things that move without news.
+// Only ages and waits change without a new frame.
 setInterval(() => {
   page.link.look();
   const moving = !page.link.up || page.paused || [...page.sensors.values()].some((sensor) => !sensor.live());

@@ -61,7 +61,7 @@ class Sensor {
     this.root.remove();
   }
 
-  // -- what comes --
+  // -- frames --
 
   hear(header, maps) {
     const first = this.said === null;
@@ -78,13 +78,13 @@ class Sensor {
       this.touched = header;
       this.highest = largest(maps.pattern.values, this.highest);
     } else if (header.baseline === null) {
-      this.pattern = this.deviation = null; // before a baseline nothing that was seen means anything
+      this.pattern = this.deviation = null; // no earlier pattern is valid without a baseline
     }
     this.tellNotes(header, first);
     this.dirty = true;
   }
 
-  /** Notes whose numbers alone change are told once; a step in rest level is an event besides. */
+  /** Log notes once if only their numbers change; a step in rest level is an event of its own. */
   tellNotes({ note, note_kinds = [], dead }, first) {
     const told = note_kinds.filter((kind) => kind !== "rest_level");
     const kinds = told.length === 0 ? "" : JSON.stringify([told, dead]);
@@ -137,16 +137,16 @@ class Sensor {
     return `${place}: ${amount(this.pattern.values[at], 3, unit)}${doubt}${this.live() ? "" : ", not live"}`;
   }
 
-  // -- how it stands --
+  // -- state --
 
   unit() { return this.said?.pattern_unit || this.hello.pattern_unit || "mm"; }
 
   ageS() { return nowS() - this.heardS; }
 
-  /** No word from the sensor: the program says so, or what it last said has become old. */
+  /** True if the sensor is silent: the program reports it, or the newest result is old. */
   away() { return this.silentS !== null || (this.said !== null && this.ageS() > 1); }
 
-  /** The pattern shown is of the newest scan here; one that was overtaken keeps the pattern before for a moment. */
+  /** True if the pattern shown is of the newest scan; after a dropped scan the pattern before stays for a moment. */
   newest() {
     if (this.pattern === null) return false;
     return this.touchedS === this.heardS || (this.said.state === "dropped" && this.heardS - this.touchedS < FRESH_S);
@@ -154,10 +154,10 @@ class Sensor {
 
   live() { return this.newest() && page.link.up && !this.away() && !page.paused; }
 
-  /** To be shown in grey; what a person stopped to look at keeps its colours, under a word that says so. */
+  /** True if the pattern is shown in grey; while paused it keeps its colours, and the state shows "paused". */
   old() { return this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest()); }
 
-  /** What was said of the pattern that is shown, if it is live; else what was said last. */
+  /** Return the result of the pattern shown if that is the newest; else the newest result. */
   made() { return this.newest() ? this.touched : this.said; }
 
   word() {

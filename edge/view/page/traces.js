@@ -1,11 +1,11 @@
 // ---- Traces ----
 
 const LONGEST_S = 60;
-const STEP_S = 0.01; // closer scans share a point: the stronger one
+const STEP_S = 0.01; // closer scans share a point, which keeps the larger value
 const GAP_S = 0.3;
 const POINTS = Math.ceil(1.1 * LONGEST_S / STEP_S);
 
-/** The last minute of force and area, in a ring. */
+/** Ring buffer of the last minute of force and area. */
 class Trace {
   constructor() {
     this.time = new Float64Array(POINTS);
@@ -15,14 +15,14 @@ class Trace {
     this.heldS = null;
   }
 
-  /** While held nothing newer is shown, nor joins what is; it is kept for later. */
+  /** Hold the trace: newer points are stored for later, but not shown, nor merged with those shown. */
   hold(on) { this.heldS = on ? this.newestS : null; }
 
   get endS() { return this.heldS ?? this.newestS; }
 
   add(points) {
     for (const [atS, ...values] of points) {
-      if (atS < this.newestS || (this.heldS !== null && atS <= this.heldS)) continue; // a newcomer is sent the last minute again
+      if (atS < this.newestS || (this.heldS !== null && atS <= this.heldS)) continue; // a new connection gets the last minute again
       const same = this.count > 0 && this.newestS !== this.heldS && atS - this.newestS < 0.5 * STEP_S;
       const place = same ? (this.next + POINTS - 1) % POINTS : this.next;
       Object.values(this.series).forEach((series, which) => {
@@ -36,7 +36,7 @@ class Trace {
     }
   }
 
-  /** Calls visit(time, value) for each point of the last `spanS` seconds, oldest first. */
+  /** Call visit(time, value) for each point of the last `spanS` seconds, oldest first. */
   each(name, spanS, visit) {
     const [series, endS] = [this.series[name], this.endS];
     for (let back = this.count; back > 0; back--) {
@@ -47,7 +47,7 @@ class Trace {
   }
 }
 
-/** Size of a canvas in device pixels, told by the browser rather than asked for, which would cost a layout. */
+/** Observer of the sizes of canvases, in device pixels; to query a size would cost a layout. */
 const sizes = new ResizeObserver((entries) => {
   for (const { target, contentRect } of entries) {
     const ratio = window.devicePixelRatio;
@@ -103,7 +103,7 @@ function paintTrace(canvas, trace, name, spanS, least, ink, unit) {
   paintLine(context, trace, name, spanS, x, y, ink);
 }
 
-/** A line through all points; those that fall on one column are one stroke from the least to the largest. */
+/** Draw a line through all points; those on one column are one stroke from the least to the largest. */
 function paintLine(context, trace, name, spanS, x, y, ink) {
   context.strokeStyle = ink;
   context.lineWidth = 1.6;

@@ -1,4 +1,4 @@
-// ---- Colours: few stops of maps that grow steadily lighter, and read the same to the colour-blind ----
+// ---- Colours: a few stops of maps that grow steadily lighter, and are readable for the colour-blind ----
 
 const STOPS = {
   viridis: "440154 482878 3e4989 31688e 26828e 1f9e89 35b779 6ece58 b5de2b fde725",
@@ -7,7 +7,7 @@ const STOPS = {
 };
 const LEVELS = 256;
 
-/** 256 colours, red green blue one behind the other. */
+/** Return 256 colours, as red, green and blue one after the other. */
 function colourTable(name) {
   const stops = STOPS[name].split(" ").map((hex) => [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16)));
   const table = new Uint8ClampedArray(3 * LEVELS);
@@ -28,7 +28,7 @@ const MAGMA = colourTable("magma");
 
 const level = (value, high) => Math.max(0, Math.min(LEVELS - 1, Math.round((value / high) * (LEVELS - 1))));
 
-/** One canvas pixel for each value; the style sheet makes it large. */
+/** Paint one canvas pixel for each value; the style sheet enlarges the canvas. */
 function paintMap(canvas, values, rows, cols, high, table) {
   if (canvas.width !== cols || canvas.height !== rows) [canvas.width, canvas.height] = [cols, rows];
   const context = canvas.getContext("2d");
@@ -54,7 +54,7 @@ const MINUS = "\u2212";
 const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
 const number = (value, digits = 0) => value.toFixed(digits).replace(/^-(?=.*[1-9])/, MINUS).replace(/^-/, "");
 const amount = (value, digits, unit) => (known(value) ? `${number(value, digits)}${THIN}${unit}` : "\u2013");
-/** A pattern has more pixels than a call may have arguments. */
+/** Return the largest value; Math.max would get more arguments than a call may have. */
 function largest(values, least = 0) {
   let most = least;
   for (const value of values) if (value > most) most = value;
@@ -63,7 +63,7 @@ function largest(values, least = 0) {
 
 const short = (value) => String(Number(value.toPrecision(3))).replace("-", MINUS);
 
-/** The next number that is easily read off a scale. */
+/** Return the next larger number that is easy to read on a scale. */
 function roundUp(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return power * [1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((factor) => factor * power >= value * (1 - 1e-9));
