@@ -12,7 +12,7 @@ from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 
 LOOK_NS: Final = 500_000_000
-"""Between two looks at what sinks report: who reads them may need a moment to be found."""
+"""Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
 _UNWRITTEN: Final = attrgetter("unwritten")
 
 
@@ -57,11 +57,11 @@ class Fan(Sink):
         self._each(methodcaller("write", result, counters), counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Hand on one event; raises as `write` does."""
+        """Pass on one event; raises as `write` does."""
         self._each(methodcaller("tell", event, counters), counters)
 
     def wait(self) -> None:
-        """Hand on that nothing comes; raises as `write` does."""
+        """Pass on that no scan came; raises as `write` does."""
         self._each(methodcaller("wait"), self._counters)
 
     def close(self) -> None:

@@ -64,7 +64,7 @@ class JsonLinesSink(Sink):
         self._may_be_full = not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Write one record; of what sinks left out it tells its own reader's."""
+        """Write one record; its counter `unwritten` counts what was left out for this reader only."""
         self._write(record_line(result, {**counters, "unwritten": self.unwritten}))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:

@@ -59,7 +59,7 @@ class Recorder(Sink):
 
     @property
     def unwritten(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Records left out, of all recordings."""
+        """Number of records left out, of all recordings."""
         return self._unwritten + (0 if self._sink is None else self._sink.unwritten)
 
     def record(self, on: bool) -> None:
