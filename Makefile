@@ -16,11 +16,12 @@ test: $(VENV)/.dev  ## everything else, all tests; the soak, which mostly waits,
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak"; tests=$$?; \
 	wait $$soak && test $$tests = 0
 
-lint: $(VENV)/.dev  ## format, lint, types, import rules
+lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+	$(BIN)/python .ci/plain_english.py
 
 docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
