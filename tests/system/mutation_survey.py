@@ -69,7 +69,9 @@ SUBJECTS = {
     "assembler": Subject("firmware_bridge.scans.scan_assembler", ("tests/bridge/test_scan_assembler.py",)),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
     "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
-    "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
+    "drift": Subject(
+        "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
+    ),
     "contract": Subject("edge.inference.contract", ("tests/runtime/test_session.py", "tests/bridge/test_pad.py")),
 }
 
