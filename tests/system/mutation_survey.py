@@ -70,8 +70,10 @@ SUBJECTS = {
         "firmware_bridge.scans.scan_assembler",
         ("tests/bridge/test_scan_assembler_cycles.py", "tests/bridge/test_scan_assembler.py"),
     ),
-    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
-    "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
+    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_tap_numbers.py", "tests/runtime/test_taps.py")),
+    "baseline": Subject(
+        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline_limits.py", "tests/bridge/test_baseline.py")
+    ),
     "drift": Subject(
         "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
     ),
@@ -89,6 +91,11 @@ EQUIVALENT: dict[str, dict[str, str]] = {
         "fewest_missing: missing < fewest -> missing <= fewest": "the fewest is set to what it is",
         "_close: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
         "begin_anew: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
+    },
+    "baseline": {
+        "deformation: signed.min() >= -half -> signed.min() > -half": "the slower way gives the same",
+        "push: 0 -> 1": "what a silent taxel reads is the same in all scans, and its rest is NaN",
+        "save_baselines: 1 -> 2": "the blanks before a line of the file",
     },
     "drift": {
         "push: 1000000000.0 -> 1000000001.0": "seconds that are off by a billionth",
