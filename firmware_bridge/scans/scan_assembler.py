@@ -143,7 +143,6 @@ class _Sensor:
         self._last_place = geometry.taxel_count - 1
         self._begins_known = False
         self._half_before = False
-        self._opened_ns = 0
         self._newest_ns = 0
         self._device: DeviceTime | None = None
         self.counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)

@@ -102,20 +102,14 @@ class DriftTracker:
         self._baseline = baseline
         self._unzeroed = np.isnan(baseline.counts).any(axis=0)
         self._dead: NDArray[np.bool_] | None = None
-        self._live = ~self._unzeroed
-        self._all_live = bool(self._live.all())
         self._contact = False
-        self._resting = False
-        self._quiet_blocks = 0
-        self._followed = self.counts
         self._rate_per_s = np.zeros((len(AXES), 1, 1), dtype=np.float32)
-        self._level: NDArray[np.float32] | None = None
         self._step: NDArray[np.float32] | None = None
         self._voters: NDArray[np.bool_] | None = None
         self._cause = _ZEROED
         self._event: str | None = None
         self._block: list[NDArray[np.int32]] = []
-        self._last_ns = self._next_ns = self._start_ns = 0
+        self._last_ns = 0  # the first scan interrupts, which sets what is not here
 
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
         """Follow one scan.
@@ -129,10 +123,9 @@ class DriftTracker:
             Whether `counts`, `summary` or `note` have changed, or there is an event.
         """
         time_ns = scan.time_ns
-        if contact != self._contact or dead is not self._dead or not 0 <= time_ns - self._last_ns <= GAP_NS:
-            self._last_ns = time_ns
+        since_ns, self._last_ns = time_ns - self._last_ns, time_ns
+        if contact != self._contact or dead is not self._dead or not 0 <= since_ns <= GAP_NS:
             return self._interrupt(scan, contact, dead)
-        self._last_ns = time_ns
         if time_ns < self._next_ns:
             return False
         if scan.complete or bool((scan.fresh | dead).all()):
@@ -170,7 +163,8 @@ class DriftTracker:
         return self.note != before
 
     def _stop(self) -> None:
-        self._resting, self._quiet_blocks, self._level = False, 0, None
+        self._resting, self._quiet_blocks = False, 0
+        self._level: NDArray[np.float32] | None = None
         self._followed = self.counts  # what the last block added may have been the touch
         self._rate_per_s.fill(0)
 

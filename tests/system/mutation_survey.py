@@ -66,16 +66,42 @@ class Subject:
 SUBJECTS = {
     "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
     "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
-    "assembler": Subject("firmware_bridge.scans.scan_assembler", ("tests/bridge/test_scan_assembler.py",)),
-    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
-    "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
-    "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
+    "assembler": Subject(
+        "firmware_bridge.scans.scan_assembler",
+        ("tests/bridge/test_scan_assembler_cycles.py", "tests/bridge/test_scan_assembler.py"),
+    ),
+    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_tap_numbers.py", "tests/runtime/test_taps.py")),
+    "baseline": Subject(
+        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline_limits.py", "tests/bridge/test_baseline.py")
+    ),
+    "drift": Subject(
+        "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
+    ),
     "contract": Subject("edge.inference.contract", ("tests/runtime/test_session.py", "tests/bridge/test_pad.py")),
 }
 
 EQUIVALENT: dict[str, dict[str, str]] = {
     "gs_usb": {
         "_timings: tseg1 - prop_seg -> tseg1 + prop_seg": "sampled at three quarters or later, it is never the least",
+    },
+    "assembler": {
+        "awaits: return False -> return None": "its caller asks for nothing but whether it is true",
+        "awaits: self.wire.awaited = cycle -> pass": "it is found to be the same by its taxels, which takes longer",
+        "feed: place > self._place -> place >= self._place": "the place is set to what it is",
+        "fewest_missing: missing < fewest -> missing <= fewest": "the fewest is set to what it is",
+        "_close: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
+        "begin_anew: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
+    },
+    "baseline": {
+        "deformation: signed.min() >= -half -> signed.min() > -half": "the slower way gives the same",
+        "push: 0 -> 1": "what a silent taxel reads is the same in all scans, and its rest is NaN",
+        "save_baselines: 1 -> 2": "the blanks before a line of the file",
+    },
+    "drift": {
+        "push: 1000000000.0 -> 1000000001.0": "seconds that are off by a billionth",
+        "_settle: 0 -> 1": "one count of a taxel that is dead is below all thresholds, and is followed of none",
+        "_step_note: counts > 0 -> counts >= 0": "a step that is named has more than seven counts",
+        "_step_note: 0 -> 1": "a step that is named has more than seven counts",
     },
 }
 """Mutants by subject that behave as the code does, each with the reason; left out of the score."""
