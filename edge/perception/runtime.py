@@ -233,8 +233,7 @@ class Runtime:
         if sensor.counts_per_newton is not None:
             force_n = force_counts / sensor.counts_per_newton
         else:
-            vendor_force_n = None if scan.vendor is None else scan.vendor_force_n
-            force_n = None if vendor_force_n is None else vendor_force_n[2]
+            force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
         # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
         window = tap.window.copy() if tap.contact else None
         result = Result(
