@@ -210,7 +210,8 @@ class Runtime:
         filled = None if readings is None else readings.filled
         watch = sensor.watch
         taxel_notes = () if watch.sound else watch.notes(filled)
-        notes = (*taxel_notes, *sensor.zeroing_notes, *sensor.drift_notes, *_age_notes(scan))
+        age_notes = () if scan.time_ns - scan.not_before_ns <= OLD_NS else _age_notes(scan)
+        notes = (*taxel_notes, *sensor.zeroing_notes, *sensor.drift_notes, *age_notes)
         unit, dead = self._model.contract.output_unit, watch.reasons
         events = self._take_events(sensor, scan.time_ns) if self._events or sensor.events else ()
         known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "notes": notes, "events": events}
@@ -233,8 +234,7 @@ class Runtime:
         if sensor.counts_per_newton is not None:
             force_n = force_counts / sensor.counts_per_newton
         else:
-            vendor_force_n = None if scan.vendor is None else scan.vendor_force_n
-            force_n = None if vendor_force_n is None else vendor_force_n[2]
+            force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
         # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
         window = tap.window.copy() if tap.contact else None
         result = Result(

@@ -59,6 +59,8 @@ class Scan:
         not_before_ns: monotonic time before which none of its readings was taken, as far as is known, in [ns]. By the
             device's time stamps, or by when the link was last found empty: the first reading after an opening sets the
             device's clock, and seems new where nobody read it for long.
+        vendor_force_n: force x, y, z on the pad in [N], by the vendor; None where it is not told, or holds for old
+            readings.
     """
 
     sensor: str
@@ -74,6 +76,7 @@ class Scan:
     whole: bool = field(init=False, repr=False, compare=False)
     on_bus_ns: int = field(init=False, repr=False, compare=False)
     not_before_ns: int = field(init=False, repr=False, compare=False)
+    vendor_force_n: tuple[float, float, float] | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         # Found once: reader, perception and statistics all ask. On sixteen taxels numpy's all() costs ten times what
@@ -83,6 +86,9 @@ class Scan:
         find(self, "whole", False not in self.renewed.tobytes())
         find(self, "on_bus_ns", self.time_ns if self.device_ns is None else self.device_ns)
         find(self, "not_before_ns", min(self.on_bus_ns, since_ns))
+        newtons = None if self.vendor is None or not self.complete else self.vendor.newtons
+        force_n = None if newtons is None else tuple(newtons.reshape(3, -1).sum(axis=1).tolist())
+        find(self, "vendor_force_n", force_n)
 
     @property
     def torn(self) -> bool:
@@ -94,14 +100,6 @@ class Scan:
     def repeated(self) -> bool:
         """Every taxel arrived and none is new."""
         return self.complete and True not in self.renewed.tobytes()
-
-    @property
-    def vendor_force_n(self) -> tuple[float, float, float] | None:
-        """Force x, y, z on the pad in [N], by the vendor; None where it is not told, or holds for old readings."""
-        if self.vendor is None or self.vendor.newtons is None or not self.complete:
-            return None
-        x, y, z = self.vendor.newtons.reshape(3, -1).sum(axis=1).tolist()
-        return x, y, z
 
 
 class ScanSeries:

@@ -152,7 +152,7 @@ def main() -> int:
     modules = Counter[str]()
     for name, count in together.items():
         modules[_module(name)] += count
-    for name, count in sorted(together.items()):
+    for name, count in sorted(together.items(), key=lambda called: (-called[1], called[0])):
         print(f"{count:4d} {name}")
     print(
         f"\n{together.total()} calls in {len(modules)} modules at a pressed scan, of {len(trace.scans)}: "
