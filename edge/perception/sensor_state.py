@@ -1,4 +1,4 @@
-"""What is remembered of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
+"""State of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
 
 import time
 from collections.abc import Callable, Hashable
@@ -26,19 +26,19 @@ from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
 
 
 class Sensor:
-    """What is remembered of one sensor.
+    """State of one sensor between scans.
 
     Attributes:
-        baseline: subtracted from the scans, drift and all; None before there is one.
-        drift: what has become of the rest level since it was zeroed; None without a baseline.
-        zeroing_notes: why there is no baseline yet, or how a zeroing on demand stands.
-        drift_notes: what the user should know of the rest level.
-        counts_per_newton: summed z per [N], if that is known.
-        pad: what is known of it.
-        pad_row: the same as the model takes it.
-        gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
-        wrench_origin: whether the model is told the counts per newton.
-        events: what has happened to the zeroing since the last scan; the reader clears them.
+        baseline: subtracted from the scans, including drift; None before there is one.
+        drift: change of the rest level since it was zeroed; None without a baseline.
+        zeroing_notes: why there is no baseline yet, or the progress of a zeroing on demand.
+        drift_notes: remarks for the user on the rest level.
+        counts_per_newton: summed z per [N]; None if unknown.
+        pad: properties of the pad; None if unknown.
+        pad_row: the same as model input.
+        gains: (3, rows, cols) by which readings are divided for the model; None if it takes them undivided.
+        wrench_origin: "calibrated" if the model takes counts per newton and they are available.
+        events: events of the zeroing since the last scan; the reader clears them.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Sensor:
         self.taps_that_matter = TapsThatMatter()
         self.last_reading = LastReading(geometry.scan_shape)
         self.last: Result | None = None
-        # Plain attributes: a property of each would cost a scan at rest a twentieth.
+        # Plain attributes, since properties would make a scan at rest take a twentieth longer.
         self.baseline: Baseline | None = None
         self.drift: Drift | None = None
         self.zeroing_notes = notes
@@ -80,7 +80,7 @@ class Sensor:
         self._tracker: DriftTracker | None = None
 
     def take_pad(self, contract: Contract) -> None:
-        """Make what is known of the pad ready for a model, once for all its runs."""
+        """Convert the pad's properties to model input, once for all its runs."""
         pad = self.pad
         if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
             pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
@@ -93,12 +93,12 @@ class Sensor:
         self.wrench_origin = "calibrated" if told and takes else "nominal"
 
     def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
-        """Subtract this from now on.
+        """Subtract a baseline from now on.
 
         Args:
             baseline: of this sensor.
-            age_s: how old it was at `time_ns`, in [s]; None where that is not known.
-            time_ns: on the clock of the scans, in [ns]; ages go by it, since a wall clock may be set.
+            age_s: its age at `time_ns`, in [s]; None if unknown.
+            time_ns: on the clock of the scans, in [ns]; ages follow it, since a wall clock may be set.
         """
         self.baseline = self._taken = baseline
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
@@ -106,19 +106,19 @@ class Sensor:
         self.drift, self.drift_notes = self._tracker.summary, ()
 
     def age_s(self, time_ns: int) -> float | None:
-        """How old the baseline is, in [s]; None where that is not known."""
+        """Return the age of the baseline, in [s]; None if unknown."""
         return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
 
     def keep(self, made: Result, newest: NDArray[np.float32], made_by: Hashable) -> None:
-        """Remember the last pattern, the reading (3, rows, cols) that it was made from, and what made it."""
+        """Remember the last pattern, the reading (3, rows, cols) that it was made from, and the key of its input."""
         self.last = made
         self.last_reading.keep(newest, made_by)
         self.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
 
     def lose_touch(self) -> None:
-        """Readings and taps from before are worth nothing: the sensor was not heard for a time.
+        """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
 
-        Drift is followed again once the pad has been at rest, and its rest level compared with the one before.
+        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one.
         """
         self.taps.reset()
         self.last = None
@@ -131,7 +131,7 @@ class Sensor:
             self._report("given_up", "the sensor was away; ask again")
 
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
-        """The newest reading of every taxel over the baseline (3, rows, cols); None without a baseline."""
+        """Take a scan and return each taxel's newest reading over the baseline (3, rows, cols); None without one."""
         if self._heard_ns is not None and scan.time_ns - self._heard_ns > TAPS_FORGOTTEN_NS:
             self.lose_touch()
         self._heard_ns = scan.time_ns
@@ -146,11 +146,11 @@ class Sensor:
         return None if self.baseline is None else deformation(self.watch.held, self.baseline, self._mounting)
 
     def fill(self, zeroed: NDArray[np.float32]) -> Readings | None:
-        """Readings with something for the dead taxels; None where none is dead, or too many are."""
+        """Return readings with estimates for the dead taxels; None if no taxel is dead, or too many are."""
         return self._filler(zeroed) if self._filler is not None and self.watch.may_be_estimated else None
 
     def follow_drift(self, scan: Scan, contact: bool) -> None:
-        """Let the rest level follow what a free pad reads; the next scan is the first to know."""
+        """Let the rest level follow the readings of a free pad; it applies from the next scan on."""
         tracker, taken = self._tracker, self._taken
         if tracker is None or taken is None or not tracker.push(scan, contact, self.watch.dead):
             return
@@ -163,7 +163,7 @@ class Sensor:
             self._report("rest_level", event)
 
     def zero_again(self, *, force: bool) -> None:
-        """Take a new baseline from the next scans; the old one stays in use until then. An event tells what came of it.
+        """Take a new baseline from the next scans, with an event for the outcome; the old one stays in use until then.
 
         Args:
             force: also in contact.
@@ -181,8 +181,9 @@ class Sensor:
         return self.taps.contact and not (self._tracker is not None and self._tracker.doubted)
 
     def _bury(self) -> None:
-        """Get ready to fill in for other dead taxels than before."""
-        # What a taxel read before it was found out is in earlier taps; and no tap may be filled in unsaid.
+        """Prepare the estimate of the dead taxels after their set has changed."""
+        # Earlier taps hold what a taxel read before it was detected; and no tap may hold estimates that no note
+        # reports.
         self.taps.reset()
         self._filler = None
         dead = np.count_nonzero(self.watch.dead)
@@ -190,7 +191,7 @@ class Sensor:
             self._filler = self._estimator.filler(self.watch.dead)
 
     def _zero(self, scan: Scan) -> None:
-        """Use the scan for the baseline; a refusal becomes a note, and zeroing starts over."""
+        """Use the scan for the baseline; after a refusal a note reports it and zeroing starts over."""
         try:
             baseline = self._zeroing.push(scan, self._silent())
         except BaselineRefusedError as refusal:
@@ -201,7 +202,7 @@ class Sensor:
             self.zeroing_notes = ()
 
     def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> bool:
-        """Whether there is a new baseline."""
+        """Push a scan to a zeroing on demand and return whether it gave a new baseline."""
         try:
             baseline = rezeroing.push(scan, self._touched, self._silent())
         except BaselineRefusedError as refusal:
@@ -215,7 +216,7 @@ class Sensor:
         self._report("zeroed", f"baseline {baseline.id}{old}")
         self._end_rezeroing()
         self.use(baseline, 0.0, scan.time_ns)
-        self.taps.reset()  # earlier taps were read over another rest level
+        self.taps.reset()  # earlier taps were zeroed with another rest level
         return True
 
     def _end_rezeroing(self) -> None:
