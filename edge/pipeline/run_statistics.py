@@ -16,7 +16,7 @@ SHORTEST_NS: Final = 50_000_000
 STAGES: Final = ("zeroing", "incomplete", "idle", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 LONGEST_US: Final = 2.0**26
-"""Longest run time that is told apart, about a minute; longer ones count as this long."""
+"""Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
 
 
 class Histogram:
