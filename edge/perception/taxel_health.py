@@ -135,8 +135,8 @@ class TaxelWatch:
                 zeroed = self._mounting.correct(zeroed)
             np.abs(zeroed, out=self._size)
             largest = float(self._size.max())
-            # Without contact, near its rest, no taxel is far or at an end that is not its rest. In contact every taxel
-            # has to be inside the range and not far, as a taxel that has wrapped round is.
+            # Near rest, without contact, no taxel is far or at an end that is not its rest. In contact every taxel must
+            # be inside the range, and not far as one is that has wrapped round.
             if largest <= NEAR_END_COUNTS or (
                 RANGE_ENDS[0] < scan.counts.min() <= scan.counts.max() < RANGE_ENDS[1]
                 and not self._may_be_far(zeroed, largest)

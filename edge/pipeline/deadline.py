@@ -6,7 +6,7 @@ from typing import Final
 
 REMEMBERED_INTERVALS: Final = 31
 FEWEST_INTERVALS: Final = 5
-"""Intervals from which the period is taken."""
+"""Fewest intervals that give a period."""
 BURST_SHARE: Final = 8
 """Divisor of the period: scans nearer to each other than an eighth of it were held up. Bursts of all sixteen frames,
 16 ms apart, are further apart."""

@@ -74,5 +74,5 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
                 for sink in sinks:
                     sink.write(result, known)
         finally:
-            counters()  # the records that the last ones left out belong to the run, too
+            counters()  # records that were left out last belong to the run, too
             statistics.sink_trouble = "; ".join(sink.trouble for sink in sinks if sink.trouble is not None) or None
