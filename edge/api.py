@@ -5,7 +5,7 @@
             print(result.force_counts)
 
 A source reads in a thread of its own; everything else happens in the thread that iterates, which must also be the one
-that makes the runtime. Every wrong argument raises a BridgeError or an EdgeError with one clear line.
+that makes the runtime. A request that cannot be met raises a BridgeError or an EdgeError with one clear line.
 
 `edge-sr` opens, runs, records, replays and zeroes through this module alone. Its doctor watches and evaluates as
 `examine` does and additionally asks a person for presses; its bench and its live page use inner modules.
