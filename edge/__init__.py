@@ -2,6 +2,7 @@
 
 import os
 
-# From 1.29 on onnxruntime sends telemetry from Linux, beginning with its import: an identifier and an upload queue in
-# ~/.cache, two threads. Only then it asks for this variable. A robot's controller sends nothing unless its owner wants.
+# From 1.29 on onnxruntime sends telemetry from Linux as soon as it is imported: it keeps an identifier and an upload
+# queue in ~/.cache and starts two threads. It reads this variable only then. A robot's controller sends nothing unless
+# its owner wants it to.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -1,9 +1,9 @@
-"""`edge-sr` as a program: until what it does listens for Ctrl-C, that ends it at once and without a traceback."""
+"""`edge-sr` as a program; Ctrl-C ends it at once and without a traceback until the command handles it itself."""
 
 import signal
 import sys
 
-if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started it wants it ignored
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the parent process wants it ignored
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from edge.cli.main import main

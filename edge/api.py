@@ -4,11 +4,11 @@
         for result in Stream(source, open_runtime("stsr-int8", source)):
             print(result.force_counts)
 
-A source reads in a thread of its own; everything else happens in the thread that iterates, which is the one to make the
-runtime in. Whatever is wrong with what was asked for is a BridgeError or an EdgeError with one clear line.
+A source reads in a thread of its own; everything else happens in the thread that iterates, which must also be the one
+that makes the runtime. A request that cannot be met raises a BridgeError or an EdgeError with one clear line.
 
-`edge-sr` opens, runs, records, replays and zeroes with nothing else. Its doctor watches and judges as `examine` does,
-and asks a person for presses beside; its bench and its live page look inside.
+`edge-sr` opens, runs, records, replays and zeroes through this module alone. Its doctor watches and evaluates as
+`examine` does and additionally asks a person for presses; its bench and its live page use inner modules.
 """
 
 import math
@@ -71,7 +71,8 @@ if TYPE_CHECKING:
     from edge.inference.onnx_session import ModelSession
     from firmware_bridge.links.discovery import Found
 
-# What only some need, onnxruntime before all, is imported where it is needed: start-up time and memory are promises.
+# Modules that only some callers need, above all onnxruntime, are imported on use: start-up time and memory are
+# promised.
 
 __all__ = [
     "DEFAULT_MODEL",
@@ -144,26 +145,27 @@ def open_source(
     give_up_s: float = math.inf,
     force: bool = False,
 ) -> Source:
-    """A source of scans, opened and closed by a with statement; what is lost meanwhile is opened again.
+    """Return a source of scans for a with statement; it reopens links that are lost while it is open.
 
     Args:
-        texts: what `edge-sr --source` takes: "slcan:serial=D30BL366", "replay:FILE", "demo", ...; several with names,
+        texts: the forms of `edge-sr --source`: "slcan:serial=D30BL366", "replay:FILE", "demo", ...; several with names,
             "left=slcan:...". Without any, the adapter of the sensor file, or the one that is plugged in.
-        sensor: file that `edge-sr doctor` wrote. How its sensors sit, their baselines, their counts per newton and
-            their pads hold for every runtime of this source; it goes before what a recording tells.
-        id_map: which CAN id is which taxel, one of ID_MAPS, and with it which pad; or a map of your own, as `layout_c`
-            makes one of a geometry.
-        rate_hz: plays a recording at this rate; of a device, what its patterns' deadlines are by, in [Hz].
-        give_up_s: how long a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
-        force: use a sensor file of an emulated sensor on a device, which is refused else when the source is opened.
+        sensor: file that `edge-sr doctor` wrote. The mountings, baselines, counts per newton and pads in it hold for
+            every runtime of this source and take precedence over those in a recording.
+        id_map: assignment of CAN ids to taxels, and with it the pad: one of ID_MAPS, or a map of your own, as
+            `layout_c` makes one of a geometry.
+        rate_hz: rate at which a recording is played; for a device, the rate that sets the deadlines of its patterns,
+            in [Hz].
+        give_up_s: longest time that a lost or silent source may be away, in [s]; at 0 its loss is an error at once.
+        force: use a sensor file of an emulated sensor on a device, which opening the source refuses otherwise.
 
     Raises:
-        SourceError: no such form, one name twice, or sources of several kinds.
-        NoDeviceError: no adapter, or several, and none was named.
-        RecordingError: a recording that cannot be used.
-        SensorFileError: a sensor file that cannot be used.
-        UsageError: no such id map, or it is not that of the sensor file; a rate or a time that cannot be; a source
-            that is no text.
+        SourceError: the form does not exist, a name occurs twice, or the sources are of several kinds.
+        NoDeviceError: there is no adapter, or there are several and none was named.
+        RecordingError: the recording cannot be used.
+        SensorFileError: the sensor file cannot be used.
+        UsageError: the id map does not exist or is not that of the sensor file; the rate or the time is out of range;
+            a source is not a text.
     """
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
@@ -175,16 +177,16 @@ def open_source(
 
 
 def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
-    """A model ready to run, and what it is for, its contract; do it in the thread that is to run it.
+    """Load a model and its contract; call it in the thread that will run the model.
 
     Args:
         model: a file, or the name of a bundled one.
-        threads: that share the work of one run.
-        stop: gives up early.
+        threads: number of threads that share the work of one run.
+        stop: event that ends the loading early.
 
     Raises:
-        ModelError: no such model, or one that cannot be used; the bundled ones, or what is wrong, are named.
-        UsageError: a number of threads that cannot be.
+        ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.
+        UsageError: the number of threads is out of range.
     """
     check_whole("threads", threads, 1)
     from edge.inference.onnx_session import ModelSession
@@ -201,24 +203,24 @@ def choose_model(
     stop: threading.Event | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> "ModelSession | None":
-    """Load the model of least error whose run time on this machine is within a budget: `edge-sr --budget-us`.
+    """Load the most accurate model whose run time on this machine is within a budget, as `edge-sr --budget-us` does.
 
     Run times are measured here and kept for later starts.
 
     Args:
-        model: the best that may be used: a file, or the name of a bundled one.
+        model: the best model that may be used: a file, or the name of a bundled one.
         budget_us: longest run time of a pattern, in [us].
-        rate_hz: of the sensor, in [Hz]; 100 unless given.
-        recalibrate: measure again although run times are kept.
-        stop: gives up early.
-        tell: receives, a line each, what is measured, what is wrong and what was chosen.
+        rate_hz: rate of the sensor, in [Hz]; 100 by default.
+        recalibrate: measure again although stored run times exist.
+        stop: event that ends the measurement early.
+        tell: called with one line each about what is measured, what is wrong and which model was chosen.
 
     Returns:
         The model, or None if it was stopped.
 
     Raises:
-        ModelError: the model cannot be used, or its contract lacks its error.
-        UsageError: a budget or a rate that cannot be.
+        ModelError: the model cannot be used, or its contract does not state its error.
+        UsageError: the budget or the rate is out of range.
     """
     check_positive("budget_us", budget_us)
     if rate_hz is not None:
@@ -251,34 +253,34 @@ def open_runtime(
     every_tap: bool = False,
     follow_drift: bool = True,
 ) -> Runtime:
-    """What makes results of a source's scans; its defaults are those of `edge-sr`.
+    """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
 
     Args:
-        model: name of a bundled one, a file, or one that `load_model` gave.
-        source: open.
-        baselines: stored ones, or their file; they go before those of the source's sensor file. A sensor without one is
-            zeroed from its first 100 scans, its pad still and free meanwhile.
-        counts_per_newton: summed z per [N], of all sensors or by name; by default as the sensor file says. A name that
-            is never heard is told as an event.
-        pad: what is known of the pad of all sensors, or of each by name, for models that take any of it; by default as
-            the sensor file says.
+        model: name of a bundled one, a file, or a model that `load_model` returned.
+        source: open source of the scans.
+        baselines: stored ones, or their file; they take precedence over those of the source's sensor file. A sensor
+            without one is zeroed from its first 100 scans, during which its pad must be still and free.
+        counts_per_newton: summed z per [N], of all sensors or by name; by default as in the sensor file. A name from
+            which no scan arrives is reported as an event.
+        pad: properties of the pad of all sensors, or of each by name, for models that use them; by default as in the
+            sensor file.
         contact_on_counts: summed z at which a tap begins.
         contact_off_counts: summed z at which it ends.
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
-        every_scan: infer also where nothing has changed since the pattern before.
-        every_tap: use also taps that are not expected to help.
-        follow_drift: let the rest level follow what a free pad reads.
+        every_scan: infer also where nothing has changed since the last pattern.
+        every_tap: use also taps that are not expected to reduce the error.
+        follow_drift: let the rest level follow the readings of a free pad.
 
     Raises:
-        ModelError: no such model, one that cannot be used, or of another sensor.
-        RecordingError: the baseline file cannot be used, or is of another order than the sensor file's.
-        UsageError: the source is not open; a baseline of another grid; a number that cannot be.
+        ModelError: the model does not exist, cannot be used, or is for another sensor.
+        RecordingError: the baseline file cannot be used, or its taxel order is not that of the sensor file.
+        UsageError: the source is not open; a baseline is of another grid; a number is out of range.
     """
     kind, known = source.kind, source.sensor_file
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
         source=kind,
-        # What dead taxels are estimated by was fitted on presses of this pad alone.
+        # The estimator of dead taxels was fitted on presses of this pad alone.
         estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if known.geometry == USPA44 else None,
         geometry=known.geometry,
         baselines=references(baselines, known),
@@ -300,21 +302,22 @@ def open_recording(
     paced: bool = False,
     rate_hz: float | None = None,
 ) -> Source:
-    """A recording as a source, to make its results anew: `edge-sr replay`.
+    """Open a recording as a source, to compute its results again as `edge-sr replay` does.
 
-    Every scan gets its result however slow the loop is, of the time when it was made. What was in use then is known of
-    its sensors: how they sat, and their baselines.
+    Every scan gets a result however slow the loop is, with the time at which it was recorded. The mountings and
+    baselines that were in use then are used again.
 
     Args:
         path: .mcap, .npz or .csv.
-        sensor: file that `edge-sr doctor` wrote, instead of what was recorded.
-        zero: zero from the first 100 scans, instead of the baselines of then.
-        paced: at the speed it was made, as if it were now; a loop that is too slow loses scans, as with a sensor.
-        rate_hz: scans a second of each sensor, in [Hz]: where the file does not tell, or to play it faster or slower.
+        sensor: file that `edge-sr doctor` wrote, used instead of the recorded settings.
+        zero: zero from the first 100 scans, instead of using the recorded baselines.
+        paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
+        rate_hz: scans a second of each sensor, in [Hz]: where the file does not state it, or to play it faster or
+            slower.
 
     Raises:
         RecordingError: the recording cannot be used.
-        SourceError: its rate is not known, or cannot be.
+        SourceError: its rate is unknown or out of range.
         SensorFileError: the sensor file cannot be used.
     """
     from edge.pipeline import replay_setup as recordings
@@ -323,16 +326,16 @@ def open_recording(
 
 
 def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.Event | None = None) -> Sink:
-    """Where results go, as `edge-sr --sink` names it; close it when the last is written.
+    """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
     Args:
         text: "jsonl:FILE", "npz:FILE.npz", "mcap:FILE.mcap", ...
-        contract: of the model that makes the results.
-        source: open. Of a sensor, records are left out for readers that are too slow; of a recording none is.
-        stop: set when the run is to end: then nothing waits for a reader of a recording's records, either.
+        contract: contract of the model that makes the results.
+        source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
+        stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
 
     Raises:
-        UsageError: no such form; the forms are listed. Or the source is not open.
+        UsageError: the form does not exist (the message lists the forms), or the source is not open.
         SinkError: it cannot be opened.
     """
     return forms.open_sink(
@@ -349,7 +352,7 @@ def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.
 
 
 def devices() -> "tuple[list[Found], list[str]]":
-    """What is plugged in and what is in its way; and what could not be looked at, and why. Opens nothing."""
+    """List what is plugged in with what prevents its use, and what could not be examined and why; opens nothing."""
     from firmware_bridge.links import discovery as devices
 
     return devices.devices()
@@ -364,20 +367,20 @@ def examine(
     duration_s: float = 60.0,
     stop: threading.Event | None = None,
 ) -> "list[Finding]":
-    """Watch free, still pads and say what is wrong with sensor and adapter, as `edge-sr doctor` does without a person.
+    """Watch free, still pads and report faults of sensor and adapter, as `edge-sr doctor` does without a person.
 
     Args:
-        texts: as of `open_source`, but one at most; nothing else may read it meanwhile.
-        sensor: as of `open_source`.
-        id_map: as of `open_source`.
-        rate_hz: to be expected of each sensor, in [Hz].
+        texts: as for `open_source`, but at most one; no other program may read it meanwhile.
+        sensor: as for `open_source`.
+        id_map: as for `open_source`.
+        rate_hz: expected rate of each sensor, in [Hz].
         baselines: of the free pads, or their file; by default those of the sensor file.
         duration_s: how long to watch, in [s].
-        stop: ends it early.
+        stop: event that ends it early.
 
     Raises:
-        BridgeError: as of `open_source`; LinkLostError if the link is lost meanwhile.
-        UsageError: as of `open_source`; several sources, baselines or a duration that cannot be.
+        BridgeError: as for `open_source`; LinkLostError if the link is lost meanwhile.
+        UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
     """
     from edge.doctor.examine import examine as judge
     from edge.doctor.watch import Watch

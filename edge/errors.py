@@ -2,11 +2,11 @@
 
 EdgeError
 +-- ModelError (ValueError)   a model that is missing, unreadable or breaks the contract
-+-- WindowError (ValueError)  an input that cannot be inferred from: shape, type, not finite
-+-- UsageError (ValueError)   what the caller asked for cannot be done as asked
-+-- MessageError (ValueError) bytes that are no packed message
++-- WindowError (ValueError)  an input that cannot be inferred from: wrong shape or type, or not finite
++-- UsageError (ValueError)   a request of the caller that cannot be met
++-- MessageError (ValueError) bytes that are not a packed message
 +-- SinkError (OSError)       a sink that cannot be opened or written
-    +-- SinkClosedError       whoever read the sink has gone
+    +-- SinkClosedError       the reader of the sink has gone
 """
 
 
@@ -23,11 +23,11 @@ class WindowError(EdgeError, ValueError):
 
 
 class UsageError(EdgeError, ValueError):
-    """What the caller asked for cannot be done as asked."""
+    """A request of the caller that cannot be met."""
 
 
 class MessageError(EdgeError, ValueError):
-    """Bytes that are no packed message."""
+    """Bytes that are not a packed message."""
 
 
 class SinkError(EdgeError, OSError):
@@ -35,4 +35,4 @@ class SinkError(EdgeError, OSError):
 
 
 class SinkClosedError(SinkError):
-    """Whoever read the sink has gone: an ordinary end."""
+    """A sink whose reader has gone, which is an ordinary end."""

@@ -1,4 +1,4 @@
-"""What a caller of the library asked for, refused in one line where it cannot be."""
+"""Checks of the arguments that a caller of the library passes; each refuses in one line."""
 
 import math
 from collections.abc import Mapping
@@ -13,20 +13,20 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 
 def check_positive(name: str, number: Any) -> None:
-    """A finite number above 0, called `name`.
+    """Check that the value called `name` is a finite number above 0.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is not.
     """
     if not isinstance(number, Real) or not 0 < float(number) < math.inf:
         raise UsageError(f"{name} is {number!r}, expected a positive number")
 
 
 def check_whole(name: str, number: Any, least: int, most: float = math.inf) -> None:
-    """A whole number from `least` to `most`, called `name`.
+    """Check that the value called `name` is a whole number from `least` to `most`.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is not.
     """
     if not isinstance(number, Integral) or not least <= int(number) <= most:
         to = "" if most == math.inf else f" to {most:.0f}"
@@ -34,10 +34,10 @@ def check_whole(name: str, number: Any, least: int, most: float = math.inf) -> N
 
 
 def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
-    """Baselines by the names of their sensors, of one grid.
+    """Check that baselines are given by sensor name and are of one grid.
 
     Raises:
-        UsageError: they are none, or of another grid.
+        UsageError: they are not baselines, or of another grid.
     """
     if not isinstance(baselines, Mapping):
         raise UsageError(
@@ -52,10 +52,10 @@ def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
 
 
 def check_pads(pads: Any, geometry: SensorGeometry) -> None:
-    """A pad of all sensors, or pads by the names of theirs, or None; their gains of one grid.
+    """Check that pads are one for all sensors, one by each sensor name, or None, with gains of one grid.
 
     Raises:
-        UsageError: it is none of these.
+        UsageError: they are none of these.
     """
     if isinstance(pads, Mapping):
         for name, pad in pads.items():
@@ -77,10 +77,10 @@ def _check_gains(name: str, pad: Pad, geometry: SensorGeometry) -> None:
 
 
 def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry) -> None:
-    """Mountings by the names of their sensors, of one grid.
+    """Check that mountings, by sensor name, are of one grid.
 
     Raises:
-        UsageError: one is of another number of taxels.
+        UsageError: a mounting has another number of taxels.
     """
     for name, mounting in mountings.items():
         if mounting.taxel_count != geometry.taxel_count:

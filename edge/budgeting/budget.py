@@ -1,4 +1,4 @@
-"""`--budget-us`: calibrate a model and its alternatives on this machine, and choose the one that fits the budget."""
+"""`--budget-us`: calibrate a model and its alternatives on this machine, and choose one that fits the budget."""
 
 import threading
 from collections.abc import Callable
@@ -16,7 +16,8 @@ from edge.perception.result import age_text
 
 USUAL_RATE_HZ: Final = 100.0
 UNEVEN: Final = 3.0
-"""99th percentile over median, 1.2 to 1.4 on a quiet machine. What a busy one gives holds for now, not for months."""
+"""Ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine. Figures of a busy
+one hold now, but not for months."""
 
 
 def choose_model(
@@ -32,19 +33,19 @@ def choose_model(
     """Load a model and its alternatives, and return the one that run times measured on this machine choose.
 
     Args:
-        model: file of the one asked for.
+        model: file of the requested model.
         budget_us: longest run time of a pattern, in [us].
-        rate_hz: of the sensor, in [Hz].
-        cache: file that run times are kept in; None keeps nothing.
-        recalibrate: measure again although run times are kept.
-        stop: gives up early.
-        tell: receives, a line each, what is measured, what is wrong and what was chosen.
+        rate_hz: rate of the sensor, in [Hz].
+        cache: file of stored run times; None stores nothing.
+        recalibrate: measure again although stored run times exist.
+        stop: event that ends the measurement early.
+        tell: called with one line each about what is measured, what is wrong and which model was chosen.
 
     Returns:
         The loaded model, or None if it was stopped.
 
     Raises:
-        ModelError: the model cannot be used, or its contract lacks its error.
+        ModelError: the model cannot be used, or its contract does not state its error.
     """
     sessions = candidate_sessions(model, tell, stop)
     kept = CalibrationCache(cache, rate_hz)
@@ -75,13 +76,13 @@ def choose_model(
 def candidate_sessions(
     model: Path, tell: Callable[[str], object], stop: threading.Event | None = None
 ) -> dict[Path, ModelSession]:
-    """A model and all that may stand in for it, by file: patterns of the same meaning, no more taps, error known.
+    """Load a model and all that may replace it, by file: patterns of one meaning, no more taps, a stated error.
 
-    A model in integers was asked for to save time, so float32 does not stand in for it. What lies beside a file as its
-    integers and does not fit is told; among the bundled ones most do not.
+    An int8 model was requested to save time, so float32 does not replace it. An int8 file next to a model's file that
+    does not fit is reported; of the bundled models most do not fit.
 
     Raises:
-        ModelError: the model cannot be used, or does not tell its error.
+        ModelError: the model cannot be used, or does not state its error.
     """
     asked = ModelSession(model, stop=stop)
     _psnr_db(asked)
@@ -102,7 +103,7 @@ def candidate_sessions(
 
 
 def _misfit(session: ModelSession, asked: ModelSession) -> str | None:
-    """Why one does not stand in for the other, told or raised; None if it does."""
+    """Return or raise the reason why a model cannot replace the requested one; None if it can."""
     contract, wanted = session.contract, asked.contract
     contract.check_stands_in(wanted)
     if contract.taps > wanted.taps:
@@ -120,7 +121,7 @@ def _candidate(session: ModelSession, run_time: RunTime) -> Candidate:
 
 
 def _psnr_db(session: ModelSession) -> float:
-    """On the frozen test set with all taps given, in [dB]."""
+    """Return the PSNR on the frozen test set with all taps in the window, in [dB]."""
     taps, errors = session.contract.taps, session.contract.test_error
     psnr_db = errors.get(str(taps), {}).get("psnr_db")
     if not is_number(psnr_db):

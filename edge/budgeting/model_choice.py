@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Model that may run, and its cost on this machine.
+    """Model that may run, with its error and its cost on this machine.
 
     Attributes:
         name: of the model.
-        psnr_db: on the frozen test set with all its taps given, in [dB].
+        psnr_db: on the frozen test set with all its taps in the window, in [dB].
         p50_us: median run time at the sensor's rate, in [us].
         p99_us: 99th percentile of the same, in [us].
     """
@@ -30,7 +30,7 @@ class Choice:
 
     Attributes:
         name: of the model.
-        fits: False where no model fits, and the fastest was taken.
+        fits: False if no model fits, and the fastest was taken.
         why: the reason in one line.
     """
 
@@ -40,7 +40,7 @@ class Choice:
 
 
 def choose(candidates: Iterable[Candidate], budget_us: float) -> Choice:
-    """Choose the candidate of least error whose 99th percentile is within the budget, else the fastest by its median.
+    """Choose the candidate of least error whose 99th percentile is within the budget, else the one of least median.
 
     Args:
         candidates: at least one.
@@ -54,7 +54,7 @@ def choose(candidates: Iterable[Candidate], budget_us: float) -> Choice:
         raise ValueError("no candidates, expected at least one")
     best = max(candidates, key=_merit)
     fitting = [candidate for candidate in candidates if candidate.p99_us <= budget_us]
-    # By the median: one hiccup of a shared host in a short calibration makes a 99th percentile.
+    # The median, since one hiccup of a shared host in a short calibration decides a 99th percentile.
     chosen = max(fitting, key=_merit) if fitting else min(candidates, key=lambda one: (one.p50_us, -one.psnr_db))
     if not fitting:
         why = f"no model fits, {chosen} is the fastest of {len(candidates)}: patterns will be late"

@@ -1,4 +1,4 @@
-"""Calibrated run times, kept from one run to the next: for this machine, these versions and this model file only."""
+"""Calibrated run times, stored for later runs: for this machine, these versions and this model file only."""
 
 import hashlib
 import importlib.metadata
@@ -20,27 +20,27 @@ from firmware_bridge.in_place import write_in_place
 
 FILE_NAME: Final = "calibration.json"
 MOST_FILE_BYTES: Final = 1 << 20
-"""A model takes 200."""
+"""Largest file; the entry of a model takes 200 bytes."""
 MOST: Final = 1e12
-"""In [us] or [s]: no figure here can be more."""
+"""Limit of every figure, in [us] or [s]."""
 CPU_KEYS: Final = ("model name", "CPU implementer", "CPU part")
-"""Of /proc/cpuinfo; the first on x86, the others on ARM."""
+"""Keys of /proc/cpuinfo; the first on x86, the others on ARM."""
 
 
 class CalibrationCache:
-    """Run times by model file, in one JSON file. What goes wrong with it costs a calibration, never the run.
+    """Store of run times by model file, in one JSON file; a fault of it costs a calibration, never the run.
 
     Attributes:
-        notes: what went wrong, a line each.
+        notes: faults, a line each.
     """
 
     def __init__(self, path: Path | None, rate_hz: float, unix_time_s: Callable[[], float] = time.time) -> None:
-        """Read it.
+        """Read the stored run times.
 
         Args:
-            path: of the file; None keeps nothing.
-            rate_hz: at which run times are taken, in [Hz].
-            unix_time_s: tells when.
+            path: of the file; None stores nothing.
+            rate_hz: rate at which run times are measured, in [Hz].
+            unix_time_s: returns the time of an entry, in [s] since 1970.
         """
         self.notes: list[str] = []
         self._path = path
@@ -51,7 +51,7 @@ class CalibrationCache:
         self._entries = self._read()
 
     def find(self, model: Path) -> tuple[RunTime, float] | None:
-        """What was kept of a model file, and its age in [s]; None where there is nothing, or nothing that can be.
+        """Return the stored run time of a model file, and its age in [s]; None if there is no usable one.
 
         Raises:
             OSError: the model file cannot be read.
@@ -66,7 +66,7 @@ class CalibrationCache:
         return RunTime(p50_us, p99_us), max(self._unix_time_s() - unix_s, 0.0)
 
     def keep(self, run_times: Mapping[Path, RunTime]) -> None:
-        """Add run times by model file, and write if there are any.
+        """Add run times by model file, and write the file if there are any.
 
         Raises:
             OSError: a model file cannot be read.
@@ -79,7 +79,7 @@ class CalibrationCache:
         text = json.dumps(self._entries, indent=1)
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            # In place, so that another run never reads half of it.
+            # In place, so that another run never reads half a file.
             write_in_place(
                 self._path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), keep_before=False
             )
@@ -113,7 +113,7 @@ def _positive(entry: object, key: str) -> float | None:
 
 
 def cache_path(environment: Mapping[str, str] = os.environ) -> Path | None:
-    """Where run times are kept: below $XDG_CACHE_HOME, else ~/.cache; None without a home.
+    """Return the path of the stored run times: below $XDG_CACHE_HOME, else ~/.cache; None without a home.
 
     Source: XDG Base Directory Specification 0.8, by which a relative path is ignored.
     """
@@ -126,7 +126,7 @@ def cache_path(environment: Mapping[str, str] = os.environ) -> Path | None:
 
 
 def machine() -> dict[str, str | int | None]:
-    """What run times hang on beside the model: processor, cores, host and versions."""
+    """Return the facts that run times depend on, except the model: processor, cores, host and versions."""
     try:
         lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     except OSError:

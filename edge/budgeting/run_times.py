@@ -1,4 +1,4 @@
-"""Run times of models on this machine, each run at its tick as on a robot; a few seconds."""
+"""Run times of models on this machine, each run at its tick as on a robot; takes a few seconds."""
 
 import threading
 import time
@@ -14,22 +14,22 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.schedule import Clock, Ticker
 
 ROUNDS: Final = 3
-"""The models take turns: a bad second of a shared host is not one model's alone."""
+"""Rounds in which the models take turns, so that a bad second of a shared host does not fall on one model alone."""
 ROUND_TICKS: Final = 50
 LEAST_RATE_HZ: Final = 50.0
-"""Slower sensors are calibrated at this rate, or it would take too long."""
+"""Least rate of a calibration; slower sensors are calibrated at this one, or it would take too long."""
 SEED: Final = 1
 WINDOWS: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
 class RunTime:
-    """What a model takes at the sensor's rate.
+    """Run time of a model at the sensor's rate.
 
     Attributes:
         p50_us: median, in [us].
-        p99_us: the 149th of 150 in order, in [us]. It is over the true 99th percentile in 44 of 100 calibrations, the
-            longest of 150 would be in 78: whatever the distribution, no other of them is nearer to even.
+        p99_us: the 149th of 150 in order, in [us]. It exceeds the true 99th percentile in 44 of 100 calibrations, the
+            longest of 150 would in 78: whatever the distribution, no other of them is nearer to even.
     """
 
     p50_us: float
@@ -37,7 +37,7 @@ class RunTime:
 
     @classmethod
     def of(cls, took_us: NDArray[np.float64]) -> "RunTime":
-        """Summary of run times (n,) in [us]."""
+        """Summarise run times (n,) in [us]."""
         p50, p99 = np.percentile(took_us, [50, 99], method="inverted_cdf")
         return cls(float(p50), float(p99))
 
@@ -50,12 +50,12 @@ def calibrate(
     ticker_of: Callable[[float], Ticker] = Ticker,
     clock_ns: Clock = time.perf_counter_ns,
 ) -> list[RunTime] | None:
-    """Run time of each model, on seeded random windows: how long a run takes does not hang on what is in them.
+    """Measure the run time of each model on seeded random windows, since it does not depend on their values.
 
     Args:
-        models: to be run on this thread.
-        rate_hz: of the sensor, in [Hz].
-        stop: gives up early.
+        models: models to run on this thread.
+        rate_hz: rate of the sensor, in [Hz].
+        stop: event that ends the measurement early.
         ticker_of: makes the ticker of a rate.
         clock_ns: measures a run, in [ns].
 

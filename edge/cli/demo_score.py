@@ -1,4 +1,4 @@
-"""The demo's score: what the runtime made of a tap whose truth is known."""
+"""Score of the demo: the runtime's pattern of each tap against its truth."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ class TapScore:
 
     Attributes:
         tap: number of the tap, from 0.
-        angle_deg: at which the surface was tapped, in [deg].
-        result: the runtime's, at the peak frame.
+        angle_deg: angle at which the surface was tapped, in [deg].
+        result: result at the peak frame.
         truth: (H, W) in the model's output unit.
         psnr_db: in [dB].
         ssim: structural similarity, mean over Gaussian windows.
@@ -40,13 +40,13 @@ class TapScore:
 
 
 class DemoScore(Sink):
-    """Keeps of each tap the result with the largest force.
+    """Sink that keeps of each tap the result with the largest force.
 
-    A result finds its truth by its raw counts, not by its number: a lost scan shifts nothing.
+    A result is matched to its truth by its raw counts, not by its number: a lost scan shifts nothing.
 
     Attributes:
-        surface: that is tapped.
-        complete: the last tap is over.
+        surface: name of the tapped surface.
+        complete: True once the last tap is over.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class DemoScore(Sink):
         """Load the truth.
 
         Args:
-            recording: .npz that has besides `counts` (n, 3, rows, cols): `tap` (n,), -1 without
+            recording: .npz that has, in addition to `counts` (n, 3, rows, cols): `tap` (n,), -1 without
                 contact; `indentation_mm` (n,); `unit_patterns` (taps, H, W), the truth per
                 indentation; `angles_deg` (taps,); `surface`.
-            contract: of the model that is scored.
-            on_complete: called with this, once, when the last tap is over; what comes then is not scored.
+            contract: contract of the scored model.
+            on_complete: called with this, once, when the last tap is over; later results are not scored.
         """
         self._full_scale = contract.output_full_scale
         with np.load(recording, allow_pickle=False) as data:
@@ -77,7 +77,7 @@ class DemoScore(Sink):
 
     @property
     def taps(self) -> int:
-        """Taps that the recording holds."""
+        """Number of taps in the recording."""
         return len(self._angles_deg)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -96,10 +96,10 @@ class DemoScore(Sink):
             self._peaks[tap] = _Peak(result, result.pattern, result.force_counts, indentation_mm)
 
     def close(self) -> None:
-        """Nothing to finish."""
+        """Do nothing, since there is nothing to finish."""
 
     def scores(self) -> list[TapScore]:
-        """Scores of the taps that got a pattern."""
+        """Return the scores of the taps that got a pattern."""
         return [self._score(tap, self._peaks[tap]) for tap in sorted(self._peaks)]
 
     def _score(self, tap: int, peak: "_Peak") -> TapScore:
@@ -124,9 +124,9 @@ class _Peak(NamedTuple):
 
 
 def score_table(scores: Sequence[TapScore]) -> str:
-    """A line for each tap, 40 columns wide.
+    """Return the scores as a table with a line for each tap, 40 columns wide.
 
-    RMSE in [% of full scale]; "+-" is the model's own word on it, half the 90 % interval of touched pixels in [um].
+    RMSE in [% of full scale]; "+-" is the model's own estimate of it, half the 90 % interval of touched pixels in [um].
     """
     lines = ["tap deg use   PSNR  SSIM   RMSE  +- time", "       taps     dB          %fs  um   us"]
     for score in scores:
@@ -140,7 +140,7 @@ def score_table(scores: Sequence[TapScore]) -> str:
 
 
 def score_picture(score: TapScore, columns: int, palette: Palette) -> str:
-    """What the taxels felt, what was made of it, and the truth."""
+    """Return the taxels, the pattern and the truth as maps side by side."""
     result = score.result
     if result.pattern is None or result.baseline is None:
         raise ValueError("score has no pattern, expected one made by DemoScore")

@@ -1,4 +1,4 @@
-"""`edge-sr devices`: what is plugged in, what to type to read it, and what is in the way."""
+"""`edge-sr devices`: list what is plugged in, what to type to read it, and what prevents its use."""
 
 import json
 from collections.abc import Sequence
@@ -16,17 +16,17 @@ SERVER_HINT = "The vendor's server, where one runs, is not looked for: --source 
 
 
 def run(*, as_json: bool, stdout: TextIO) -> int:
-    """Print what there is, opening nothing.
+    """Print the devices, opening none.
 
     Args:
-        as_json: an object, for programs.
-        stdout: where it goes.
+        as_json: True prints an object, for programs.
+        stdout: output stream.
 
     Returns:
         The exit code, 0.
 
     Raises:
-        DeviceError: nothing a sensor is usually behind; what else there is was printed.
+        DeviceError: no device is of a kind that sensors are usually connected to; the others were printed.
     """
     found, notes = devices()
     if as_json:
@@ -39,12 +39,12 @@ def run(*, as_json: bool, stdout: TextIO) -> int:
 
 
 def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
-    """Lines for a reader, adapters first, then what could not be looked at.
+    """Return lines for a reader, adapters first, then what could not be examined.
 
     Args:
-        found: what there is.
-        notes: what could not be looked at.
-        width: of a line, in columns; wider are only words that are, and what is to be typed.
+        found: the devices.
+        notes: what could not be examined, and why.
+        width: of a line, in columns; only wider words, and text to be typed, exceed it.
     """
     lines: list[str] = []
     for one in sorted(found, key=lambda one: not one.adapter):

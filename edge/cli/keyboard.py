@@ -1,7 +1,7 @@
 """Keys on a terminal as commands: z zeroes, Z even in contact, r forgets earlier taps.
 
-Keys come one by one only if the terminal does not wait for a line, and that setting outlives a program: it is taken
-back on every way out, also when the program is stopped by Ctrl-Z or killed by a second Ctrl-C. In the background a
+Keys arrive one by one only if the terminal does not wait for a line, and that setting outlives a program: it is undone
+on every way out, also when the program is stopped by Ctrl-Z or killed by a second Ctrl-C. In the background a
 program may neither set a terminal nor read it, or it is stopped.
 """
 
@@ -23,13 +23,13 @@ ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
 class Keys:
-    """Producer of commands from keys of a terminal, which is never waited for; other keys than KEYS are passed over."""
+    """Producer of commands from keys of a terminal; it never waits, and ignores other keys than KEYS."""
 
     def __init__(self, commands: Commands, descriptor: int) -> None:
         """Start with the terminal as it is.
 
         Args:
-            commands: asked for by keys.
+            commands: queue that the keys' commands are put into.
             descriptor: of a terminal.
         """
         self._commands = commands
@@ -38,7 +38,7 @@ class Keys:
         self._gone = False
 
     def read(self) -> None:
-        """Put what was asked for since the last call."""
+        """Put the commands of the keys pressed since the last call."""
         if self._gone or not self._foreground():
             return
         if self._before is None:
@@ -56,7 +56,7 @@ class Keys:
                 self._commands.put(command)
 
     def take(self) -> None:
-        """Have keys come one by one, unseen; Ctrl-C and Ctrl-Z go on to be signals."""
+        """Set the terminal to pass keys one by one, unseen; Ctrl-C and Ctrl-Z remain signals."""
         import termios
 
         if self._gone or self._before is not None or not self._foreground():
@@ -73,7 +73,7 @@ class Keys:
             self._before = before
 
     def give_back(self, *, for_good: bool = False) -> None:
-        """Leave the terminal as it was found; in the background it is another program's by now."""
+        """Restore the terminal's settings, unless the program is in the background, where another uses it."""
         import termios
 
         self._gone = self._gone or for_good
@@ -93,7 +93,7 @@ class Keys:
 
 @contextmanager
 def terminal_keys(commands: Commands) -> Iterator[None]:
-    """Have keys of the terminal that stdin is taken for commands; nothing where it is none."""
+    """Take keys as commands within a with statement, if stdin is a terminal."""
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
         yield
         return
@@ -109,13 +109,13 @@ def terminal_keys(commands: Commands) -> Iterator[None]:
 
 @contextmanager
 def _given_back_on_signals(keys: Keys) -> Iterator[None]:
-    """Have the terminal given back before a signal that ends or stops the program does what it did before."""
+    """Restore the terminal before a signal that ends or stops the program has its usual effect."""
     before: dict[int, Any] = {}
 
     def end(number: int, frame: object) -> None:
         keys.give_back(for_good=True)
         earlier = before[number]
-        # From now on as without us: the first signal may have set what the second does.
+        # From now on the signal has its earlier handler: the first one may have set the handler of the second.
         signal.signal(number, earlier)
         if callable(earlier):
             earlier(number, frame)

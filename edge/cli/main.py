@@ -44,11 +44,11 @@ EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
 EXIT_SINK: Final = 5
 EXIT_INTERRUPTED: Final = 130
-"""By Ctrl-C, where nothing was begun yet that ends well; as a shell says it."""
+"""Exit code of a shell after Ctrl-C, used until a run has begun that ends well."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line and return the exit code."""
     code = _main(sys.argv[1:] if arguments is None else arguments)
     if unfinished_load():
         sys.stderr.flush()
@@ -85,7 +85,7 @@ def _demo(arguments: Sequence[str]) -> int:
     options = understood(run_parser(), arguments)
     if options.source:
         raise UsageError(f"the demo is a source itself: leave out --source {options.source[0]}")
-    # Whoever looks at a page may look for long; a program that reads our output waits for its end.
+    # A person may look at a page for long; a program that reads our output waits for its end.
     options.source = [DEMO_LOOP if options.view is not None and sys.stdout.isatty() else "demo"]
     _follow(options)
     return 0
@@ -127,7 +127,7 @@ def _replay(arguments: Sequence[str]) -> int:
     from edge.cli.run_command import run
     from edge.pipeline.replay_setup import open_recording
 
-    paced = options.paced or options.view is not None  # else it is over before a browser has come
+    paced = options.paced or options.view is not None  # else it is over before a browser has connected
     source = open_recording(
         options.file,
         sensor=options.sensor,
@@ -186,7 +186,7 @@ def _bench(arguments: Sequence[str]) -> int:
         raise UsageError("--soak is a part of --system: add it")
     from edge.bench.command import Settings, run
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # what it has started is ended with it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
     settings = Settings(
         out=options.out,
         rate_hz=options.rate_hz,

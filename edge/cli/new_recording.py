@@ -1,4 +1,4 @@
-"""The file that `edge-sr record` adds to a run."""
+"""File that `edge-sr record` adds to a run."""
 
 import argparse
 import sys
@@ -12,19 +12,19 @@ from edge.pipeline.run_statistics import Statistics
 from edge.sinks.registry import check_apart
 
 _NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
-"""Whose name says what is in them, which a recording is not."""
+"""Suffixes of other formats, which a recording must not be named after."""
 _RECORDS: Final = "records in JSON are edge-sr --sink jsonl:FILE"
 
 
 @contextmanager
 def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
-    """Have a run recorded, and tell at its end, however it came, what there is.
+    """Record a run, and report the recording at its end, however it ends.
 
     Args:
         options: of edge.cli.run_options.record_parser; a sink is added.
 
     Raises:
-        UsageError: a file of another kind is asked for, or a sink writes into it as well.
+        UsageError: another kind of file was requested, or a sink writes into it as well.
         SinkError: the file exists.
     """
     path = Path(options.file)
@@ -34,7 +34,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
         raise UsageError(f"no {path.suffix} is recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
     if path.suffix not in (".mcap", ".npz"):
         path = path.with_name(path.name + ".mcap")
-    if path.exists():  # before anything is begun
+    if path.exists():  # checked before anything is begun
         raise SinkError(f"{path} exists: give another name, or delete it first")
     options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
     check_apart(options.sink)
@@ -45,7 +45,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
         if path.exists():
             size_mb = path.stat().st_size / 1e6
             emulated = ", EMULATED" if statistics.source == "emulated" else ""
-            sure = sys.exception() is None and not statistics.unwritten  # else a sink has told what it does not hold
+            sure = sys.exception() is None and not statistics.unwritten  # else a sink has reported what it lacks
             held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
             with suppress(OSError):  # the terminal may have gone
                 sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")

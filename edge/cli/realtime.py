@@ -1,8 +1,8 @@
-"""The scheduling that `--realtime` asks the system for: each part on its own, and in one line what was refused.
+"""Real-time scheduling of `--realtime`: each part requested on its own, with one line for each that is refused.
 
 SCHED_FIFO lets the loop, and the thread that reads for it, run before every ordinary process. The pin keeps their
-caches warm, on the last of the processors they may use, since interrupts and everything else tend to the first. Locked
-memory cannot be paged out. The kernel still takes back 5 % of each second from threads that never rest
+caches warm, on the last of the processors they may use, since interrupts and most other work run on the first. Locked
+memory cannot be paged out. The kernel still takes 5 % of each second from threads that never rest
 (/proc/sys/kernel/sched_rt_runtime_us); these rest between scans.
 """
 
@@ -15,11 +15,11 @@ from functools import partial
 from typing import Final
 
 PRIORITY: Final = 20
-"""Modest: above every ordinary process, below the kernel's interrupt threads (50)."""
+"""Modest priority: above every ordinary process, below the kernel's interrupt threads (50)."""
 MCL_CURRENT: Final = 1
 MCL_FUTURE: Final = 2
 MCL_ONFAULT: Final = 4
-"""Only what is used: the untouched part of every thread's stack would be 8 MB each."""
+"""Flag that locks only used memory: the untouched part of every thread's stack would be 8 MB each."""
 
 _SCHEDULER_REMEDY: Final = "a line '@GROUP - rtprio 20' in /etc/security/limits.conf, or CAP_SYS_NICE, permits it"
 _MEMORY_REMEDY: Final = "'ulimit -l unlimited', a line '@GROUP - memlock unlimited' there, or CAP_IPC_LOCK, permits it"
@@ -30,9 +30,9 @@ def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> I
     """Run in real time as far as is permitted, and as before afterwards.
 
     Args:
-        tell: gets one line for each part that is not to be had; the run goes on without it.
-        thread_ids: of the threads that the caller's waits for, by the system's numbers: they stand no lower. Threads
-            started before stay as they are; one begun meanwhile is an ordinary one, but on the caller's processor.
+        tell: called with one line for each part that is refused; the run goes on without it.
+        thread_ids: system's numbers of the threads that the caller's waits for, which get the same priority. Other
+            threads started before stay as they are; one begun meanwhile is ordinary, but on the caller's processor.
     """
     if sys.platform != "linux":
         tell(f"--realtime: not on {sys.platform}, only on Linux; going on without")
@@ -58,8 +58,8 @@ def _schedule(threads: Sequence[int]) -> Callable[[], object]:
     def schedule(policy: int, parameters: os.sched_param) -> None:
         for thread in threads:
             with suppress(ProcessLookupError):  # it has ended, and its link with it
-                # What these threads begin is not of them, and begins as an ordinary thread. The flag stays afterwards:
-                # to take it back is a privilege of its own.
+                # Threads that these begin start as ordinary ones. The flag stays afterwards, since clearing it needs
+                # a privilege of its own.
                 os.sched_setscheduler(thread, policy | os.SCHED_RESET_ON_FORK, parameters)
 
     schedule(os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -74,7 +74,7 @@ def _pin(threads: Sequence[int]) -> Callable[[], object]:
             with suppress(ProcessLookupError):
                 os.sched_setaffinity(thread, processors)
 
-    if len(allowed) > 1:  # nothing is gained on the only one
+    if len(allowed) > 1:  # a single processor gains nothing
         pin({max(allowed)})
     return lambda: pin(allowed)
 

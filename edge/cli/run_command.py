@@ -1,6 +1,6 @@
-"""The run of `edge-sr`: a source through the runtime into sinks, and its summary.
+"""Run of `edge-sr`: a source through the runtime into sinks, and its summary.
 
-What a run may do without is imported where it is needed.
+Modules that only some runs need are imported where they are used.
 """
 
 import argparse
@@ -47,20 +47,20 @@ if TYPE_CHECKING:
 
 DEMO_HZ: Final = 100.0
 DEMO_REST_SCANS: Final = 100
-"""After so many without contact a demo that begins again is at its first tap: 174 lie between, and 24 between taps."""
+"""Scans without contact after which a repeating demo is at its first tap: 174 lie before it, 24 between taps."""
 
 
 def run(options: argparse.Namespace, source: Source, statistics: Statistics | None = None) -> None:
-    """Do what `edge-sr` without a command is asked for.
+    """Run `edge-sr` without a command, or a command that runs the same way.
 
     Args:
         options: of edge.cli.run_options.run_parser.
         source: not open yet.
-        statistics: filled on the way, so that they are there however the run ends.
+        statistics: filled on the way, so that they are available however the run ends.
 
     Raises:
-        EdgeError: something cannot be used.
-        BridgeError: of the source.
+        EdgeError: an option, a model or a sink cannot be used.
+        BridgeError: the source cannot be used.
     """
     stdout_taken = "jsonl:-" in options.sink
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
             if loops:
                 rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
                 asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
-            if score is not None:  # the demo is there to show what every scan takes, and what every tap gives
+            if score is not None:  # the demo shows the run time of every scan, and the gain of every tap
                 asked = replace(asked, every_scan=True, every_tap=True)
             runtime = open_runtime(
                 model,
@@ -127,7 +127,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 sinks.append(fan)
             if view is not None:
                 sinks += view.sinks
-            if options.realtime:  # last: what the page and the sinks have started has no part in it
+            if options.realtime:  # last, so that it does not affect what the page and the sinks have started
                 from edge.cli.realtime import realtime
 
                 closing.enter_context(realtime(_tell, source.thread_ids))
@@ -140,7 +140,7 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 duration_s=options.duration_s,
                 commands=commands,
             )
-        # A user who ends it before the first scan was due is no fault of the sensor.
+        # A run that its user ends before the first scan was due is no fault of the sensor.
         if not statistics.scans and (statistics.events or not stop.is_set()):
             raise DeviceError(f"no scan came from {source.name}: {hint}")
         if score is not None and not (loops and score.complete):
@@ -179,7 +179,7 @@ def _silence_hint(sources: Sequence[str]) -> str:
 
 
 def _go_on(stream: TextIO, view: "LiveView | None", score: "DemoScore") -> None:
-    """Tell what the demo is there to show while it goes on, and where else to look."""
+    """Print the score of a complete round while the demo goes on, and where else to look."""
     _print_score(score, stream)
     page = "" if view is None else f"live page: {view.url}; "
     print(f"\n{page}the demo goes on until Ctrl-C", file=sys.stderr)
@@ -187,7 +187,7 @@ def _go_on(stream: TextIO, view: "LiveView | None", score: "DemoScore") -> None:
 
 @contextlib.contextmanager
 def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
-    """Tells at the end what the run did; a reader that has gone is an ordinary end, like Ctrl-C."""
+    """Print the summary of a run at its end; a reader that has gone is an ordinary end, like Ctrl-C."""
     try:
         with contextlib.suppress(SinkClosedError):
             yield

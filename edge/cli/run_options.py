@@ -1,4 +1,4 @@
-"""What `edge-sr` and its small commands may be asked, and their help; wide enough for 40 columns.
+"""Options of `edge-sr` and its small commands, and their help; made for 40 columns.
 
 Bench and doctor have options of their own: edge.bench.options, edge.doctor.options.
 """
@@ -112,7 +112,7 @@ example:
 
 
 def run_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr`."""
+    """Return the parser of `edge-sr`."""
     parser = Parser(
         prog="edge-sr",
         usage="edge-sr [options]\n       edge-sr demo [options]\n"
@@ -127,7 +127,7 @@ def run_parser() -> argparse.ArgumentParser:
 
 
 def record_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr record`: a file, and those of `edge-sr`."""
+    """Return the parser of `edge-sr record`: a file, and the options of `edge-sr`."""
     parser = Parser(
         prog="edge-sr record",
         usage="edge-sr record FILE [options]",
@@ -140,7 +140,7 @@ def record_parser() -> argparse.ArgumentParser:
 
 
 def replay_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr replay`; those of a live run have the values that a recording wants."""
+    """Return the parser of `edge-sr replay`; options of live runs alone have the values that a recording needs."""
     parser = Parser(
         prog="edge-sr replay",
         usage="edge-sr replay FILE [options]",
@@ -171,10 +171,10 @@ def replay_parser() -> argparse.ArgumentParser:
 
 
 def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
-    """Options of a run, and of them all that can be wrong before anything is opened.
+    """Parse the options of a run, and check all that can be checked before anything is opened.
 
     Raises:
-        UsageError: no such sink, one twice, or thresholds that cannot be.
+        UsageError: a sink does not exist or occurs twice, or thresholds are out of range.
     """
     options = parser.parse_args(arguments)
     for text in options.sink:
@@ -185,10 +185,10 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
 
 
 def runtime_options(options: argparse.Namespace) -> RuntimeOptions:
-    """Return what of the flags is the runtime's, each by its own name; what has no flag is as by default.
+    """Return the flags of the runtime, each by its own name; options without a flag keep their defaults.
 
     Raises:
-        UsageError: thresholds or a time that cannot be.
+        UsageError: thresholds or a time are out of range.
     """
     given = vars(options)
     return RuntimeOptions(**{name: given[name] for name in asdict(DEFAULTS) if name in given})
@@ -220,7 +220,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
-    """What is made of scans, wherever they come from."""
+    """Add the options of making results from scans, whatever their source."""
     add = parser.add_argument
     add("--counts-per-newton", metavar="C", type=positive, help="summed z per newton; gives forces in N")
     add(
@@ -264,7 +264,7 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
 
 
 def baseline_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr baseline`."""
+    """Return the parser of `edge-sr baseline`."""
     parser = Parser(
         prog="edge-sr baseline",
         description="Zeroes once and keeps the baseline.",
@@ -279,7 +279,7 @@ def baseline_parser() -> argparse.ArgumentParser:
 
 
 def devices_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr devices`."""
+    """Return the parser of `edge-sr devices`."""
     parser = Parser(
         prog="edge-sr devices",
         description="Lists serial ports, CAN adapters and\nCAN interfaces, what to write behind\n"
@@ -291,5 +291,5 @@ def devices_parser() -> argparse.ArgumentParser:
 
 
 def models_parser() -> argparse.ArgumentParser:
-    """Options of `edge-sr models`: none."""
+    """Return the parser of `edge-sr models`, which has no options."""
     return Parser(prog="edge-sr models", description="Lists the bundled models.")

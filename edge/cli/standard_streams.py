@@ -1,4 +1,4 @@
-"""Standard streams as a program finds them: closed, full, or with a reader that has gone."""
+"""Standard streams as a program may get them: closed, full, or with a reader that has gone."""
 
 import contextlib
 import os
@@ -10,14 +10,14 @@ from edge.errors import SinkError
 
 STDIN, STDOUT, STDERR = 0, 1, 2
 _MODES: Final = {STDIN: os.O_RDONLY, STDOUT: os.O_RDONLY, STDERR: os.O_WRONLY}
-"""Of what takes the place of a closed stream. Into stdout nothing can be written, as before: results are not lost
-unsaid. stderr takes what nobody reads."""
+"""Modes of the files that replace closed streams. Writing to stdout still fails, so that results are not lost without
+a message; stderr discards its text."""
 
 
 def open_closed_streams() -> None:
-    """Take up the numbers of closed standard streams, or the next file to be opened has one: a port, or the records.
+    """Open placeholders for closed standard streams, or the next file would take their number: a port, or the records.
 
-    What Python prints to a closed stderr would go to stdout, between records.
+    Python's messages for a closed stderr would else go to stdout, between records.
     """
     for number, mode in _MODES.items():
         with contextlib.suppress(OSError):
@@ -30,12 +30,12 @@ def open_closed_streams() -> None:
 
 @contextlib.contextmanager
 def guarded_streams() -> Iterator[None]:
-    """Stdout whose faults are those of a sink, and stderr that has none: prose that nobody can read ends no run.
+    """Replace stdout by one whose faults are those of a sink, and stderr by one without, in a with statement.
 
-    A reader of stdout that has had enough ends what is done, without a word.
+    Text that nobody can read ends no run. A reader of stdout that has had enough ends the block, without a message.
 
     Raises:
-        SinkError: stdout takes no more.
+        SinkError: stdout cannot be written.
     """
     streams = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = cast("TextIO", _Told(sys.stdout)), cast("TextIO", _Unheard(sys.stderr))
@@ -54,14 +54,14 @@ def guarded_streams() -> Iterator[None]:
 
 
 def _stand_in(stream: TextIO, number: int) -> None:
-    """Point a stream elsewhere, or Python tries again at exit what is left in it, and complains."""
-    with contextlib.suppress(OSError, ValueError):  # a test's stand-in has no number
+    """Point a stream elsewhere, or Python tries to write the rest of it again at exit, and complains."""
+    with contextlib.suppress(OSError, ValueError):  # a stand-in of a test has no number
         if stream.fileno() == number:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
 class _Told:
-    """A stream that says in one line why it takes no more."""
+    """Stream that reports in one line why it cannot be written."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -89,7 +89,7 @@ class _Told:
 
 
 class _Unheard(_Told):
-    """A stream that takes all there is, also where it cannot be written: full, or its window closed."""
+    """Stream that accepts all text, even if it cannot be written: full, or its window closed."""
 
     @contextlib.contextmanager
     def _refused(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""Commands of a run from where a user gives them: lines on stdin, keys of a terminal, and SIGUSR1."""
+"""Commands of a run from its user: lines on stdin, keys of a terminal, and SIGUSR1."""
 
 import contextlib
 import signal
@@ -10,7 +10,7 @@ from edge.pipeline.commands import ZERO, Commands, read_stdin
 
 @contextlib.contextmanager
 def user_commands() -> Iterator[Commands]:
-    """Commands from lines on stdin, or from keys where it is a terminal, and from SIGUSR1."""
+    """Yield the queue of commands from lines on stdin, or from keys if it is a terminal, and from SIGUSR1."""
     commands = Commands()
     with zero_on_signal(commands):
         read_stdin(commands)
@@ -20,7 +20,7 @@ def user_commands() -> Iterator[Commands]:
 
 @contextlib.contextmanager
 def zero_on_signal(commands: Commands) -> Iterator[None]:
-    """SIGUSR1, where there is one, asks for zeroing again; as any request it is refused in contact."""
+    """Request zeroing on SIGUSR1, where the system has it; like any request it is refused in contact."""
     number = getattr(signal, "SIGUSR1", None)
     if number is None:
         yield

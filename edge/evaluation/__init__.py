@@ -1,1 +1,1 @@
-"""Errors of patterns against their truth, and the methods that a model has to beat."""
+"""Evaluation: errors of patterns against their truth, and the methods that a model has to beat."""

@@ -1,4 +1,4 @@
-"""Patterns without a network: what a model has to beat."""
+"""Classical methods: patterns without a network, which a model has to beat."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,22 +11,22 @@ from edge.errors import EdgeError
 from firmware_bridge.recording.npz_reader import read_npz
 
 CONTACT_LEVEL: Final = 0.5
-"""Share of a pattern's maximum from which these methods call a pixel touched: the edge of a blurred step."""
+"""Share of a pattern's maximum from which a pixel of these methods counts as touched: the edge of a blurred step."""
 
 _CUBIC_A: Final = -0.5
 
 MOST_BYTES: Final = 1 << 28
 
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
-"""Newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
+"""Function from newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
 
 
 def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
-    """The methods by name, with what was fitted on training taps.
+    """Return the methods by name, with the parameters fitted on training taps.
 
     Args:
         path: npz of bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels); bicubic is
-            left out where the file, of an earlier version, has no gain for it.
+            left out if the file, of an earlier version, has no gain for it.
         scale: pattern pixels per taxel pitch.
 
     Raises:
@@ -53,10 +53,9 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
 
 
 def method_macs(name: str, scale: int, rows: int = 4, cols: int = 4) -> int:
-    """Multiply-accumulates of one scan in a method of `fitted_methods`.
+    """Return the multiply-accumulates of one scan in a method of `fitted_methods`.
 
-    Interpolation is counted as it is computed here, as two matrix products, along the rows and along the columns, and
-    the gain.
+    Interpolation counts as it is computed here: two matrix products, along rows and columns, and the gain.
     """
     pixels = rows * scale * cols * scale
     if name == "linear map":
@@ -74,7 +73,7 @@ def bilinear(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float
 
 
 def _weights(taxels: int, scale: int) -> NDArray[np.float64]:
-    """Interpolation matrix (taxels*scale, taxels) along one axis."""
+    """Return the interpolation matrix (taxels*scale, taxels) along one axis."""
     position = np.clip((np.arange(taxels * scale) + 0.5) / scale - 0.5, 0, taxels - 1)
     low = np.minimum(np.floor(position).astype(int), max(taxels - 2, 0))
     matrix = np.zeros((taxels * scale, taxels))
@@ -87,7 +86,7 @@ def _weights(taxels: int, scale: int) -> NDArray[np.float64]:
 def bicubic(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
     """Interpolate taxels (..., rows, cols) to (..., rows*scale, cols*scale) by cubic convolution.
 
-    Pixels lie as those of `bilinear`, and outside the outer taxels their values are held likewise; curves between them
+    Pixels lie as those of `bilinear`, and outside the outer taxels the value is held likewise; the curve between taxels
     may overshoot.
 
     Source: Keys 1981, Eq. 4, with a = -1/2 (Catmull-Rom), which alone is exact on parabolas.
@@ -97,7 +96,7 @@ def bicubic(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float6
 
 
 def _cubic_weights(taxels: int, scale: int) -> NDArray[np.float64]:
-    """Interpolation matrix (taxels*scale, taxels) along one axis, of the two taxels on either side."""
+    """Return the interpolation matrix (taxels*scale, taxels) along one axis, over the two taxels on either side."""
     position = (np.arange(taxels * scale) + 0.5) / scale - 0.5
     matrix = np.zeros((taxels * scale, taxels))
     for offset in (-1, 0, 1, 2):
@@ -108,7 +107,7 @@ def _cubic_weights(taxels: int, scale: int) -> NDArray[np.float64]:
 
 
 def _cubic_kernel(distance: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Weight of a taxel at a distance of 0 to 2 pitches."""
+    """Return the weight of a taxel at a distance of 0 to 2 pitches."""
     a, x = _CUBIC_A, distance
     near = (a + 2) * x**3 - (a + 3) * x**2 + 1
     far = a * (x**3 - 5 * x**2 + 8 * x - 4)
@@ -116,7 +115,7 @@ def _cubic_kernel(distance: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
-    """The one factor that brings interpolated maps nearest to the truth, least squares; shapes equal."""
+    """Return the one factor that brings interpolated maps nearest to the truth, least squares; shapes equal."""
     x, y = np.asarray(interpolated, dtype=np.float64).ravel(), np.asarray(truth, dtype=np.float64).ravel()
     return float(x @ y / (x @ x))
 
@@ -124,7 +123,7 @@ def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) ->
 def fit_linear_map(
     readings: NDArray[np.floating], patterns: NDArray[np.floating], ridge: float = 1e-4
 ) -> NDArray[np.float32]:
-    """Least-squares matrix (features, pixels) with readings @ matrix ~ patterns.
+    """Return the least-squares matrix (features, pixels) with readings @ matrix ~ patterns.
 
     Args:
         readings: (n, features).

@@ -1,4 +1,4 @@
-"""Judge patterns on the frozen test set: the figures that contracts, benches and tests speak of."""
+"""Evaluation of patterns on the frozen test set, for the figures in contracts, benches and tests."""
 
 from collections.abc import Callable
 
@@ -27,14 +27,14 @@ def judge(
     half_width_mm: NDArray[np.floating] | None = None,
     pitch_mm: float = USPA44.pitch_mm,
 ) -> dict[str, NDArray[np.float64]]:
-    """Every metric of every frame, (n,) each.
+    """Return every metric of every frame, (n,) each.
 
     Args:
         patterns: (n, H, W) in [mm].
         frozen: the test set.
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        half_width_mm: (n, H, W), of the intervals that are to hold 90 % of pixels, in [mm]; "coverage_90" tells how
-            many they hold, and is left out without them.
+        half_width_mm: (n, H, W), half widths of the 90 % intervals, in [mm]; "coverage_90", the share of pixels that
+            they hold, is left out without them.
         pitch_mm: of the taxels, in [mm].
     """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
@@ -52,9 +52,9 @@ def judge(
 
 
 def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> dict[str, NDArray[np.float64]]:
-    """Every metric of every frame, (n,) each, of a model with the newest `given` taps or all it takes.
+    """Return every metric of every frame, (n,) each, of a model with the newest `given` taps or all that it takes.
 
-    One run a frame gives the patterns and, where the model has them, the deviations.
+    One run a frame gives the patterns and, if the model has them, the deviations.
     """
     patterns, half_width_mm = infer_with_intervals(model, frozen, given)
     return judge(patterns, frozen, model.contract.contact_level, half_width_mm, model.contract.pitch_mm)
@@ -63,9 +63,9 @@ def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> di
 def infer_with_intervals(
     model: Model, frozen: FrozenSet, given: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Patterns (n, H, W) of every frame, and half of the intervals that are to hold 90 % of pixels, both in [mm].
+    """Return the patterns (n, H, W) of every frame, and the half widths of their 90 % intervals, both in [mm].
 
-    The intervals are None where the model gives no deviations.
+    The intervals are None if the model gives no deviations.
     """
     contract = model.contract
     half_widths_mm: list[NDArray[np.float32]] = []
@@ -81,12 +81,12 @@ def infer_with_intervals(
 
 
 def mean_error(errors: dict[str, NDArray[np.float64]]) -> dict[str, float]:
-    """Mean of each metric over all frames, rounded to what the test set can tell."""
+    """Return the mean of each metric over all frames, rounded to the resolution of the test set."""
     return {name: round(float(values.mean()), 4) for name, values in errors.items()}
 
 
 def by_surface(values: NDArray[np.float64], frozen: FrozenSet) -> dict[str, float]:
-    """Mean of one metric, (n,), for each surface."""
+    """Return the mean of one metric, (n,), for each surface."""
     surface = frozen.surface[frozen.tap]
     return {str(name): float(values[surface == name].mean()) for name in dict.fromkeys(frozen.surface.tolist())}
 
@@ -97,13 +97,13 @@ def infer_all(
     frozen: FrozenSet,
     given: int | None = None,
 ) -> NDArray[np.float32]:
-    """Patterns (n, H, W) of a model for every frame, with the newest `given` taps or all it takes.
+    """Return the patterns (n, H, W) of a model for every frame, with the newest `given` taps or all that it takes.
 
     Args:
-        run: gives the pattern (H, W) of a window (taps, 3, rows, cols) in network input units.
-        contract: the model's.
+        run: returns the pattern (H, W) of a window (taps, 3, rows, cols) in network input units.
+        contract: contract of the model.
         frozen: the test set.
-        given: taps that are there; older ones are zero.
+        given: number of taps in the window; older ones are zero.
     """
     windows = frozen.windows(contract.taps, given)
     return np.stack([run(contract.scale_window(window)).copy() for window in windows])

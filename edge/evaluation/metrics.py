@@ -1,8 +1,8 @@
 """Errors of a pattern against its truth; numpy only, used by training and runtime alike.
 
-All take (..., H, W) arrays of one shape and the declared full scale L in the same unit, and give one
-value per pattern, shape (...). Equal maps give an infinite PSNR, an SSIM of 1 and an RMSE of 0, also
-where both are constant or zero.
+All functions of a full scale take (..., H, W) arrays of one shape and the declared full scale L in the same unit, and
+return one value per pattern, shape (...). Equal maps give an infinite PSNR, an SSIM of 1 and an RMSE of 0, also where
+both are constant or zero.
 """
 
 from functools import lru_cache
@@ -20,7 +20,7 @@ _WINDOW_RADIUS_PX: Final = 5
 
 
 def psnr_db(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
-    """Peak signal-to-noise ratio, 10 log10(L^2 / mean squared error), in [dB].
+    """Return the peak signal-to-noise ratio, 10 log10(L^2 / mean squared error), in [dB].
 
     Source: Wu and Liu 2024, Eq. 11, with the square and the 1/N that the equation lacks.
     """
@@ -31,13 +31,13 @@ def psnr_db(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[
 
 
 def rmse_percent(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
-    """Root mean squared error in [% of full scale]."""
+    """Return the root mean squared error in [% of full scale]."""
     a, b = _pair(pattern, truth, full_scale)
     return 100.0 * np.sqrt(np.mean((a - b) ** 2, axis=(-2, -1))) / full_scale
 
 
 def ssim_global(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
-    """Structural similarity over one window as large as the pattern.
+    """Return the structural similarity over one window as large as the pattern.
 
     Source: Wu and Liu 2024, Eq. 12-13, with C = (0.01 L)^2 and (0.03 L)^2.
     """
@@ -53,7 +53,7 @@ def ssim_global(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDAr
 
 
 def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
-    """Structural similarity, mean over 11 x 11 Gaussian windows that lie inside the pattern.
+    """Return the structural similarity, mean over 11 x 11 Gaussian windows that lie inside the pattern.
 
     Source: Wang et al. 2004; the same figure as scikit-image with gaussian_weights, sigma 1.5,
     use_sample_covariance=False and data_range=L.
@@ -69,9 +69,9 @@ def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.
 
 
 def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -> NDArray[np.float64]:
-    """Overlap over union of the pixels that `touched` finds and those that truly touch, (..., H, W) bool.
+    """Return overlap over union of the pixels of `touched` and those that truly touch, (..., H, W) bool.
 
-    Where both are empty they agree: 1.
+    If both are empty they agree: 1.
     """
     found = touched(np.asarray(pattern), level)
     if found.shape != touching.shape:
@@ -84,13 +84,13 @@ def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -
 def boundary_distance_mm(
     pattern: ArrayLike, touching: NDArray[np.bool_], level: float, pixel_mm: float
 ) -> NDArray[np.float64]:
-    """How far the outlines of two contacts lie apart: each pixel of one to the nearest of the other, mean of both.
+    """Return the distance between the outlines of two contacts: pixel of one to nearest of the other, mean of both.
 
-    Where both are empty they agree: 0. Where one is, they are the map's diagonal apart.
+    If both are empty they agree: 0. If only one is, they are the map's diagonal apart.
 
     Args:
         pattern: (n, H, W), touched where it reaches `level` of its maximum.
-        touching: (n, H, W), what is touched.
+        touching: (n, H, W), the pixels that truly touch.
         level: share of a pattern's maximum.
         pixel_mm: pixel size, in [mm].
 
@@ -113,7 +113,7 @@ def boundary_distance_mm(
 
 
 def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Touched pixels (n, H, W) beside an untouched one or the map's end."""
+    """Return the touched pixels (n, H, W) next to an untouched one or at the map's edge."""
     around = np.pad(touching, ((0, 0), (1, 1), (1, 1)))
     inside = around[:, :-2, 1:-1] & around[:, 2:, 1:-1] & around[:, 1:-1, :-2] & around[:, 1:-1, 2:]
     return touching & ~inside
@@ -121,13 +121,13 @@ def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=2)
 def _pixels_apart(height: int, width: int) -> NDArray[np.float32]:
-    """Distance between any two pixels of a map, (H W, H W), in pixels."""
+    """Return the distance between any two pixels of a map, (H W, H W), in pixels."""
     rows, columns = np.divmod(np.arange(height * width, dtype=np.float32), width)
     return np.hypot(rows[:, None] - rows, columns[:, None] - columns)
 
 
 def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:
-    """What patterns (..., H, W) in [mm] sum up to over their area, (...) in [mm3].
+    """Return the volume of patterns over their area, (...) in [mm3].
 
     Args:
         patterns: (..., H, W) in [mm].
@@ -137,7 +137,7 @@ def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:
 
 
 def interval_coverage(pattern: ArrayLike, truth: ArrayLike, half_width: ArrayLike) -> NDArray[np.float64]:
-    """Share of pixels whose truth lies no farther from the pattern than `half_width`, (..., H, W) in the same unit."""
+    """Return the share of pixels whose truth is within `half_width` of the pattern, (..., H, W) in the same unit."""
     errors = np.abs(np.asarray(pattern) - np.asarray(truth))
     if errors.shape != np.shape(half_width):
         raise ValueError(
@@ -168,7 +168,7 @@ def _similarity(
 
 
 def _blur(maps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian means over the windows that lie inside the map."""
+    """Return Gaussian means over the windows that lie inside the map."""
     offsets_px = np.arange(-_WINDOW_RADIUS_PX, _WINDOW_RADIUS_PX + 1)
     weights = np.exp(-0.5 * (offsets_px / _WINDOW_SIGMA_PX) ** 2)
     weights /= weights.sum()

@@ -1,4 +1,4 @@
-"""The frozen test set: what every model and every classical method is judged on, here and in training."""
+"""Frozen test set, on which every model and every classical method is evaluated, here and in training."""
 
 import hashlib
 from collections.abc import Mapping
@@ -26,11 +26,11 @@ _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "angle_deg": ("f", "t"),
     "full_scale_mm": ("f", ""),
 }
-"""Type and axes of each array; a letter is the same length everywhere."""
+"""Type and axes of each array; a letter stands for one length everywhere."""
 
 
 class FrozenSetError(EdgeError, ValueError):
-    """A file that is no frozen set."""
+    """Error of a file that is not a frozen test set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,18 +38,18 @@ class FrozenSet:
     """Frames of taps with their truth.
 
     A frame's window is its own reading and the ends of the earlier taps, newest first. Contacts are flat, so a tap's
-    truth is one map times the frame's indentation.
+    truth is one map multiplied by the frame's indentation.
 
     Attributes:
         newest: (n, 3, rows, cols) int16, zeroed counts of the frame.
-        earlier: (taps, K-1, 3, rows, cols) int16, zeroed counts at the end of the taps before.
+        earlier: (taps, K-1, 3, rows, cols) int16, zeroed counts at the end of the earlier taps.
         tap: (n,) index of the frame's tap; frames of a tap are not independent.
         indentation_mm: (n,) float32, in [mm].
         force_n: (n,) float32, in [N].
         unit_patterns: (taps, H, W) float16, deformation per indentation.
         touched: (taps, H, W) bool, pixels of which the surface touches at least half.
         surface: (taps,) name of the surface.
-        angle_deg: (taps,) turn of the pad, in [deg].
+        angle_deg: (taps,) rotation of the pad, in [deg].
         full_scale_mm: the patterns' declared full scale, in [mm].
     """
 
@@ -73,10 +73,10 @@ class FrozenSet:
         return self.unit_patterns.shape[-1] // self.newest.shape[-1]
 
     def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
-        """Windows (n, taps, 3, rows, cols) in zeroed counts; only the newest `given` taps are there, the rest zero.
+        """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero.
 
         Raises:
-            FrozenSetError: the set has not as many taps.
+            FrozenSetError: the set has fewer taps.
         """
         if not 1 <= taps <= 1 + self.earlier.shape[1]:
             raise FrozenSetError(
@@ -88,15 +88,15 @@ class FrozenSet:
         return windows
 
     def patterns(self) -> NDArray[np.float32]:
-        """Truth, (n, H, W) in [mm]."""
+        """Return the truth, (n, H, W) in [mm]."""
         return self.unit_patterns[self.tap].astype(np.float32) * self.indentation_mm[:, None, None]
 
     def touching(self) -> NDArray[np.bool_]:
-        """Pixels that the surface touches, (n, H, W)."""
+        """Return the pixels that the surface touches, (n, H, W)."""
         return self.touched[self.tap]
 
     def sha256(self) -> str:
-        """Hash over all arrays, whatever file they lie in."""
+        """Return a hash over all arrays, independent of the file that holds them."""
         digest = hashlib.sha256()
         for field in fields(self):
             digest.update(field.name.encode())
@@ -104,7 +104,7 @@ class FrozenSet:
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write as a compressed npz, in place.
+        """Write the set as a compressed npz, in place.
 
         Raises:
             OSError: it cannot be written.
@@ -114,10 +114,10 @@ class FrozenSet:
 
 
 def load_frozen_set(path: Path) -> FrozenSet:
-    """Read a frozen set.
+    """Load a frozen test set.
 
     Raises:
-        FrozenSetError: no such file, or an array is missing or of another type or shape; it is named.
+        FrozenSetError: the file is missing, or an array is missing or of another type or shape; the message names it.
     """
     try:
         arrays = read_npz(path, (field.name for field in fields(FrozenSet)), MOST_BYTES)

@@ -1,1 +1,1 @@
-"""Models: their contract, and how onnxruntime is kept to it."""
+"""Models: their contract, and its enforcement on onnxruntime."""

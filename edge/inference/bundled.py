@@ -1,4 +1,4 @@
-"""The models and the demo recording that come with the package."""
+"""Models and demo recording that come with the package."""
 
 from pathlib import Path
 from typing import Final
@@ -7,26 +7,26 @@ from edge.errors import ModelError, UsageError
 
 BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
 TAXELS: Final = BUNDLE_DIR / "taxels.npz"
-"""What dead taxels are estimated by."""
+"""File of the estimator of dead taxels."""
 DEFAULT_MODEL: Final = "stsr-int8"
-"""Takes nothing for granted: a model of several taps is wrong, and looks right, where the taps before were of another
+"""Model that assumes nothing: a model of several taps is wrong, and looks right, if the earlier taps were of another
 object or the pad was not turned."""
 INT8_SUFFIX: Final = "-int8"
-"""Of the file name of a model in integers, beside that of the same network in float32."""
+"""Suffix of the file name of an int8 model, next to that of the same network in float32."""
 DEMO_MODEL: Final = "mtsr4-int8"
-"""The demo's taps are turned as this one expects."""
+"""Model of the demo, whose taps are turned as it expects."""
 
 
 def bundled_models() -> list[Path]:
-    """Files of the bundled models, by name."""
+    """Return the files of the bundled models, by name."""
     return sorted(BUNDLE_DIR.glob("*.onnx"))
 
 
 def find_model(name: str | Path) -> Path:
-    """File of a model: a path that exists, else a bundled name with or without .onnx.
+    """Return the file of a model: a path that exists, else a bundled name with or without .onnx.
 
     Raises:
-        ModelError: neither; the bundled ones are listed.
+        ModelError: it is neither; the message lists the bundled ones.
     """
     path = Path(name)
     if path.is_file():
@@ -45,9 +45,9 @@ def find_model(name: str | Path) -> Path:
 
 
 def alternatives(model: Path) -> list[Path]:
-    """Files of models that may be able to do a model's work: the bundled ones for one of them, else its own integers.
+    """Return files of models that may replace a model: for a bundled one the others, else its own int8 file.
 
-    Another network than the bundled ones was trained on other surfaces, and these cannot stand in for it.
+    A network that is not bundled was trained on other surfaces, and the bundled ones cannot stand in for it.
     """
     bundled = bundled_models()
     if model.resolve() in bundled:
@@ -57,10 +57,10 @@ def alternatives(model: Path) -> list[Path]:
 
 
 def demo_recording() -> Path:
-    """File of the recording that the demo plays.
+    """Return the file of the recording that the demo plays.
 
     Raises:
-        UsageError: it did not come with this package.
+        UsageError: it is missing from this installation.
     """
     path = BUNDLE_DIR / "demo.npz"
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""The one agreement between a trained model and the runtime, kept in the ONNX metadata."""
+"""Contract between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -16,9 +16,9 @@ from firmware_bridge.scans.pad import PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 5
 EARLIER_VERSION: Final = 4
-"""Still loaded; its files lack the keys of ADDED."""
+"""Version that is still loaded; its files lack the keys of ADDED."""
 ADDED: Final = ("pad_inputs", "takes_gains", "traction_scale")
-"""Keys that version 5 brought; without them a model takes no pad and gives no traction."""
+"""Keys that version 5 added; without them a model takes no pad and gives no traction."""
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 PAD_NAME: Final = "pad"
@@ -26,33 +26,33 @@ OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
 TRACTION_NAME: Final = "traction"
 ANY_BATCH: Final = "any"
-"""Of a graph that takes as many windows in one run as it is given; its first dimension bears this name."""
+"""Batch of a graph that takes any number of windows in one run; its first dimension bears this name."""
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
 MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
-"""Of a pattern: what is allocated for a run is this times a few."""
+"""Most pixels of a pattern: a run allocates a small multiple of it."""
 LONGEST_VALUE: Final = 1 << 16
-"""Characters of a key's JSON; the longest of a bundled model has a thousand."""
+"""Most characters of a key's JSON; the longest of a bundled model has a thousand."""
 LONGEST_SHOWN: Final = 100
 LEAST_UNIT: Final = 1e-6
-"""Of counts, newtons or millimetres that something is divided by, so that float32 holds what comes out."""
+"""Least divisor in counts, newtons or millimetres, so that float32 holds the quotient."""
 STAND_IN_KEYS: Final = (
     *("scale", "angle_step_deg", "output_unit", "output_full_scale", "sensor", "rows", "cols", "pitch_mm"),
     "traction_scale",
 )
-"""What two models must share for one to take over from the other: the same taps, and patterns of one meaning."""
+"""Keys that two models must share for one to replace the other: the same taps, and patterns of one meaning."""
 
 Shape = tuple[int | str, *tuple[int, ...]]
-"""Of an input or output: the batch first."""
+"""Shape of an input or output: the batch first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """What a model expects and gives.
+    """Inputs, outputs and measured errors of a model.
 
     Attributes:
-        version: of this agreement.
+        version: version of the contract.
         batch: windows in one run, or ANY_BATCH.
         taps: K, the number of taps in the window.
         scale: pattern pixels per taxel pitch.
@@ -66,17 +66,18 @@ class Contract:
         rows: taxel rows.
         cols: taxel columns.
         pitch_mm: taxel pitch, in [mm].
-        arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are float32 always.
+        arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are always float32.
         interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
-            None where the model gives no deviation.
-        confidence: number of taps given -> what the deviations say of the pattern's error, see
-            edge.inference.expected_error; empty where the model gives no deviation.
+            None if the model gives no deviation.
+        confidence: number of taps -> table of the pattern's error by its deviations, see
+            edge.inference.expected_error; empty if the model gives no deviation.
         training_sha256: of the training configuration.
         test_set_sha256: of the frozen test set that `test_error` was measured on.
-        test_error: number of taps given -> metric name -> value; empty where the test set has another scale.
-        pad_inputs: what the model takes of the pad, see `pad_row`: name in PAD_RANGES, centre and spread of each.
-        takes_gains: it takes windows of taxels whose gains are evened out, and wants to know where they are.
-        traction_scale: traction pixels per taxel pitch; None where the model gives no traction.
+        test_error: number of taps -> metric name -> value; empty if the test set has another scale.
+        pad_inputs: properties of the pad that the model takes, see `pad_row`: name in PAD_RANGES, centre and spread.
+        takes_gains: True if it takes windows with the taxels' gains divided out, and an input that states whether they
+            are.
+        traction_scale: traction pixels per taxel pitch; None if the model gives no traction.
     """
 
     version: int
@@ -115,18 +116,18 @@ class Contract:
 
     @property
     def pad_width(self) -> int:
-        """Numbers that the model takes of each pad; 0 where it takes none."""
+        """Number of values that the model takes of each pad; 0 without pad input."""
         return 2 * len(self.pad_inputs) + self.takes_gains
 
     @property
     def traction_shape(self) -> tuple[int, int, int] | None:
-        """Shape (3, h, w) of the traction x, y, z; None where the model gives none."""
+        """Shape (3, h, w) of the traction x, y, z; None if the model gives none."""
         scale = self.traction_scale
         return None if scale is None else (len(AXES), self.rows * scale, self.cols * scale)
 
     @property
     def input_shapes(self) -> dict[str, Shape]:
-        """Shapes of the graph's inputs by name: the window, and the pad if it takes any of it."""
+        """Shapes of the graph's inputs by name: the window, and the pad if the model takes it."""
         shapes: dict[str, Shape] = {INPUT_NAME: self.window_shape}
         return shapes | ({PAD_NAME: (self.batch, self.pad_width)} if self.pad_width else {})
 
@@ -141,7 +142,7 @@ class Contract:
         return shapes
 
     def to_metadata(self) -> dict[str, str]:
-        """The contract as the string map that ONNX metadata holds."""
+        """Return the contract as the string map of ONNX metadata."""
         keys = _keys(self.version)
         return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items() if key in keys}
 
@@ -153,7 +154,7 @@ class Contract:
             ModelError: a key is missing, unreadable or out of range; the key is named.
         """
         version = _value(metadata, "version")
-        # Before the other keys, which another version may not have.
+        # Before the other keys, which another version may lack.
         if version not in (CONTRACT_VERSION, EARLIER_VERSION):
             expected = f"expected {CONTRACT_VERSION} or {EARLIER_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
@@ -167,7 +168,7 @@ class Contract:
         """Refuse a sensor that the model was not trained for.
 
         Raises:
-            ModelError: a key of the contract differs from the sensor's; the key is named.
+            ModelError: a key of the contract differs from the sensor's; the message names it.
         """
         for key, got in (
             ("sensor", geometry.name),
@@ -184,10 +185,10 @@ class Contract:
                 )
 
     def check_stands_in(self, other: "Contract") -> None:
-        """Refuse to be chosen instead of a model whose patterns mean something else.
+        """Refuse to replace a model whose patterns mean something else.
 
         Raises:
-            ModelError: a key differs; it is named.
+            ModelError: a key differs; the message names it.
         """
         keys = {key: (getattr(self, key), getattr(other, key)) for key in STAND_IN_KEYS}
         keys["interval_factor"] = (self.interval_factor is not None, other.interval_factor is not None)
@@ -198,24 +199,24 @@ class Contract:
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Zeroed counts (taps, 3, rows, cols) to network input units, same shape.
+        """Convert zeroed counts (taps, 3, rows, cols) to network input units, same shape.
 
         Args:
             deformation_counts: as they were read.
-            gains: (3, rows, cols) that they are divided by, where they are known and the model takes them.
+            gains: (3, rows, cols) that they are divided by, if available and the model takes them.
         """
         divisor = np.asarray(self.counts_per_unit, dtype=np.float32)[None, :, None, None]
         return deformation_counts / (divisor if gains is None else divisor * gains)
 
     def pad_row(self, pad: Pad | None) -> NDArray[np.float32]:
-        """A pad as the model takes it.
+        """Return a pad as model input.
 
         Args:
-            pad: what is known of it, if anything.
+            pad: its properties; None if unknown.
 
         Returns:
-            (pad_width,) float32: of each of `pad_inputs` (value - centre) / spread, 0 where it is not known; then 1
-            for each that is and 0 for each that is not; at last, where the model takes gains, the same of these.
+            (pad_width,) float32: for each of `pad_inputs` (value - centre) / spread, 0 if unknown; then 1 for each that
+            is available and 0 for each that is not; last, if the model takes gains, 1 if they are available, else 0.
         """
         row = np.zeros(self.pad_width, dtype=np.float32)
         known = {} if pad is None else pad.constants
@@ -229,7 +230,7 @@ class Contract:
 
 
 def _keys(version: int) -> list[str]:
-    """Keys of a contract of this version."""
+    """Return the keys of a contract of this version."""
     names = [field.name for field in fields(Contract)]
     return [name for name in names if name not in ADDED] if version == EARLIER_VERSION else names
 
@@ -247,7 +248,7 @@ def _value(metadata: Mapping[str, str], key: str) -> Any:
 
 
 def _shown(value: object) -> str:
-    """Short enough for a line."""
+    """Return a value as text short enough for a line."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
@@ -292,7 +293,7 @@ def _check(values: Mapping[str, Any]) -> None:
 
 
 def _check_pad_and_traction(values: Mapping[str, Any], refuse: Callable[[str, str], None]) -> None:
-    """Check the keys of ADDED, where they are there."""
+    """Check the keys of ADDED, if they exist."""
     inputs = values.get("pad_inputs", [])
     if not isinstance(inputs, list) or not all(map(_is_pad_input, inputs)):
         expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"

@@ -1,8 +1,8 @@
-"""How far off a pattern is expected to be, and whether another tap is expected to bring it nearer.
+"""Expected error of a pattern, and the expected gain of another tap.
 
-A pattern's doubt is the RMS of its deviations over the RMS of the pattern itself, one number. What it meant on taps not
-trained on, by the number of taps given, is a table in the model's contract: the error that patterns of that doubt had,
-and the share of it that one more tap took away.
+A pattern's doubt is the RMS of its deviations over the RMS of the pattern itself, one number. A table in the model's
+contract gives its meaning on taps not trained on, by the number of taps in the window: the error that patterns of that
+doubt had, and the share of it that one more tap took away.
 """
 
 import math
@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST: Final = float(np.finfo(np.float32).max)
-"""Of the numbers in a contract: patterns are float32. A whole number can have more digits than any float."""
+"""Largest number in a contract: patterns are float32. A whole number can have more digits than any float."""
 WORTH_A_TAP: Final = 0.02
 """Share of the error that another tap must be expected to take away to be worth it: .2 dB."""
 
 Table = Mapping[str, Mapping[str, list[float]]]
-"""Number of taps given -> doubt, error and gain, lists of one length: at that doubt, the RMS error as a share of the
-pattern's RMS, and the share of the error that another tap takes away; no gain where no further tap can be given."""
+"""Number of taps -> doubt, error and gain, lists of one length: at that doubt, the RMS error as a share of the
+pattern's RMS, and the share of the error that another tap takes away; no gain for the largest number of taps."""
 
 
 class Expected(NamedTuple):
-    """What is expected of a pattern.
+    """Expected error of a pattern.
 
     Attributes:
         rmse: RMS error over all its pixels, in its unit.
-        gain: share of it that another tap would take away; None where the network takes no further tap.
+        gain: share of it that another tap would take away; None if the network takes no further tap.
     """
 
     rmse: float
@@ -36,28 +36,28 @@ class Expected(NamedTuple):
 
     @property
     def another_tap(self) -> bool | None:
-        """Whether another tap is expected to be worth it; None where none can be given."""
+        """True if another tap is expected to be worth it; None if the network takes no further tap."""
         return None if self.gain is None else self.gain >= WORTH_A_TAP
 
 
 def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple[float, float]:
-    """Doubt of a pattern (H, W), and its RMS in its unit; infinite and 0 where the pattern is nothing but zero."""
+    """Return the doubt of a pattern (H, W), and its RMS in its unit; infinite and 0 for a pattern of zeros."""
     size = math.sqrt(float(np.vdot(pattern, pattern)) / pattern.size)
     spread = math.sqrt(float(np.vdot(deviation, deviation)) / deviation.size)
     return (spread / size, size) if size > 0 else (math.inf, 0.0)
 
 
 def expect(table: Table, taps: int, pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> Expected | None:
-    """What is expected of a pattern (H, W) made from so many taps; None where the table does not tell.
+    """Return the expected error of a pattern (H, W) made from so many taps; None if the table has none.
 
-    Nor does it of a pattern that is nothing but zero.
+    A pattern of zeros has none either.
     """
     about, size = doubt(pattern, deviation)
     return expect_of(table, taps, about, size) if size > 0 else None
 
 
 def expect_of(table: Table, taps: int, about: float, size: float) -> Expected | None:
-    """What is expected of a pattern of that doubt and RMS; None where the table does not tell.
+    """Return the expected error of a pattern of that doubt and RMS; None if the table has none for so many taps.
 
     Between two doubts it is interpolated; beyond the last the error grows with the doubt.
     """
@@ -71,7 +71,7 @@ def expect_of(table: Table, taps: int, about: float, size: float) -> Expected | 
 
 
 def is_confidence(value: Any, taps: int) -> bool:
-    """Whether a value read from a file is such a table for a model of so many taps, or empty."""
+    """Return whether a value read from a file is such a table for a model of so many taps, or empty."""
     if not isinstance(value, dict):
         return False
     return all(key in map(str, range(1, taps + 1)) and _is_row(row) for key, row in value.items())
@@ -88,5 +88,5 @@ def _is_row(row: Any) -> bool:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value read from a file is a finite number."""
+    """Return whether a value read from a file is a finite number."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST

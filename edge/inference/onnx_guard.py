@@ -1,9 +1,9 @@
-"""What a file must be before onnxruntime sees it: one plain graph that holds its own weights, of bounded size.
+"""Check of a model file before onnxruntime reads it: one plain graph with its own weights, of bounded size.
 
 onnxruntime follows a tensor into a side file below the model's folder, and a graph into graphs within it, which may
-run for ever. No model of ours has either. The walk below knows the fields that lead to them and to the operators, of
-which only those of plain networks are allowed, passes over all else, weights among it, and refuses what it does not
-understand: what it let pass unread, onnxruntime might read.
+run for ever. None of our models has either. The walk below covers the fields that lead to them and to the operators, of
+which only those of plain networks are allowed. It skips all else, weights among it, and refuses what it does not
+understand, since onnxruntime might read what passed unchecked.
 
 Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
 """
@@ -17,13 +17,13 @@ from edge.errors import ModelError
 from firmware_bridge.bounded_read import read_bounded
 
 MOST_BYTES: Final = 1 << 28
-"""A hundred times the largest bundled model, ten times the paper's network."""
+"""Largest file: a hundred times the largest bundled model, ten times the paper's network."""
 MOST_FIELDS: Final = 1 << 20
-"""Some seconds of walking; the bundled models have a thousand and a half."""
+"""Most fields, some seconds of walking; the bundled models have a thousand and a half."""
 MOST_NODES: Final = 5000
-"""Thirty times as many as the largest bundled model has; onnxruntime goes over all of them again and again."""
+"""Most operators, thirty times those of the largest bundled model; onnxruntime goes over all of them repeatedly."""
 MOST_DIMS: Final = 64
-"""Of weights: the product of a million dimensions takes hours."""
+"""Most dimensions of weights: the product of a million takes hours."""
 _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
 ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
@@ -35,10 +35,10 @@ Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze
 Where
 """
 OPERATORS: Final = frozenset(_NAMES.split())
-"""Those that are allowed: of the exported models, of the networks that they are compared with, and of others like them.
+"""Operators that are allowed: of the exported models, of the networks that they are compared with, and of similar ones.
 No control flow, no recurrence, nothing random, no text. docs/formats.md lists them too."""
 ONNX_DOMAINS: Final = ("", "ai.onnx")
-"""Two names of one set of operators; all others are of one vendor, or of the file itself."""
+"""Both names of the standard operators; other domains belong to a vendor or to the file itself."""
 _LONGEST_NAME: Final = 40
 _HIGHEST_TAG: Final = (1 << 32) - 1
 _TAG_BYTES: Final = 5
@@ -52,7 +52,7 @@ _BROKEN: Final = "not a model that onnxruntime can load: damaged, or no ONNX fil
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
 _Message = Mapping[int, "_Message | str"]
-"""Number of a field -> what message it holds, or why it is refused."""
+"""Number of a field -> the message that it holds, or the reason to refuse it."""
 _DIMS: Final = 1
 _LOCATION: Final = 14
 _OPERATOR: Final = 4
@@ -65,7 +65,7 @@ _MODEL: Final[_Message] = {7: _GRAPH, 20: _NESTED, 25: _NESTED}
 
 
 class _Field(NamedTuple):
-    """A field's number and kind, its number if it is one, and where its content lies."""
+    """Field of a message: its number and wire type, its value if it is a number, and the range of its content."""
 
     number: int
     wire: int
@@ -75,10 +75,10 @@ class _Field(NamedTuple):
 
 
 def read_model(path: Path) -> bytes:
-    """An ONNX file's content, for onnxruntime to load from memory.
+    """Return an ONNX file's content, for onnxruntime to load from memory.
 
     Raises:
-        ModelError: no such file, too large, or not one plain graph with its weights.
+        ModelError: the file is missing, too large, or not one plain graph with its weights.
     """
     try:
         content = read_bounded(path, MOST_BYTES)
@@ -92,7 +92,7 @@ def read_model(path: Path) -> bytes:
 
 
 def check_plain(content: bytes) -> None:
-    """Refuse all but one plain graph with its weights.
+    """Refuse all files but one plain graph with its weights.
 
     Raises:
         ModelError: weights in another file, sparse or of more elements than the file can hold; graphs within the
@@ -166,7 +166,7 @@ def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
 
 
 def _varint(content: bytes, position: int, end: int, most_bytes: int) -> tuple[int, int]:
-    """A number and the place behind it; bits beyond 64 are refused by the limits on what it stands for."""
+    """Return a number and the position after it; bits beyond 64 are refused by the limits on its meaning."""
     value = 0
     for shift in range(0, 7 * most_bytes, 7):
         if position >= end:

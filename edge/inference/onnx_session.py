@@ -1,4 +1,4 @@
-"""One model in onnxruntime: checked against its contract, arrays bound once for every number of windows."""
+"""Model session in onnxruntime: checked against its contract, with arrays bound once per number of windows."""
 
 import os
 import re
@@ -26,17 +26,17 @@ from edge.inference.onnx_guard import read_model
 from edge.inference.timed_loading import flush_denormals, within_limit
 
 WARM_UP_RUNS: Final = 10
-"""The first takes 3 to 10 times as long as the tenth, after which run times stay."""
+"""Runs before run times stay: the first takes 3 to 10 times as long as the tenth."""
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
-"""Of onnxruntime, which may quote a whole graph."""
+"""Most characters of a message of onnxruntime, which may quote a whole graph."""
 NOT_WHILE_LOADING: Final = ["ConstantFolding"]
-"""Work on constants, of which a stranger's file may ask hours, and which no flag ends. In a run it can be ended; the
-bundled models have none, and give the same to the bit."""
+"""Optimisers that are off while loading: folding of constants, which a stranger's file can make last hours, and which
+no flag ends. A run can be ended; the bundled models have no such work, and give the same to the bit."""
 _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
-"""File, line and signature of a function."""
+"""Pattern of a function's file, line and signature."""
 ORT_ERRORS: Final = (
     ort_errors.EPFail,
     ort_errors.Fail,
@@ -46,16 +46,16 @@ ORT_ERRORS: Final = (
     ort_errors.NoModel,
     ort_errors.NotImplemented,
     ort_errors.RuntimeException,
-    RuntimeError,  # what its C++ throws otherwise
+    RuntimeError,  # other exceptions of its C++
     MemoryError,
-    UnicodeDecodeError,  # names in its messages are the file's
+    UnicodeDecodeError,  # names in its messages come from the file
 )
 
-onnxruntime.disable_telemetry_events()  # where it was imported before `edge`, which is too late for all of it
+onnxruntime.disable_telemetry_events()  # if it was imported before `edge`, which is too late for all of it
 
 
 class ModelSession:
-    """A model ready to run, on one thread unless told otherwise, without spinning.
+    """Model ready to run, on one thread by default, without spinning.
 
     Build it on the thread that runs it: onnxruntime makes denormals zero once in a process, on the thread that builds
     the first session and on threads which that one starts later. Everything else on them computes like this as well.
@@ -75,12 +75,13 @@ class ModelSession:
 
         Args:
             path: of the model.
-            threads: that share the work of one run.
-            stop: gives up early.
+            threads: number of threads that share the work of one run.
+            stop: event that ends the loading early.
 
         Raises:
-            ModelError: no such file, not a model, weights in a side file, an operator that is not allowed, no contract,
-                or a graph that does not keep the contract; the key or tensor is named. Or it takes too long.
+            ModelError: the file is missing or not a model, has weights in a side file, an operator that is not allowed
+                or no contract, or a graph that does not keep the contract (the message names the key or tensor); or
+                loading takes too long.
         """
         self._path = path
         self.name = path.stem.encode(errors="replace").decode()  # records are UTF-8, file names need not be
@@ -111,7 +112,7 @@ class ModelSession:
 
         Args:
             window: (taps, 3, rows, cols) float32, newest first, in network input units.
-            pad: what the contract's `pad_row` makes of the sensor's pad; without, nothing is known of it.
+            pad: the contract's `pad_row` of the sensor's pad; by default that of an unknown pad.
 
         Returns:
             (H, W) float32 in the contract's output unit: the session's own array, read-only, and
@@ -132,13 +133,13 @@ class ModelSession:
     def run_together(
         self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
     ) -> NDArray[np.float32]:
-        """Infer the patterns of several windows in one call, as `run` does of one.
+        """Infer the patterns of several windows in one call; see `run`.
 
         A graph of one window a run is called once for each.
 
         Args:
             windows: one or more, of different sensors.
-            pads: of the same sensors; without, nothing is known of any.
+            pads: rows of the same sensors; by default those of unknown pads.
 
         Returns:
             (n, H, W).
@@ -180,7 +181,7 @@ class ModelSession:
             self.run(np.zeros(self._shape, dtype=np.float32))
 
     def _end_run(self) -> None:
-        self._options.terminate = True  # looked at before each operator
+        self._options.terminate = True  # checked before each operator
 
 
 class _Run:
@@ -213,7 +214,7 @@ def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> N
 
 
 def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
-    """The runtime's own settings."""
+    """Return the session options of the runtime."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = LOG_FATAL_ONLY
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -222,25 +223,25 @@ def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
-    # Second locks behind `read_model`. Nothing can lie below the null device; and by its first bytes a file may also be
-    # of onnxruntime's own format, which is not looked into.
+    # A second lock after `read_model`. No file can lie below the null device; and without the format a file might be
+    # read as onnxruntime's own, which `read_model` does not check.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
     options.add_session_config_entry("session.load_model_format", "ONNX")
     return options
 
 
 def load_session(path: Path, threads: int = 1, stop: threading.Event | None = None) -> onnxruntime.InferenceSession:
-    """Any ONNX file in the runtime's own settings, its contract not asked for.
+    """Load any ONNX file with the runtime's session options, without looking for a contract.
 
     Raises:
-        ModelError: no such file, not a model, not one plain graph with its weights, or it takes too long.
+        ModelError: the file is missing, not a model, not one plain graph with its weights, or loading takes too long.
     """
     content = read_model(path)
     flush_denormals(session_options)
     options = session_options(threads)
 
     def load() -> onnxruntime.InferenceSession:
-        # Its fallback tries the same again, and prints on stdout, where records go.
+        # The fallback would try the same again, and print on stdout, where records go.
         return onnxruntime.InferenceSession(
             content,
             options,
@@ -256,7 +257,7 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
 
 
 def _reason(error: Exception) -> str:
-    """What onnxruntime says, without where in its source, which may be all that there is room for."""
+    """Return onnxruntime's message without the place in its source, which may take all the room."""
     said = _PLACE.sub("", " ".join(str(error).split()))
     return said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]}..."
 

@@ -1,7 +1,7 @@
-"""Load a model within a time limit, on a thread that can be left behind.
+"""Loading of a model within a time limit, on a thread that can be abandoned.
 
-While onnxruntime loads a graph, and while it runs it first, Python handles no signal on the thread that asked for it.
-So that thread only waits, and gives up in time.
+While onnxruntime loads a graph, and during its first run, Python handles no signal on the calling thread. So the
+calling thread only waits, and gives up in time.
 """
 
 import threading
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     import onnxruntime
 
 LOAD_LIMIT_S: Final = 60.0
-"""A thousand times what the bundled models take, and enough for a network fifty times as large on a busy machine."""
+"""Longest load: a thousand times that of the bundled models, and enough for a network fifty times as large on a busy
+machine."""
 STOP_S: Final = 0.5
-"""Time that each part of a load may still take after a stop was asked for: any usual one is done by then, and two
+"""Time that each part of a load may still take after a stop was requested: any usual one is done by then, and two
 in a row before a program is ended by force."""
 _POLL_S: Final = 0.1
 _THREAD: Final = "edge: loading a model"
@@ -30,7 +31,7 @@ _IDENTITY: Final = (
     b"\x62\x0f\x0a\x01b\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01"
     b"\x42\x02\x10\x0d"  # operator set
 )
-"""The smallest graph that onnxruntime loads. Source: onnx.proto, ModelProto and what it holds."""
+"""Smallest graph that onnxruntime loads. Source: onnx.proto, ModelProto and its messages."""
 
 Made = TypeVar("Made")
 
@@ -41,14 +42,14 @@ def within_limit(
     stop: threading.Event | None = None,
     give_up: Callable[[], object] = lambda: None,
 ) -> Made:
-    """Do a part of loading a model on another thread, and return or raise what it returns or raises.
+    """Do a part of loading a model on another thread, and return its value or raise its exception.
 
-    Work that is given up goes on until it ends, `give_up` ends it, or the program ends. See `unfinished_load`.
+    Abandoned work goes on until it ends, `give_up` ends it, or the program ends. See `unfinished_load`.
 
     Args:
-        work: what is to be done.
+        work: the part to do.
         path: of the model, for the message.
-        stop: gives up early.
+        stop: event that ends the wait early.
         give_up: asks the work to end, and does not wait for it.
 
     Raises:
@@ -83,9 +84,9 @@ def within_limit(
 
 
 def unfinished_load() -> bool:
-    """Whether a load that was given up still goes on: then a program must end by `os._exit`, or onnxruntime may crash.
+    """Return whether an abandoned load still goes on; the program must then end by `os._exit`.
 
-    It takes apart at exit what that thread is still using.
+    Otherwise onnxruntime may crash at exit, when it frees objects that the thread still uses.
     """
     return any(thread.name == _THREAD for thread in threading.enumerate())
 
@@ -95,8 +96,8 @@ def flush_denormals(options_of: "Callable[[], onnxruntime.SessionOptions]") -> N
     """Build a session on this thread, so that onnxruntime makes denormals zero on it, which it does once in a process.
 
     Args:
-        options_of: gives options that ask for it.
+        options_of: returns options with that setting.
     """
-    import onnxruntime  # here, so that the command line may ask for `unfinished_load` without it
+    import onnxruntime  # here, so that the command line can call `unfinished_load` without it
 
     onnxruntime.InferenceSession(_IDENTITY, options_of(), providers=["CPUExecutionProvider"])

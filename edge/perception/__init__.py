@@ -1,1 +1,1 @@
-"""Scans to taps, taps to patterns: all that is computed, without I/O."""
+"""Scans to taps and taps to patterns: the computation, without I/O."""

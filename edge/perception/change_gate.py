@@ -1,8 +1,9 @@
-"""What of a scan needs computing. No I/O, no clock.
+"""Decision which part of a scan needs computing. No I/O, no clock.
 
-Nothing, where nothing touches. The pattern before, where nothing has changed beyond noise since the scan that it was
-made from: that scan, not the last one, so that what creeps is followed. Else a pattern, from the taps that matter: the
-newest, and one earlier tap more each time that the pattern of a tap was expected to gain by another.
+Without contact nothing is inferred. The last pattern is reused where nothing has changed beyond noise since the scan
+that it was made from; comparing with that scan and not with the newest one follows slow creep. Else a pattern is
+inferred from the newest tap and a number of earlier taps, which grows by one each time that the pattern of a tap was
+expected to gain by another.
 """
 
 import math
@@ -15,15 +16,15 @@ from numpy.typing import NDArray
 from edge.perception.tap_tracker import TapState
 
 NOISE_COUNTS: Final = 2.0
-"""Standard deviation of a reading at rest: 1.7 to 2.6 on record."""
+"""Standard deviation of a reading at rest: 1.7 to 2.6 in recordings."""
 CHANGED_RMS_COUNTS: Final = 1.4 * math.sqrt(2) * NOISE_COUNTS
-"""RMS of the change of all readings that noise, which is in both scans, does not reach: four of its deviations off."""
+"""RMS change of all readings that noise, present in both scans, does not reach: four of its deviations away."""
 CHANGED_COUNTS: Final = 5 * math.sqrt(2) * NOISE_COUNTS
 """Change of one reading that noise does not reach."""
 
 
 class TapsThatMatter:
-    """How many of a sensor's taps a pattern is made from: an early stop, tap by tap."""
+    """Number of a sensor's taps that a pattern is made from: an early stop, tap by tap."""
 
     def __init__(self) -> None:
         self._wanted = 1
@@ -32,10 +33,10 @@ class TapsThatMatter:
         self._another = True
 
     def of(self, tap: TapState) -> int:
-        """Taps to use for this scan, 1 to those there are; 0 without contact."""
+        """Return the number of taps to use for this scan, 1 to those available; 0 without contact."""
         if not tap.contact:
             return 0
-        if tap.tap != self._tap:  # a reset makes another of a tap that goes on
+        if tap.tap != self._tap:  # a reset gives a tap that goes on a new number
             if self._another:
                 self._wanted += 1
             self._tap, self._another, self._strongest_counts = tap.tap, True, -math.inf
@@ -43,9 +44,9 @@ class TapsThatMatter:
         return self._wanted
 
     def judge(self, force_counts: float, another_tap: bool | None) -> None:
-        """What the pattern of this scan was expected to gain by another tap; the strongest scan of a tap decides.
+        """Note whether this scan's pattern was expected to gain by another tap; the strongest scan of a tap decides.
 
-        Where that is not known, another tap counts as worth it.
+        Where the expectation is unknown, another tap counts as worth it.
         """
         if force_counts > self._strongest_counts:
             self._strongest_counts = force_counts
@@ -53,7 +54,7 @@ class TapsThatMatter:
 
 
 class LastReading:
-    """The readings that a sensor's last pattern was made from; allocates nothing after construction."""
+    """Readings that a sensor's last pattern was made from; allocates nothing after construction."""
 
     def __init__(self, scan_shape: tuple[int, int, int]) -> None:
         self._counts = np.zeros(scan_shape, dtype=np.float32)
@@ -61,7 +62,7 @@ class LastReading:
         self._made_by: Hashable = None
 
     def holds(self, counts: NDArray[np.float32], made_by: Hashable) -> bool:
-        """Whether zeroed readings (3, rows, cols) differ by noise alone, and the same makes the pattern."""
+        """Return whether zeroed readings (3, rows, cols) differ by noise alone and the pattern has the same maker."""
         if made_by != self._made_by:
             return False
         np.subtract(counts, self._counts, out=self._change)
@@ -71,6 +72,6 @@ class LastReading:
         return float(np.vdot(self._change, self._change)) <= CHANGED_RMS_COUNTS**2 * self._change.size
 
     def keep(self, counts: NDArray[np.float32], made_by: Hashable) -> None:
-        """A pattern was made from these, by this; None keeps nothing."""
+        """Keep the readings that a pattern was made from, and its maker; None as the maker keeps nothing."""
         self._counts[...] = counts
         self._made_by = made_by

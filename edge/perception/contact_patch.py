@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 
 def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
-    """Pixels that reach `level` of the pattern's maximum, (..., H, W) bool; none where it is not above zero."""
+    """Return the pixels that reach `level` of the pattern's maximum, (..., H, W) bool; none if that is not positive."""
     peak = pattern.max(axis=(-2, -1), keepdims=True)
     return (pattern >= level * peak) & (peak > 0)
 
@@ -13,16 +13,16 @@ def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
 def touched_patch(
     pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
 ) -> tuple[float, tuple[float, float] | None]:
-    """Area and centroid of the touched pixels.
+    """Return area and centroid of the touched pixels.
 
     Args:
         pattern: (H, W).
-        touching: (H, W), which pixels are touched; their pattern is above zero.
+        touching: (H, W), the touched pixels; the pattern is above zero there.
         pixel_pitch_mm: distance of neighbouring pixels, in [mm].
 
     Returns:
         Area in [mm2]; pattern-weighted centroid x, y in [mm] from the pattern's centre, x to the
-        right and y down, or None where nothing is touched.
+        right and y down, or None if no pixel is touched.
     """
     rows, cols = np.nonzero(touching)
     if rows.size == 0:

@@ -1,7 +1,7 @@
-"""What stands for dead taxels: an estimate from the living ones.
+"""Estimate of dead taxels from the living ones.
 
-Readings are taken as drawn from one of several kinds of contact, each a zero-mean Gaussian of any scale: a figure's
-edge, a face over the whole pad. The living taxels weigh the kinds, and each says what the dead ones would read.
+Readings are modelled as drawn from one of several kinds of contact, each a zero-mean Gaussian of any scale: the edge of
+a figure, a face over the whole pad. The living taxels give the probability of each kind, and each kind an estimate.
 """
 
 import math
@@ -17,10 +17,10 @@ from edge.perception.result import Filled
 from firmware_bridge.recording.npz_reader import read_npz
 
 RIDGE: Final = 2e-3
-"""Of a kind's mean variance, added to every channel: gains and noise of a sensor of its own."""
+"""Share of a kind's mean variance that is added to every channel, for the gains and noise of the individual sensor."""
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
-"""Of deviations with so many of sixteen taxels dead, that 90 % intervals hold 90 % of pixels: on validation presses,
-the larger of STSR's and MTSR-4's. On contacts unlike those of training it may be too little."""
+"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels: fitted on
+validation presses, the larger of STSR's and MTSR-4's. They may be too small on contacts unlike those of training."""
 _OF_TAXELS: Final = 16
 MOST_BYTES: Final = 1 << 24
 MOST_KINDS: Final = 64
@@ -30,12 +30,12 @@ _Z: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Readings with something in the place of dead taxels.
+    """Readings with estimates in the place of dead taxels.
 
     Attributes:
         counts: (3, rows, cols) float32, for the network; finite.
         z_counts: summed z.
-        filled: what stands for them.
+        filled: kind of the estimates.
     """
 
     counts: NDArray[np.float32]
@@ -44,7 +44,7 @@ class Readings:
 
 
 class TaxelEstimator:
-    """Estimates dead taxels by what simulated presses read.
+    """Estimator of dead taxels, fitted on readings of simulated presses.
 
     Args:
         covariances: (kinds, 3 taxels, 3 taxels) of zeroed counts about zero, of any scale, x of all taxels first,
@@ -52,7 +52,7 @@ class TaxelEstimator:
         grid_shape: (rows, cols).
 
     Raises:
-        EdgeError: the covariances are of another grid, or not such.
+        EdgeError: the covariances are of another grid, or not positive definite.
     """
 
     def __init__(self, covariances: NDArray[np.floating], grid_shape: tuple[int, int]) -> None:
@@ -69,7 +69,7 @@ class TaxelEstimator:
         self._covariances = ridged(exact)
 
     def filler(self, dead: NDArray[np.bool_]) -> "Filler":
-        """What fills in for `dead` (rows, cols), some of which live."""
+        """Return the filler for the taxels `dead` (rows, cols), some of which must be alive."""
         if dead.shape != self._grid_shape or dead.all():
             raise EdgeError(
                 f"{np.count_nonzero(dead)} dead taxels of {dead.shape}, expected fewer, of {self._grid_shape}"
@@ -78,7 +78,7 @@ class TaxelEstimator:
 
 
 class Filler:
-    """Fills in for the same dead taxels scan after scan; all that does not depend on readings is worked out before."""
+    """Filler for the same dead taxels scan after scan; computes once all that does not depend on readings."""
 
     def __init__(self, dead: NDArray[np.bool_], covariances: NDArray[np.float64]) -> None:
         off = np.tile(dead.ravel(), _AXES)
@@ -88,7 +88,7 @@ class Filler:
         self._maps = np.linalg.solve(living, covariances[:, self._live[:, None], self._dead]).transpose(0, 2, 1)
 
     def __call__(self, zeroed: NDArray[np.float32]) -> Readings:
-        """Fill in one scan (3, rows, cols) in zeroed counts; what dead taxels read in it is not looked at."""
+        """Fill in one scan (3, rows, cols) in zeroed counts; readings of dead taxels in it are ignored."""
         living = zeroed.ravel()[self._live].astype(np.float64)
         counts = zeroed.copy()
         counts.flat[self._dead] = self._kinds.weigh(living[None])[0] @ (self._maps @ living)
@@ -96,7 +96,7 @@ class Filler:
 
 
 class Kinds:
-    """Weighs kinds of contact, equally frequent, by readings, whatever their scale.
+    """Probabilities of kinds of contact, equally frequent, from readings of any scale.
 
     Args:
         covariances: (kinds, n, n) of readings.
@@ -110,7 +110,7 @@ class Kinds:
         self._log_sizes = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
 
     def weigh(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Probability of each kind, (m, kinds), by readings (m, n)."""
+        """Return the probability of each kind, (m, kinds), from readings (m, n)."""
         square = np.square(self._whiteners @ readings.T).sum(axis=1) + np.finfo(np.float64).tiny
         log_weight = -readings.shape[1] / 2 * np.log(square) - self._log_sizes[:, None]
         weight = np.exp(log_weight - log_weight.max(axis=0))
@@ -118,12 +118,12 @@ class Kinds:
 
 
 def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariances (kinds, n, n) with RIDGE on each one's diagonal."""
+    """Return covariances (kinds, n, n) with the ridge added to the diagonal of each."""
     return covariances + ridge_of(covariances)[:, None, None] * np.eye(covariances.shape[1])
 
 
 def ridge_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What RIDGE comes to for each of (kinds, n, n)."""
+    """Return the ridge in squared counts for each of (kinds, n, n)."""
     return RIDGE * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
 
 
@@ -133,7 +133,7 @@ def widening(dead_share: float) -> float:
 
 
 def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
-    """Read what `train.freeze` found of simulated presses.
+    """Load the covariances that `train.freeze` computed from simulated presses.
 
     Raises:
         EdgeError: the file cannot be read, or is of another grid.

@@ -1,6 +1,6 @@
-"""Events and notes of a run, each of a closed set of kinds: programs read the kind, text is made where it is shown.
+"""Events and notes of a run, each of a closed set of kinds: programs read the kind, the text is made for display.
 
-An event happens once; a note holds for as long as results have it.
+An event happens once; a note holds for as long as results carry it.
 """
 
 from collections.abc import Iterable
@@ -20,22 +20,22 @@ _HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One thing that happened.
+    """One event of a run.
 
     Attributes:
         time_ns: monotonic time, in [ns].
         kind: one of KINDS.
 
-            Of a link, as in `Notice`, or of one sensor while others go on: "lost", "silent", "back", "trouble", "well".
-            Of a recording that is played or made: "note". Of where results go: "sink", it was given up, or nobody
-            reads it.
+            Kinds of a link, as in `Notice`, or of one sensor while others go on: "lost", "silent", "back", "trouble",
+            "well". Kind of a recording that is played or made: "note". Kind of a sink: "sink", it was given up, or
+            nobody reads it.
 
-            Of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was asked for;
+            Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
-            has ended without a baseline; "refused", something else that was asked for is not done; "rest_level", a
-            step in it, or its end.
-        sensor: name of the sensor, or None where it is about all, or none.
-        detail: what the kind does not say, in a user's words.
+            has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
+            its end.
+        sensor: name of the sensor, or None if the event concerns all, or none.
+        detail: what the kind leaves open, in a user's words.
 
     Raises:
         ValueError: the kind is not one of KINDS.
@@ -52,7 +52,7 @@ class Event:
 
     @property
     def text(self) -> str:
-        """The event in a user's words."""
+        """Text of the event in a user's words."""
         match self.kind:
             case "reset":
                 return "earlier taps forgotten"
@@ -90,19 +90,20 @@ class Untimed(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """One thing that a user should know of a result.
+    """One remark on a result for its user.
 
     Attributes:
         kind: one of NOTE_KINDS.
 
-            Of taxels: "held", the last reading of one stands for the present; "estimated", dead ones are, from their
-            neighbours; "dead", and there is no pattern; "frozen", the whole sensor.
+            Of taxels: "held", the last reading of a taxel stands for the present; "estimated", dead taxels are
+            estimated from their neighbours; "dead", taxels are dead and there is no pattern; "frozen", the whole sensor
+            is frozen.
 
-            Of zeroing: "zeroing", it goes on; "zeroing_restarted", and why; "no_stored_baseline", so the sensor is
-            zeroed; "not_in_sensor_file".
+            Of zeroing: "zeroing", it goes on; "zeroing_restarted", with the reason; "no_stored_baseline", so the sensor
+            is zeroed; "not_in_sensor_file".
 
             Of the rest level: "rest_level", it has stepped; "all_alike", a contact looks like drift. Of time: "late",
-            the reading was old when it came.
+            the reading was old when it arrived.
         text: in a user's words.
 
     Raises:

@@ -14,17 +14,17 @@ from edge.perception.result import Result
 
 Function = Callable[[Any], Any]
 PLACE_IN_HEADER: Final = -1
-"""Stands for the byte of a map in shared memory: it follows from the map's size, so the header gives it."""
+"""Mark of a map in shared memory: its byte follows from the map's size, so the header states it."""
 
 
 class Out(Flag):
-    """Outputs that hold a field, besides shared memory, where a field has a byte.
+    """Outputs that hold a field, in addition to shared memory, where a field has a byte.
 
     Attributes:
         RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
         NPZ: arrays of a recording.
         ROS: members of tactile_edge_sr/msg/Result.
-        MAP: maps beside the record: in lines of JSON, in packed messages and as images of MCAP.
+        MAP: maps next to the record: in lines of JSON, in packed messages and as images of MCAP.
         ALL: all but maps.
     """
 
@@ -44,10 +44,10 @@ class Kind:
         array: numpy's type, in npz.
         packed: struct's character, in shared memory.
         message: ROS's type.
-        unknown: stands for an unknown value where there is no null; None where the value is always known.
+        unknown: value for "unknown" in outputs without null; None where the value is always available.
         words: the values of a choice. In shared memory they are numbered from 1, so that memory that nobody wrote is
             none of them, and the order is part of the format.
-        shape: of a map, the name of its shape: "scan", "pattern", "deviation" or "traction".
+        shape: name of a map's shape: "scan", "pattern", "deviation" or "traction".
         cut: npz cuts a text that is too long, rather than refuse it.
     """
 
@@ -84,7 +84,7 @@ class Columns:
         rounded = tuple((index, one.decimals) for index, one in enumerate(columns) if one.decimals is not None)
         self._rounded = rounded
         self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
-        # From the last to the first, so that a vector that is spread out moves none that is still to be.
+        # From the last to the first, so that spreading out a vector does not move those still to come.
         self._vectors = tuple(index for index, unknown in reversed(self._unknown) if isinstance(unknown, tuple))
 
     def of(self, result: Result) -> list[Any]:
@@ -116,17 +116,17 @@ class Field:
     """One field of a result, in every output that holds it.
 
     Attributes:
-        name: in every output; ends with the unit where there is one.
+        name: in every output; ends with the unit if it has one.
         kind: type of the value, or of each component of a vector.
-        attribute: dotted path from the result to what the value is made of.
-        text: what it is, for the pages.
-        make: makes the value of the attribute, unless that is None; None takes it as it is.
-        decimals: of a number in JSON.
-        parts: names of a vector's components, where an output holds them one by one.
-        json: makes the value in JSON of the attribute, where `make` and `decimals` do not.
+        attribute: dotted path from the result to the attribute that the value is made of.
+        text: description of the value, for the pages.
+        make: converts the attribute into the value, unless that is None; None takes it as it is.
+        decimals: decimals of a number in JSON.
+        parts: names of a vector's components, for outputs that hold them one by one.
+        json: converts the attribute into the JSON value, if `make` and `decimals` do not.
         out: outputs that hold it.
-        byte: where it begins in a half of shared memory. The layout only grows at its end.
-        left_out: a record has no such key while the value is unknown.
+        byte: its first byte in a half of shared memory. The layout only grows at its end.
+        left_out: a record omits the key while the value is unknown.
     """
 
     name: str
@@ -143,7 +143,7 @@ class Field:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its components, or its own."""
+        """Names of the components, or the field's own."""
         return self.parts or (self.name,)
 
     def in_record(self) -> Column:
@@ -179,7 +179,7 @@ class Field:
 
 
 def _then(first: Function | None, second: Function) -> Function:
-    """Join two functions; the second sees no None."""
+    """Chain two functions; the second is never called with None."""
     return second if first is None else lambda value: None if (made := first(value)) is None else second(made)
 
 

@@ -1,4 +1,4 @@
-"""What a run may be asked for, under one name each from the flags of `edge-sr` to the tap tracker."""
+"""Options of a run, under one name each from the flags of `edge-sr` to the tap tracker."""
 
 import math
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ IDLE_RESET_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class RuntimeOptions:
-    """How results are made of scans; each field is the flag of its name, and the keyword of `edge.api.open_runtime`.
+    """Options of making results from scans; each field is the flag of its name, and a keyword of `open_runtime`.
 
     Attributes:
         contact_on_counts: summed z at which a tap begins.
         contact_off_counts: summed z below which it ends.
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
-        every_scan: infer also where nothing has changed beyond noise since the pattern before.
-        every_tap: use all taps there are, also those that are not expected to help.
-        follow_drift: let the rest level follow what a free pad reads.
+        every_scan: infer also where nothing has changed beyond noise since the last pattern.
+        every_tap: use all available taps, also those that are not expected to reduce the error.
+        follow_drift: let the rest level follow the readings of a free pad.
 
     Raises:
-        UsageError: contact thresholds or a time that cannot be.
+        UsageError: the contact thresholds or the time are out of range.
     """
 
     contact_on_counts: float = ON_COUNTS

@@ -1,4 +1,4 @@
-"""What the runtime says about one scan."""
+"""Result of the runtime for one scan."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ MADE: Final = (
     *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),
     *("expected_rmse_mm", "another_tap", "traction", "wrench", "wrench_origin"),
 )
-"""Of a result, what is made of a pattern."""
+"""Fields of a result that are made from a pattern."""
 
 State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
@@ -28,25 +28,24 @@ WrenchOrigin = Literal["calibrated", "nominal"]
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One scan and what was made of it; there is one for every scan, whatever its state.
+    """One scan and what was computed from it; every scan has one, whatever its state.
 
-    The attributes that are not listed here are fields of a record: `edge.perception.result_fields` describes them. None
-    stands for what is not known, or not there.
+    Attributes that are not listed here are fields of a record: `edge.perception.result_fields` describes them. None
+    stands for an unknown or missing value.
 
     Attributes:
-        scan: as it came.
+        scan: the scan as it arrived.
         pattern: (H, W) float32 in `pattern_unit`, as is `deviation`; `traction` is (3, h, w) float32 in [kPa].
         zeroed: (3, rows, cols) float32, each taxel's newest reading over the baseline in counts, along the pad's axes,
-            NaN where it was not zeroed; those of dead taxels as they read. None without a baseline.
+            NaN if it was not zeroed; dead taxels as they read. None without a baseline.
         window: (taps, 3, rows, cols) float32, the taps that the pattern is made from, newest first, as `zeroed` with
-            something for dead taxels; None without contact.
-        wrench: the traction summed up, see edge.perception.wrench.
+            estimates for dead taxels; None without contact.
+        wrench: sums of the traction over the pad, see edge.perception.wrench.
         baseline: subtracted from the scan.
-        drift: what of the baseline was followed since it was taken, and which step in rest level was not.
-        dead: taxels that are not believed, row-major from the top left, and why; empty where all are.
-        notes: what the user should know, such as why zeroing started over.
-        events: what happened before this scan: taps were forgotten, zeroing was done or refused, the rest level made a
-            step.
+        drift: drift that was followed since the baseline was taken, and the step in rest level that was not.
+        dead: dead taxels, row-major from the top left, and the reason of each; empty if all are alive.
+        notes: remarks for the user, such as why zeroing started over.
+        events: events before this scan: taps were forgotten, zeroing was done or refused, the rest level made a step.
     """
 
     scan: Scan
@@ -92,7 +91,7 @@ class Result:
         return joined(self.events) if self.events else None
 
     def baseline_text(self) -> str:
-        """Which baseline, how old."""
+        """Return id and age of the baseline in words."""
         if self.baseline is None:
             return "no baseline"
         if self.baseline_age_s is None:
@@ -101,12 +100,12 @@ class Result:
 
 
 def age_text(age_s: float) -> str:
-    """An age in [s], in seconds, minutes or hours."""
+    """Return an age in [s] as text in seconds, minutes or hours."""
     return f"{age_s:.0f} s" if age_s < 600 else f"{age_s / 60:.0f} min" if age_s < 36000 else f"{age_s / 3600:.0f} h"
 
 
 def mask_bits(taxels: NDArray[np.bool_]) -> int:
-    """A (rows, cols) mask as a number: bit i is taxel i, row-major from the top left."""
+    """Return a (rows, cols) mask as a number: bit i is taxel i, row-major from the top left."""
     return _bits(taxels.tobytes())
 
 

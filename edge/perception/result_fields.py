@@ -1,4 +1,4 @@
-"""Table of the fields of a result: every output, and the pages that describe them, are made from it.
+"""Table of the fields of a result, from which every output and the pages that describe them are made.
 
 A new field is one row here, and the attribute or the function that gives its value. By default it is then in the JSON
 record, the npz and the ROS message, and with a `byte` in shared memory; `python tests/docs/field_tables.py` writes it
@@ -200,6 +200,6 @@ MAPS: Final = tuple(field for field in FIELDS if Out.MAP in field.out)
 
 
 def maps_of(result: Result) -> dict[str, NDArray[np.float32]]:
-    """Return the maps that go beside a record, those that there are, by name."""
+    """Return the maps of a result that accompany its record, by name."""
     maps = ((field.name, getattr(result, field.attribute)) for field in MAPS)
     return {name: values for name, values in maps if values is not None}

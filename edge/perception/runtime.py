@@ -1,4 +1,4 @@
-"""Scan in, result out: the only state there is between scans, kept per sensor."""
+"""Scan in, result out: all state between scans is kept here, per sensor."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -28,60 +28,61 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
 OLD_NS: Final = 50_000_000
-"""Later by the device's own time stamps than its fastest reading of late: three times what a slow adapter keeps."""
+"""Age from which a reading is old, in [ns], by the device's time stamps and counted from its fastest recent reading:
+three times as long as a slow adapter holds readings."""
 
 
 class Model(Protocol):
-    """What the runtime needs of a model session."""
+    """Interface of a model session as the runtime uses it."""
 
     name: str
     contract: Contract
 
     def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Pattern (H, W) of a window (taps, 3, rows, cols) in network input units, and of a `Contract.pad_row`."""
+        """Return the pattern (H, W) of a window (taps, 3, rows, cols) in network input units and its pad row."""
         ...
 
     def run_together(
         self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
     ) -> NDArray[np.float32]:
-        """Patterns (n, H, W) of several windows in one call."""
+        """Return the patterns (n, H, W) of several windows in one call."""
         ...
 
     @property
     def deviation(self) -> NDArray[np.float32] | None:
-        """Standard deviation of each pixel of the last run's patterns, of their shape; None where there is none."""
+        """Standard deviation of each pixel of the last run's patterns, of their shape; None without."""
         ...
 
     @property
     def traction(self) -> NDArray[np.float32] | None:
-        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]; None where there is none."""
+        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]; None without."""
         ...
 
 
 class Runtime:
-    """Makes one result of every scan.
+    """Maker of one result per scan.
 
     Args:
         model: the loaded model.
-        source: what kind of source the scans come from; every result says it.
-        estimator: of dead taxels, on the same grid; without it there is no pattern while one is dead.
+        source: kind of source that the scans come from; every result carries it.
+        estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
         geometry: of the sensors; refused if the model was not trained for it.
         baselines: stored baselines by sensor name; a sensor without one is zeroed from its first
             scans, during which its pad must be still and free.
         counts_per_newton: summed z per [N], of all sensors or by name; without it a force in newtons is the vendor's,
-            where the scan has one.
-        mountings: which way a sensor's axes point, and its gains, by name; as wired without.
-        pad: what is known of the pad of all sensors, or of each by name, for models that take any of it. Counts per
-            newton that it lacks are those above.
-        options: where taps begin and end, and what may be left out.
+            if the scan has one.
+        mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
+        pad: properties of the pad of all sensors, or of each by name, for models that use them. Counts per newton that
+            it lacks are those above.
+        options: thresholds of taps, and which computations may be omitted.
         clock_ns: measures run time.
-        unix_time_s: dates baselines that are taken, and tells how old a stored one is when its sensor is first heard;
-            ages go on by scan time.
+        unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
+            from then on ages follow scan time.
 
     Raises:
         ModelError: the model is for another sensor.
-        UsageError: counts per newton, a pad or a number of taps that cannot be, or a baseline or a mounting of another
-            grid.
+        UsageError: counts per newton, a pad or a number of taps are out of range, or a baseline or a mounting is of
+            another grid.
     """
 
     def __init__(
@@ -120,7 +121,7 @@ class Runtime:
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._options = options
-        # Plain attributes: asked of every scan.
+        # Plain attributes, since every scan reads them.
         self._every_scan, self._every_tap = options.every_scan, options.every_tap
         self._follow_drift = options.follow_drift
         self._clock_ns = clock_ns
@@ -130,18 +131,18 @@ class Runtime:
 
     @property
     def expected(self) -> frozenset[str]:
-        """Names of the sensors that there are stored baselines of, or counts per newton."""
+        """Names of the sensors with stored baselines or counts per newton."""
         per_newton = self._counts_per_newton
         return frozenset({*self._baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
 
     def reset(self) -> None:
-        """Forget the taps of every sensor, as when the robot moves to another object; an event tells. Zeroing stays."""
+        """Forget the taps of every sensor, as for a new object, and report it as an event; zeroing stays."""
         for sensor in self._sensors.values():
             sensor.taps.reset()
         self._report("reset")
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
-        """Zero again from the next scans; the old baselines stay in use until then, and an event tells what came of it.
+        """Zero again from the next scans; the old baselines stay in use until then, and an event reports the outcome.
 
         Args:
             name: of the sensor; None for all.
@@ -156,10 +157,10 @@ class Runtime:
             sensor.zero_again(force=force)
 
     def lose_touch(self, sensors: str = "") -> None:
-        """Forget what readings and taps there were: the link broke, and nobody saw what happened; zeroing stays.
+        """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.
 
         Args:
-            sensors: how the names of those begin that it is about.
+            sensors: prefix of the names of the sensors concerned; all by default.
         """
         for name, sensor in self._sensors.items():
             if name.startswith(sensors):
@@ -173,11 +174,11 @@ class Runtime:
         return self.push_together([(scan, infer)])[0]
 
     def push_together(self, scans: Sequence[tuple[Scan, bool]]) -> list[Result]:
-        """Make the results of scans, in their order; what is to be inferred is inferred in one call.
+        """Make the results of scans, in their order; all patterns that are due are inferred in one call.
 
         Args:
-            scans: each with whether it is inferred if it touches. A scan that a newer one of its sensor has overtaken
-                is spared; its tap is followed all the same.
+            scans: each with whether it is inferred if it is in contact. A scan that a newer one of its sensor has
+                overtaken is not inferred; its tap is followed all the same.
 
         Raises:
             WindowError: a scan is not of this sensor geometry.
@@ -235,7 +236,7 @@ class Runtime:
             force_n = force_counts / sensor.counts_per_newton
         else:
             force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
-        # A copy: the tracker goes on to write into its own, if the sensor's next scan comes in the same call.
+        # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
         window = tap.window.copy() if tap.contact else None
         result = Result(
             scan,
@@ -253,14 +254,14 @@ class Runtime:
         return result, None if window is None else _Due(sensor, window, made_by)
 
     def _take_events(self, sensor: Sensor, time_ns: int) -> tuple[Event, ...]:
-        """Return what has happened up to a scan of a sensor, at its time in [ns]."""
+        """Return the events up to a scan of a sensor, at its time in [ns]."""
         events = tuple(event.at(time_ns) for event in (*self._events, *sensor.events))
         self._events.clear()
         sensor.events.clear()
         return events
 
     def _unchanged(self, result: Result, due: "_Due") -> Result | None:
-        """The result with the pattern before, where there is no need of another."""
+        """Return the result with the last pattern, or None if a new pattern is needed."""
         before = due.sensor.last
         if self._every_scan or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
             return None
@@ -351,7 +352,7 @@ class Runtime:
         sensor.take_pad(self._model.contract)
         if baseline is not None:
             age_s = baseline.age_s(self._unix_time_s())
-            # Taken in the future it cannot have been: one of the two clocks was wrong.
+            # A baseline from the future means that one of the two clocks was wrong.
             sensor.use(baseline, age_s if age_s >= 0 else None, scan.time_ns)
         return sensor
 
@@ -361,7 +362,7 @@ class Runtime:
 
 
 def _age_notes(scan: Scan) -> tuple[Note, ...]:
-    """Return what to know of readings that were old when they came."""
+    """Return notes on readings that were old when they arrived."""
     if scan.device_ns is None:
         if scan.unread_ns <= OLD_NS:
             return ()
@@ -373,7 +374,7 @@ def _age_notes(scan: Scan) -> tuple[Note, ...]:
 
 
 class _Due(NamedTuple):
-    """What a pattern is to be made from: the sensor's window, and what makes it a pattern of its own."""
+    """Input of a pattern: the sensor's window, and the key that distinguishes its pattern from others."""
 
     sensor: Sensor
     window: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""What is remembered of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
+"""State of one sensor between scans: its zeroing, its taxels, its taps and its last pattern."""
 
 import time
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
 
 
 class Sensor:
-    """What is remembered of one sensor.
+    """State of one sensor between scans.
 
     Attributes:
         baseline: subtracted from the scans, drift and all; None before there is one.
@@ -56,7 +56,7 @@ class Sensor:
         self.taps_that_matter = TapsThatMatter()
         self.last_reading = LastReading(geometry.scan_shape)
         self.last: Result | None = None
-        # Plain attributes: a property of each would cost a scan at rest a twentieth.
+        # Plain attributes, since properties would make a scan at rest take a twentieth longer.
         self.baseline: Baseline | None = None
         self.drift: Drift | None = None
         self.zeroing_notes = notes
@@ -81,7 +81,7 @@ class Sensor:
         self._tracker: DriftTracker | None = None
 
     def take_pad(self, contract: Contract) -> None:
-        """Make what is known of the pad ready for a model, once for all its runs."""
+        """Convert the pad's properties to model input, once for all its runs."""
         pad = self.pad
         if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
             pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
@@ -94,12 +94,12 @@ class Sensor:
         self.wrench_origin = "calibrated" if told and takes else "nominal"
 
     def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
-        """Subtract this from now on.
+        """Subtract a baseline from now on.
 
         Args:
             baseline: of this sensor.
-            age_s: how old it was at `time_ns`, in [s]; None where that is not known.
-            time_ns: on the clock of the scans, in [ns]; ages go by it, since a wall clock may be set.
+            age_s: its age at `time_ns`, in [s]; None if unknown.
+            time_ns: on the clock of the scans, in [ns]; ages follow it, since a wall clock may be set.
         """
         self.baseline = self._taken = baseline
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
@@ -107,13 +107,13 @@ class Sensor:
         self.drift, self.drift_notes = self._tracker.summary, ()
 
     def age_s(self, time_ns: int) -> float | None:
-        """How old the baseline is, in [s]; None where that is not known."""
+        """Return the age of the baseline, in [s]; None if unknown."""
         return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
 
     def lose_touch(self) -> None:
-        """Readings and taps from before are worth nothing: the sensor was not heard for a time.
+        """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
 
-        Drift is followed again once the pad has been at rest, and its rest level compared with the one before.
+        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one.
         """
         self.taps.reset()
         self.last = None
@@ -126,7 +126,7 @@ class Sensor:
             self._report("given_up", "the sensor was away; ask again")
 
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
-        """The newest reading of every taxel over the baseline (3, rows, cols); None without a baseline."""
+        """Take a scan and return each taxel's newest reading over the baseline (3, rows, cols); None without one."""
         if self._heard_ns is not None and scan.time_ns - self._heard_ns > TAPS_FORGOTTEN_NS:
             self.lose_touch()
         self._heard_ns = scan.time_ns
@@ -145,7 +145,7 @@ class Sensor:
         return self.filler(zeroed) if self.filler is not None and self.watch.may_be_estimated else None
 
     def follow_drift(self, scan: Scan, contact: bool) -> None:
-        """Let the rest level follow what a free pad reads; the next scan is the first to know."""
+        """Let the rest level follow the readings of a free pad; it applies from the next scan on."""
         tracker, taken = self._tracker, self._taken
         if tracker is None or taken is None or not tracker.push(scan, contact, self.watch.dead):
             return
@@ -158,7 +158,7 @@ class Sensor:
             self._report("rest_level", event)
 
     def zero_again(self, *, force: bool) -> None:
-        """Take a new baseline from the next scans; the old one stays in use until then. An event tells what came of it.
+        """Take a new baseline from the next scans, with an event for the outcome; the old one stays in use until then.
 
         Args:
             force: also in contact.
@@ -176,8 +176,9 @@ class Sensor:
         return self.taps.contact and not (self._tracker is not None and self._tracker.doubted)
 
     def _bury(self) -> None:
-        """Get ready to fill in for other dead taxels than before."""
-        # What a taxel read before it was found out is in earlier taps; and no tap may be filled in unsaid.
+        """Prepare the estimate of the dead taxels after their set has changed."""
+        # Earlier taps hold what a taxel read before it was detected; and no tap may hold estimates that no note
+        # reports.
         self.taps.reset()
         self.filler = None
         dead = np.count_nonzero(self.watch.dead)
@@ -185,7 +186,7 @@ class Sensor:
             self.filler = self._estimator.filler(self.watch.dead)
 
     def _zero(self, scan: Scan) -> None:
-        """Use the scan for the baseline; a refusal becomes a note, and zeroing starts over."""
+        """Use the scan for the baseline; after a refusal a note reports it and zeroing starts over."""
         try:
             baseline = self._zeroing.push(scan, self._silent())
         except BaselineRefusedError as refusal:
@@ -196,7 +197,7 @@ class Sensor:
             self.zeroing_notes = ()
 
     def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> bool:
-        """Whether there is a new baseline."""
+        """Push a scan to a zeroing on demand and return whether it gave a new baseline."""
         try:
             baseline = rezeroing.push(scan, self._touched, self._silent())
         except BaselineRefusedError as refusal:
@@ -210,7 +211,7 @@ class Sensor:
         self._report("zeroed", f"baseline {baseline.id}{old}")
         self._end_rezeroing()
         self.use(baseline, 0.0, scan.time_ns)
-        self.taps.reset()  # earlier taps were read over another rest level
+        self.taps.reset()  # earlier taps were zeroed with another rest level
         return True
 
     def _end_rezeroing(self) -> None:

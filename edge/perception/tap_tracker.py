@@ -1,8 +1,8 @@
-"""Contact, the peak frame of each tap, and the window of K taps that the network sees.
+"""Contact, the peak frame of each tap, and the window of K taps for the network.
 
-Contact has two thresholds on the summed z, so that noise around one of them cannot chop a tap in
-pieces. While a tap goes on the window holds its current frame, not its peak: a robot gets a
-pattern from the first scan of a tap. The peaks are what earlier taps are remembered by.
+Contact has two thresholds on the summed z, so that noise around one of them cannot split a tap. While a tap goes on
+the window holds its current frame, not its peak, so that a robot gets a pattern from the first scan of a tap. Earlier
+taps are remembered by their peaks.
 """
 
 import math
@@ -17,18 +17,18 @@ from edge.perception.options import DEFAULTS, RuntimeOptions
 from firmware_bridge.geometry import USPA44
 
 MIN_TAP_SCANS: Final = 2
-"""A touch seen in one scan only may be a flipped bit; it is reported, but not remembered as a tap."""
+"""Fewest scans of a tap. A touch in a single scan may be a flipped bit; it is reported, but not remembered as a tap."""
 
 
 @dataclass(frozen=True, slots=True)
 class TapState:
-    """What the tracker knows after a scan.
+    """State of the tracker after a scan.
 
     Attributes:
-        contact: a tap is going on.
-        tap: number of the tap, from 0; of the last one without contact.
+        contact: True while a tap goes on.
+        tap: number of the tap, from 0; without contact that of the last one.
         taps_used: taps in the window, the current one included; 0 without contact.
-        window: (K, 3, rows, cols) float32, newest first, zeros where there was no tap. It is the
+        window: (K, 3, rows, cols) float32, newest first, zeros in place of missing taps. It is the
             tracker's own array: read-only, and overwritten by the next push.
     """
 
@@ -39,7 +39,7 @@ class TapState:
 
 
 class TapTracker:
-    """Follows the taps of one sensor; allocates no array after construction."""
+    """Tracker of the taps of one sensor; allocates no array after construction."""
 
     def __init__(
         self,
@@ -51,11 +51,11 @@ class TapTracker:
 
         Args:
             taps: K, the length of the window.
-            options: where taps begin and end, and when earlier ones are forgotten.
+            options: thresholds of taps, and when earlier ones are forgotten.
             grid_shape: (rows, cols) of the sensor.
 
         Raises:
-            UsageError: no taps.
+            UsageError: `taps` is less than 1.
         """
         if taps < 1:
             raise UsageError(f"taps is {taps}, expected at least 1")
@@ -73,11 +73,11 @@ class TapTracker:
 
     @property
     def contact(self) -> bool:
-        """A tap is going on."""
+        """True while a tap goes on."""
         return self._contact
 
     def reset(self) -> None:
-        """Forget every tap. A tap in progress goes on, as the first one, under a number of its own."""
+        """Forget every tap. A tap in progress continues as the first one, with a new number."""
         self._tap += self._contact
         self._window.fill(0)
         self._earlier = 0
@@ -85,7 +85,7 @@ class TapTracker:
         self._peak_counts = -math.inf
 
     def push(self, deformation: NDArray[np.float32], time_ns: int, z_counts: float | None = None) -> TapState:
-        """Follow one scan.
+        """Take one scan and return the new state.
 
         The idle time is measured between scans, from the last one in contact. Time that runs
         backwards counts as no time; a gap within a tap does not end the tap.
@@ -93,7 +93,7 @@ class TapTracker:
         Args:
             deformation: (3, rows, cols) float32, zeroed counts.
             time_ns: of the scan, in [ns].
-            z_counts: its summed z, where that is known better than from `deformation`.
+            z_counts: its summed z, if available more exactly than from `deformation`.
         """
         z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
         if self._contact:

@@ -1,4 +1,4 @@
-"""Which taxels of a sensor can be believed: held readings, dead taxels and why, scan by scan."""
+"""Health of a sensor's taxels, scan by scan: held readings, dead taxels and their reasons."""
 
 from typing import Final
 
@@ -12,35 +12,38 @@ from firmware_bridge.silence import TAXEL_SILENT_SCANS
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 HOLD_SCANS: Final = 5
-"""A taxel missing from a torn scan keeps its last reading this long: 50 ms at 100 Hz."""
+"""Scans for which a taxel that is missing from a torn scan keeps its last reading: 50 ms at 100 Hz."""
 HOLD_NS: Final = 90_000_000
-"""And no longer than this from scan to scan, however few came meanwhile: what was pressed half a second ago is another
-press. A reading may have come 60 ms before the end of its scan, the longest pause in one: none is older than 150 ms.
-Held since it was taken, not since it came, which a reader who was kept from running does not know."""
+"""Longest time that a reading is held, in [ns] from scan to scan, however few scans arrived meanwhile: what was pressed
+half a second ago is another press. A reading may have arrived 60 ms before the end of its scan, the longest pause
+inside one, so no held reading is older than 150 ms. The time counts from when the reading was taken, since a reader
+that was kept from running cannot date its arrival."""
 STUCK_SCANS: Final = 20
-"""A living taxel sends the same three counts twice in a quarter of the scans in which a quarter of the taxels are new:
-so torn are real grips at their source, and no run in them is longer than 3. Were scans independent, twenty in a row
-came once in decades at 100 Hz; with noise of two counts alone, where it is one scan in 350, never."""
+"""Repeats of a taxel in a row that make it stuck. A living taxel sends the same three counts twice in a quarter of the
+scans in which a quarter of the taxels are new, as torn as real grips are at their source, and no run there is longer
+than 3. If scans were independent, twenty in a row would come once in decades at 100 Hz; with noise of two counts
+alone, which repeats one scan in 350, never."""
 FROZEN_SENSOR_SCANS: Final = 10
-"""Bit for bit alike, all taxels at once: with noise of two counts 48 equal values do not come twice."""
+"""Scans bit for bit alike in all taxels: with noise of two counts 48 equal values do not come twice."""
 FROZEN_SCANS: Final = 300
-"""Without a new count, whatever the others do: most are stuck at once, or one old scan is sent for ever. A
-server was seen that sends 507 scans a second of a sensor that renews a taxel four times: that makes 127."""
+"""Scans without a new count of a taxel, whatever the others do: most are stuck at once, or one old scan is sent for
+ever. A server that sends 507 scans a second, of a sensor that renews a taxel four times, reaches 127."""
 FAR_SCANS: Final = 20
 BACK_SCANS: Final = 10
-"""Good scans after which a dead taxel is believed again, so that one that comes and goes does not flicker."""
+"""Good scans after which a dead taxel counts as alive again, so that an intermittent one does not flicker."""
 RANGE_ENDS: Final = (0, 65535)
-"""Of a chip. What stands there has left the range, and is no reading, unless the taxel rests nearby and wraps round."""
+"""Ends of a chip's range. A count there has left the range and is not a reading, unless the taxel rests nearby and
+wraps round."""
 NEAR_END_COUNTS: Final = 500.0
 LONE_COUNTS: Final = 1500.0
-"""As much as makes a contact."""
+"""Size of a reading from which a lone taxel is checked: as large as a contact."""
 LONE_SHARE: Final = 0.015
-"""What the second largest taxel reads of the largest: at least .030 where a small sphere stands on one taxel alone,
-.063 on simulated taps, .67 on real grips."""
+"""Share of the largest taxel's reading that the second largest reaches in any contact: at least .030 with a small
+sphere on one taxel alone, .063 on simulated taps, .67 on real grips."""
 REST_COUNTS: Final = 500.0
-"""A taxel found far from rest is believed again below this."""
+"""Reading below which a taxel that was far from rest is believed again."""
 REACH_COUNTS: Final = ((-2800.0, 2800.0), (-2800.0, 2800.0), (-2800.0, 27000.0))
-"""Of x, y, z: twice what sensors in the field have shown, whose z only rises when pressed."""
+"""Limits of x, y, z: twice what sensors in the field have shown, whose z only rises when pressed."""
 REASONS: Final = ("silent", "saturated", "stuck", "far", "unzeroed")
 SILENT, SATURATED, STUCK, FAR, UNZEROED = range(1, 6)
 _LOW, _HIGH = np.array(REACH_COUNTS, dtype=np.float32).T[:, :, None, None]
@@ -55,7 +58,7 @@ _OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
 
 
 class TaxelWatch:
-    """Follows the taxels of one sensor.
+    """Tracker of the health of one sensor's taxels.
 
     A taxel is dead while it is silent or saturated for longer than its last reading is held; stuck, when it repeats
     itself while most others do not; far, when it reads what no contact makes; or was not heard while zeroing. It is
@@ -98,7 +101,7 @@ class TaxelWatch:
 
     @property
     def silent_long(self) -> NDArray[np.bool_]:
-        """Taxels (rows, cols) not heard for TAXEL_SILENT_SCANS."""
+        """Taxels (rows, cols) that have not arrived for TAXEL_SILENT_SCANS."""
         return (self._age >= TAXEL_SILENT_SCANS) & ~self._saturated
 
     @property
@@ -108,16 +111,16 @@ class TaxelWatch:
         return len(self.reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
 
     def forget(self) -> None:
-        """No reading from before is held any longer; dead taxels stay dead until they prove themselves."""
+        """Hold no earlier reading any longer; dead taxels stay dead until enough good scans arrive."""
         self._heard[:] = False
         self.sound = False
 
     def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
-        """Follow one scan.
+        """Take one scan and return the newest readings over the baseline.
 
         Args:
             scan: the sensor's next one.
-            baseline: of the sensor, NaN where a taxel was not zeroed; None while there is none.
+            baseline: of the sensor, NaN where a taxel was not zeroed; None as long as there is no baseline.
 
         Returns:
             The newest readings over the baseline, (3, rows, cols) in counts, NaN where not zeroed; None without one.
@@ -133,8 +136,8 @@ class TaxelWatch:
                 zeroed = self._mounting.correct(zeroed)
             np.abs(zeroed, out=self._size)
             largest = float(self._size.max())
-            # Where nothing touches: near its rest no taxel is far, or at an end that is not its rest. Where something
-            # does: none is at an end or far, as one that has gone round the circle is.
+            # Near rest, without contact, no taxel is far or at an end that is not its rest. In contact every taxel must
+            # be inside the range, and not far as one is that has wrapped round.
             if largest <= NEAR_END_COUNTS or (
                 RANGE_ENDS[0] < scan.counts.min() <= scan.counts.max() < RANGE_ENDS[1]
                 and not self._may_be_far(zeroed, largest)
@@ -162,10 +165,10 @@ class TaxelWatch:
         return zeroed
 
     def notes(self, filled: str | None) -> tuple[Note, ...]:
-        """Return what to know of taxels that are not believed.
+        """Return notes on taxels that are not believed.
 
         Args:
-            filled: what stands for dead ones; None where there is no pattern for them.
+            filled: kind of the estimates of dead taxels; None if there is no pattern for them.
         """
         if self.sound:
             return ()
@@ -199,7 +202,7 @@ class TaxelWatch:
         return [taxel for taxel, why in self.reasons.items() if why == reason]
 
     def _find_saturated(self, scan: Scan, baseline: Baseline | None) -> bool:
-        """Keep which taxels stand, on some axis, at an end of the chip's range and far from rest; are there any?"""
+        """Mark taxels at an end of the chip's range on some axis and far from rest; return whether there are any."""
         low, high = RANGE_ENDS
         ends = (scan.counts == low) | (scan.counts == high)
         if not self.sound:
@@ -211,7 +214,7 @@ class TaxelWatch:
         return False
 
     def _may_be_far(self, zeroed: NDArray[np.float32], largest: float) -> bool:
-        """Quickly, of a sensor whose taxels are all alive; the full question is asked only where this is true.
+        """Return quickly whether a taxel may be far, if all taxels live; only then the full check is made.
 
         Args:
             zeroed: (3, rows, cols), its sizes being in `_size`.
@@ -226,7 +229,7 @@ class TaxelWatch:
         self._age += 1
         self._age[read] = 0
         self._read_ns[read] = scan.not_before_ns
-        # A scan in which few are new says nothing about one that is not: the adapter repeats itself.
+        # A scan with few new taxels is no evidence against one that is not new: the adapter repeats itself.
         if 4 * np.count_nonzero(scan.renewed) >= np.count_nonzero(~self.dead) > 0:
             self._still += scan.fresh & ~scan.renewed
         self._still[scan.renewed] = 0
@@ -254,17 +257,17 @@ class TaxelWatch:
         if (code != self._code).any():
             dead = code > 0
             if (dead != self.dead).any():
-                self.dead = dead  # a new one, so that a change is seen by identity
+                self.dead = dead  # a new array, so that a change is detected by identity
             self._code = code
             self.reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
         counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
         self.sound = not counting and not self.dead.any() and bool(self._heard.all())
 
     def _follow_far(self, zeroed: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-        """Count scans in which a taxel reads what no contact makes; the largest of its axes, (rows, cols)."""
+        """Count scans in which a taxel reads what no contact makes; return the largest of its axes, (rows, cols)."""
         if zeroed is None:
             return None
-        # Where a taxel is dead or was not zeroed its reading is none, and others may not be measured by it.
+        # A taxel that is dead or was not zeroed gives no reading, and others may not be measured by it.
         size = np.nan_to_num(np.abs(zeroed).max(axis=0))
         beyond = ((zeroed < _LOW) | (zeroed > _HIGH)).any(axis=0)
         living = np.where(self.dead, 0, size)

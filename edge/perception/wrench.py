@@ -1,8 +1,8 @@
 """Force and torque on a pad from the traction on its face. No I/O.
 
-The frame is that of everything here: x to the right, y down the rows, and so, to be right-handed, z into the pad; its
-origin is the middle of the face. What is told acts on the pad: pressing is a positive z force, and a twist, torque
-about z, is positive where it turns x to y, clockwise for one who looks at the pad from above.
+The frame is that of the whole project: x to the right, y down the rows, and so, to be right-handed, z into the pad; its
+origin is the middle of the face. Forces and torques act on the pad: pressing is a positive z force, and a twist, torque
+about z, is positive if it turns x to y, clockwise for a viewer who looks at the pad from above.
 """
 
 import math
@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEAST_FORCE_N: Final = 0.1
-"""Of z, below which noise would move the centre of pressure about; a tap begins at ten times as much."""
+"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
 _N_OF_KPA_MM2: Final = 1e-3
 
 
 class Wrench(NamedTuple):
-    """What acts on a pad as a whole.
+    """Total force and torque on a pad.
 
     Attributes:
         force_n: x, y, z in [N].
         torque_n_mm: about x, y, z through the middle of the face, in [N mm]; the last is the twist.
-        centre_of_pressure_mm: x, y from the middle where the z force alone would give the torques about x and y, in
-            [mm]; None where nothing much presses.
+        centre_of_pressure_mm: x, y from the middle of the point where the z force alone would give the torques about x
+            and y, in [mm]; None if hardly anything presses.
     """
 
     force_n: tuple[float, float, float]
@@ -33,13 +33,13 @@ class Wrench(NamedTuple):
 
     @property
     def shear_ratio(self) -> float | None:
-        """Tangential over normal force, whatever the sensor's counts per newton; None where nothing much presses."""
+        """Tangential over normal force, whatever the sensor's counts per newton; None if hardly anything presses."""
         x, y, z = self.force_n
         return math.hypot(x, y) / z if z >= LEAST_FORCE_N else None
 
 
 def wrench_of(traction_kpa: NDArray[np.floating], pixel_mm: float) -> Wrench:
-    """Sum a traction up over the face.
+    """Sum a traction over the face to force and torque.
 
     Args:
         traction_kpa: (3, h, w) of x, y, z, constant within each pixel, the middle of the grid over that of the face,
@@ -54,7 +54,7 @@ def wrench_of(traction_kpa: NDArray[np.floating], pixel_mm: float) -> Wrench:
 
 @lru_cache(maxsize=8)
 def _sums(height: int, width: int, pixel_mm: float) -> NDArray[np.float64]:
-    """Matrix (6, 3 h w) that makes force and torque of a flat traction."""
+    """Return the matrix (6, 3 h w) that maps a flat traction to force and torque."""
     y_mm, x_mm = np.indices((height, width), dtype=np.float64).reshape(2, -1)
     x_mm, y_mm = (x_mm - (width - 1) / 2) * pixel_mm, (y_mm - (height - 1) / 2) * pixel_mm
     one, none = np.ones_like(x_mm), np.zeros_like(x_mm)

@@ -14,21 +14,21 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
 GIVE_UP_NS: Final = 15_000_000_000
-"""Of scan time: ten tries at 100 Hz, and four at 30."""
+"""Longest zeroing on demand, in [ns] of scan time: ten tries at 100 Hz, and four at 30 Hz."""
 
 
 class Rezeroing:
-    """Takes one new baseline of one sensor, or gives up.
+    """Zeroing of one sensor on demand: takes one new baseline, or gives up.
 
     Attributes:
-        note: how it stands.
+        note: its progress.
     """
 
     def __init__(self, old: Baseline, *, force: bool, unix_time_s: Callable[[], float] = time.time) -> None:
         """Start with the next scan.
 
         Args:
-            old: the baseline so far; against it a load is seen.
+            old: the baseline so far; a load shows as a difference from it.
             force: zero away a contact or a load.
             unix_time_s: dates the new one, in [s] since 1970.
         """
@@ -41,15 +41,16 @@ class Rezeroing:
         self._estimator = self._new_estimator()
 
     def push(self, scan: Scan, contact: bool, silent: NDArray[np.bool_] | None) -> Baseline | None:
-        """Take one more scan; the new baseline once there are enough.
+        """Take one more scan; return the new baseline once there are enough.
 
         Args:
             scan: the sensor's next one.
-            contact: a tap is going on; unless forced it starts the zeroing over.
+            contact: True while a tap goes on, which starts the zeroing over unless it is forced.
             silent: taxels (rows, cols) to zero without, as in `BaselineEstimator.push`.
 
         Raises:
-            BaselineRefusedError: it has tried for long enough, and why it did not succeed; the old baseline stays.
+            BaselineRefusedError: the tries have taken too long; the message gives the last reason. The old baseline
+                stays.
         """
         if self._end_ns is None:
             self._end_ns = scan.time_ns + GIVE_UP_NS

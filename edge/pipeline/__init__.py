@@ -1,1 +1,1 @@
-"""From a source through the runtime into sinks."""
+"""Pipeline from a source through the runtime into sinks."""

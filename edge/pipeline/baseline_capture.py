@@ -14,7 +14,7 @@ from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 
 FEWEST_RECORDED: Final = 30
-"""Of a recording, for which nobody can wait: where a pad is free for half a second alone, this is what there is."""
+"""Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
 
 
 def take_baselines(
@@ -25,20 +25,20 @@ def take_baselines(
     stop: threading.Event | None = None,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> dict[str, Baseline]:
-    """Baselines of all sensors of a source, by name, their pads free and still; gives up at the first refusal.
+    """Take the baselines of all sensors of a source, by name, from free, still pads; give up at the first refusal.
 
     Args:
-        source: open; what it gives meanwhile goes nowhere else.
-        scans: complete ones to take the median of, 100 or more; of a recording 30.
+        source: open; its scans meanwhile go nowhere else.
+        scans: number of complete scans to take the median of, 100 or more; of a recording 30 or more.
         skip: scans of each sensor to leave out first.
-        stop: gives up early.
+        stop: event that ends it early.
         clock_s: monotonic, in [s].
 
     Raises:
-        BaselineRefusedError: a pad moved or was loaded, or the end came too soon.
-        DeviceError: no scan came for a long time.
-        LinkLostError: the link is gone.
-        UsageError: a number of scans that cannot be.
+        BaselineRefusedError: a pad moved or was loaded, or the source ended too soon.
+        DeviceError: no scan arrived for a long time.
+        LinkLostError: the link is lost.
+        UsageError: the number of scans is out of range.
     """
     check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
     check_whole("skip", skip, 0)
@@ -61,7 +61,7 @@ def take_baselines(
             for heard in taken:
                 if not isinstance(heard, Scan):
                     if heard.kind in ("lost", "silent"):
-                        estimators.clear()  # nobody knows whether the sensor behind the gap reads as before
+                        estimators.clear()  # the sensor may read differently after the gap
                     continue
                 name = heard.sensor
                 skipped[name] = skipped.get(name, -1) + 1

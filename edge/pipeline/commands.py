@@ -1,4 +1,4 @@
-"""Commands to a run: one queue, filled by keys, signals, viewers and JSON lines on stdin, such as {"cmd": "reset"}."""
+"""Commands to a run in one queue, from keys, signals, viewers and JSON lines on stdin such as {"cmd": "reset"}."""
 
 import json
 import os
@@ -16,18 +16,18 @@ from firmware_bridge.scans.scan import is_sensor_name
 READ_BYTES: Final = 4096
 LONGEST_LINE_BYTES: Final = 4096
 WAITING: Final = 64
-"""Commands that may wait for the loop to come round."""
+"""Commands that may wait until the loop takes them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a user asks for between two scans.
+    """Request of a user that is carried out between two scans.
 
     Attributes:
         name: "reset" forgets earlier taps, "zero" zeroes again, "record" begins or ends a recording.
-        sensor: which one to zero; None for all.
+        sensor: name of the sensor to zero; None for all.
         force: zero it even if it is in contact.
-        on: begin a recording, or else end it.
+        on: True begins a recording, False ends it.
     """
 
     name: Literal["reset", "zero", "record"]
@@ -41,7 +41,7 @@ ZERO: Final = Command("zero")
 
 
 class Commands:
-    """Queue of what users ask for; any thread puts, and the loop takes between two scans.
+    """Queue of users' commands; any thread puts, and the loop takes between two scans.
 
     Attributes:
         refused: messages that were no command, or came when too many waited.
@@ -60,20 +60,20 @@ class Commands:
 
     @property
     def full(self) -> bool:
-        """More should not be put before the loop has come round, ten times a second at least."""
+        """True if no more should be put before the loop takes what waits, at least ten times a second."""
         return self._waiting.qsize() >= WAITING
 
     def put(self, command: Command) -> None:
-        """Ask for something."""
+        """Put a command into the queue."""
         self._waiting.put(command)
 
     def refuse(self) -> None:
-        """Count a message that was no command."""
+        """Count a message that is not a command."""
         with self._lock:
             self.refused += 1
 
     def ask(self, producer: Callable[[], object]) -> None:
-        """Have a producer without a thread called before commands are taken; it puts what has come, and never waits."""
+        """Register a producer without a thread; it is called before commands are taken and must never wait."""
         self._producers.append(producer)
 
     def poll(self) -> list[Command]:
@@ -93,19 +93,19 @@ class Commands:
 
 
 class Controlled(Protocol):
-    """A runtime, as far as commands go."""
+    """Runtime as seen by commands."""
 
     def reset(self) -> None:
         """Forget earlier taps."""
         ...
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
-        """Zero a sensor again, or all."""
+        """Zero one sensor again, or all."""
         ...
 
 
 def obey(commands: Commands, runtime: Controlled) -> None:
-    """Have done what was asked for since the last call."""
+    """Carry out the commands that were put since the last call."""
     for command in commands.poll():
         if command.name == "reset":
             runtime.reset()
@@ -114,7 +114,7 @@ def obey(commands: Commands, runtime: Controlled) -> None:
 
 
 class CommandLines:
-    """Producer of commands from lines of a file descriptor, which is never waited for."""
+    """Producer of commands from lines of a file descriptor; it never waits."""
 
     def __init__(self, commands: Commands, descriptor: int) -> None:
         self._commands = commands
@@ -151,25 +151,25 @@ class CommandLines:
 
 
 def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
-    """The command to the runtime that parsed JSON is; None if it is none."""
+    """Return the command to the runtime that parsed JSON stands for; None if it is not one."""
     if parsed.get("cmd") == "reset":
         return RESET
     sensor, force = parsed.get("sensor"), parsed.get("force", False)
     # A misspelt key must not turn "zero sensor 4" into "zero all": unlike a reset, a zeroing cannot be undone.
     if parsed.get("cmd") != "zero" or parsed.keys() - {"cmd", "sensor", "force"}:
         return None
-    # A name that no sensor can have is not looked for, and not told of, either: who wrote it may be a stranger.
+    # A name that no sensor can have is neither looked up nor shown: a stranger may have written it.
     if not (sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))) or not isinstance(force, bool):
         return None
     return Command("zero", sensor, force)
 
 
 def read_stdin(commands: Commands) -> None:
-    """Have lines of stdin taken for commands, unless there is none or it is a terminal, which has keys.
+    """Take lines of stdin as commands, unless there is no stdin or it is a terminal, which has keys.
 
-    Elsewhere than on POSIX a pipe cannot be asked whether it has something.
+    Only on POSIX can a pipe be polled for data.
     """
     if os.name != "posix" or sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
         return
-    with suppress(OSError):  # what stands in its place is no file of the system's
+    with suppress(OSError):  # a replaced stdin is not a file of the system
         commands.ask(CommandLines(commands, sys.stdin.fileno()).read)

@@ -6,27 +6,27 @@ from typing import Final
 
 REMEMBERED_INTERVALS: Final = 31
 FEWEST_INTERVALS: Final = 5
-"""Before so many, nobody knows the period."""
+"""Fewest intervals that give a period."""
 BURST_SHARE: Final = 8
-"""Of a period: scans nearer to each other than an eighth were held up. Bursts of all sixteen frames, 16 ms apart, are
-further apart."""
+"""Divisor of the period: scans nearer to each other than an eighth of it were held up. Bursts of all sixteen frames,
+16 ms apart, are further apart."""
 LONGEST_BURST: Final = 500
-"""Five seconds of a sensor at 100 Hz; after that it is its pace."""
+"""Scans of a burst: five seconds of a sensor at 100 Hz; a longer one is the sensor's own pace."""
 NS_PER_S: Final = 1_000_000_000
 
 
 class Deadline:
-    """Judges the patterns of one sensor by its own grid: scans come when the sensor sends them, not when we ask.
+    """Deadline of one sensor's patterns on the sensor's own time grid: scans come when the sensor sends them.
 
     The period is the running median of the intervals between scans, which neither jitter nor a gap moves, unless a
     rate is given.
 
     Attributes:
-        period_ns: between scans, in [ns]; None as long as too few have come.
+        period_ns: between scans, in [ns]; None as long as too few have arrived.
     """
 
     def __init__(self, rate_hz: float | None = None) -> None:
-        """Start without a scan; `rate_hz` is the sensor's rate if it is known, in [Hz]."""
+        """Start without a scan; `rate_hz` is the sensor's rate in [Hz], None if unknown."""
         self.period_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._known = rate_hz is not None
         self._intervals: deque[int] = deque()
@@ -35,7 +35,7 @@ class Deadline:
         self._hurried = 0
 
     def follow(self, scan_time_ns: int) -> None:
-        """Take the arrival of the next scan, pattern or not, in [ns]. Time that stands is no interval."""
+        """Take the arrival of the next scan, pattern or not, in [ns]; a time that stands still gives no interval."""
         last_ns, self._last_ns = self._last_ns, scan_time_ns
         if last_ns is None or scan_time_ns <= last_ns:
             return
@@ -57,7 +57,7 @@ class Deadline:
             self.period_ns = self._sorted[len(self._sorted) // 2]
 
     def check(self, scan_time_ns: int, done_ns: int) -> bool:
-        """Whether a pattern missed its deadline; without a period none does.
+        """Return whether a pattern missed its deadline; without a period it never does.
 
         Args:
             scan_time_ns: arrival of its scan's last reading, in [ns].

@@ -1,8 +1,8 @@
-"""Links read beside whoever takes what they give: in one thread, however many there are.
+"""Reader of links, next to the user of their scans: in one thread, however many links there are.
 
-The system says which link has something to read. One of several of which it cannot say so (gs_usb, python-can, the
-vendor's server, a recording, the demo) has a thread of its own, and so has one that is away, until it is back: to open
-a link may take seconds, and holds up no other.
+The system reports which link has something to read. Where it cannot (gs_usb, python-can, the vendor's server, a
+recording, the demo), each of several links has a thread of its own, and so has a link that is away, until it is back:
+opening one may take seconds and must not hold up the others.
 """
 
 import math
@@ -21,7 +21,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
 SHORTEST_POLL_S: Final = 0.001
-"""The system's poll counts in milliseconds."""
+"""Shortest time that the system's poll can wait, which counts in milliseconds."""
 _WAKES: Final = 64
 
 HandOver = Callable[[Sequence[Notice], Sequence[Scan]], None]
@@ -29,18 +29,18 @@ HandOver = Callable[[Sequence[Notice], Sequence[Scan]], None]
 
 @dataclass(slots=True)
 class _Shared:
-    """A link that is read in the common thread, and when at latest, by the monotonic clock."""
+    """Link that is read in the common thread, and the latest time of its next read on the monotonic clock."""
 
     link: Link
     due_s: float
 
 
 class LinkReader:
-    """Reads open links until all have ended, one is lost for good, or it is closed.
+    """Reader of open links until all have ended, one is lost for good, or it is closed.
 
     Attributes:
-        thread_ids: by the system's numbers, of the threads that it begins with.
-        reading: done when all is handed over; its exception is what ended the first link that failed.
+        thread_ids: system's numbers of the threads that it begins with.
+        reading: done when all is handed over; its exception is that of the first link that failed.
     """
 
     def __init__(self, links: Sequence[Link], hand_over: HandOver, on_end: Callable[[], object]) -> None:
@@ -48,7 +48,7 @@ class LinkReader:
 
         Args:
             links: open.
-            hand_over: takes what one link had to tell, and the scans behind that; called from several threads.
+            hand_over: takes the notices of one link and then its scans; called from several threads.
             on_end: called when all is handed over, just before `reading` is done.
         """
         self._hand_over = hand_over
@@ -62,7 +62,7 @@ class LinkReader:
         self._shared: dict[int, _Shared] = {}
         self._apart: dict[Future[None], tuple[Link, ThreadPoolExecutor]] = {}
         self._thread_ids: list[int] = []
-        # The only link needs no other's leave to wait.
+        # A single link may wait without regard to others.
         self._alone = links[0] if len(links) == 1 else None
         self._executor = self._new_thread("scan-reader")
         for link in links if self._alone is None else ():
@@ -71,7 +71,7 @@ class LinkReader:
         self.reading = self._executor.submit(self._read)
 
     def close(self) -> None:
-        """End all reading; no thread is left."""
+        """End all reading and all threads."""
         self._stop.set()
         self._wake()
         self._executor.shutdown()
@@ -96,7 +96,7 @@ class LinkReader:
             self._on_end()
 
     def _take_turns(self) -> None:
-        """Wait until a link has something to read, and read each that has."""
+        """Wait until links have something to read, and read them."""
         due_s = min((shared.due_s for shared in self._shared.values()), default=math.inf)
         left_s = min(max(due_s - time.monotonic(), 0.0), POLL_S)
         if 0 < left_s < SHORTEST_POLL_S:
@@ -112,7 +112,7 @@ class LinkReader:
                 self._place(shared.link, descriptor)
 
     def _place(self, link: Link, before: int | None = None) -> None:
-        """Have a link read where it can be waited for; `before` is the descriptor that it had in the common thread."""
+        """Assign a link to the thread that can wait for it; `before` is its earlier descriptor in the common thread."""
         wait = None if link.ended else link.wait_on()
         if before is not None and (wait is None or wait.descriptor != before):
             self._poll.unregister(before)
@@ -128,10 +128,10 @@ class LinkReader:
             reading.add_done_callback(lambda _: self._wake())
 
     def _welcome_back(self) -> None:
-        """Share the common thread again with links that can be waited for again.
+        """Move links that can be waited for again back into the common thread.
 
         Raises:
-            LinkLostError: and whatever else ended one.
+            LinkLostError: or another error that ended a link.
         """
         with suppress(BlockingIOError):
             self._woken.recv(_WAKES)
@@ -142,7 +142,7 @@ class LinkReader:
             self._place(link)
 
     def _follow(self, link: Link) -> None:
-        """Read one link until it has ended, or can be waited for beside others."""
+        """Read one link until it has ended, or can be waited for together with others."""
         while not (self._stop.is_set() or link.ended):
             self._take(link, POLL_S)
             if self._alone is None and link.wait_on() is not None:
@@ -152,7 +152,7 @@ class LinkReader:
         scans: Sequence[Scan] = ()
         try:
             scans = link.read(timeout_s)
-        finally:  # what it has to tell comes before its end, too
+        finally:  # its notices come also before its end
             notices = link.notices()
             if notices or scans:
                 self._hand_over(notices, scans)

@@ -1,4 +1,4 @@
-"""From a source through the runtime into sinks, in one loop."""
+"""Loop from a source through the runtime into sinks."""
 
 import gc
 from collections.abc import Iterator, Sequence
@@ -18,10 +18,10 @@ _UNWRITTEN: Final = attrgetter("unwritten")
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Without garbage collection.
+    """Disable garbage collection within a with statement.
 
     A full collection stops everything for tens of milliseconds, several periods of a sensor, and the loop makes no
-    cycles that would need one: what it makes is freed at once. What is there before is kept out of later collections.
+    cycles that would need one: its objects are freed at once. Older objects are kept out of later collections.
     """
     enabled = gc.isenabled()
     gc.collect()
@@ -36,13 +36,13 @@ def uncollected() -> Iterator[None]:
 
 
 def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: Statistics, **settings: Any) -> None:
-    """Give sinks every result and event of a stream, and the counters, until it ends.
+    """Write every result and event of a stream, with the counters, into sinks until it ends.
 
     Args:
         source: open.
         runtime: makes the results.
         sinks: their counters are the stream's and `unwritten`, the records that sinks left out.
-        statistics: filled on the way, so that they are there however the run ends.
+        statistics: filled on the way, so that they are available however the run ends.
         settings: of the stream.
 
     Raises:

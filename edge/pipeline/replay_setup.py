@@ -1,4 +1,4 @@
-"""A recording as a source, with what it knows of its sensors."""
+"""Recording as a source, with what it stores of its sensors."""
 
 import time
 from collections.abc import Sequence
@@ -29,11 +29,11 @@ def open_recording(
     rate_hz: float | None,
     bar: bool = False,
 ) -> Source:
-    """The source that plays a recording, as edge.api.open_recording; with a bar of how far it is, if asked for."""
+    """Return the source that plays a recording, as edge.api.open_recording does; `bar` shows its progress."""
     paths = recording_paths(str(path))
     replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
-    # A sensor file says which pad it is; without one the recording's grid does.
+    # A sensor file names the pad; without one the recording's grid does.
     pad = tracks[0].geometry
     file = settled(sensor, None if sensor is not None else _named(pad))
     known = with_recorded(file, [replay])
@@ -41,7 +41,7 @@ def open_recording(
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
     mountings = known.mountings
     sensors = {*mountings, *baselines}
-    if sensor is None:  # else it is told which ones the file does not know
+    if sensor is None:  # else a note reports the sensors that the file lacks
         sensors |= {track.sensor for track in tracks}
     entries = {
         name: SensorEntry(
@@ -57,12 +57,12 @@ def open_recording(
 
 
 def _named(pad: SensorGeometry) -> str | ModelMap:
-    """What stands for the id map of a recording's sensors, whose ids are of no use any more."""
+    """Return a replacement for the id map of a recording's sensors, whose ids are no longer needed."""
     return pad.name if pad in PADS else ModelMap(pad.name, pad, {})
 
 
 class _FollowedReplay(ReplayLink):
-    """A recording, and a bar that shows how much of it was taken."""
+    """Recording with a bar that shows how much of it was taken."""
 
     def __init__(self, paths: Sequence[str], rate_hz: float | None, *, paced: bool) -> None:
         super().__init__(paths, rate_hz, paced=paced)
@@ -74,18 +74,18 @@ class _FollowedReplay(ReplayLink):
         super().__exit__(*exc_info)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that fell due since the last call."""
+        """Return the scans that fell due since the last call."""
         scans = super().read(timeout_s)
         self._bar.advance(len(scans))
         return scans
 
 
 def _in_its_time(recording: Recording, *, paced: bool) -> dict[str, Baseline]:
-    """Its baselines, as old as they were where nobody knows when that was, and the scans are of now."""
+    """Return a recording's baselines; if it is paced and undated, dated so that they keep their ages at its scans."""
     baselines = dict(recording.baselines)
     if recording.path.suffix.lower() == ".npz":
         baselines = npz_baselines(recording)
-    if not paced or recording.unix_offset_ns:  # 0: nobody knew either when it was recorded
+    if not paced or recording.unix_offset_ns:  # 0: the time of recording was unknown even then
         return baselines
     firsts_ns = {track.sensor: track.time_ns[0] for track in recording.tracks if track.time_ns is not None}
     now_s = time.time()

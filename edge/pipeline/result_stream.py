@@ -1,4 +1,4 @@
-"""Results of a source, one for every scan, as they come."""
+"""Stream of the results of a source, one for every scan."""
 
 import math
 import threading
@@ -21,12 +21,12 @@ from firmware_bridge.silence import POLL_S
 
 
 class Stream:
-    """Iterates over the results of a source, until it ends, `stop` is set or `duration_s` is over.
+    """Iterator over the results of a source, until it ends, `stop` is set or `duration_s` is over.
 
     Of the scans that wait, the newest of each sensor gets a pattern; the older ones get their result without one.
-    Everything happens in the thread that iterates: between two results the runtime may be told to zero or to reset. A
-    sensor that a baseline or counts per newton are given of, and that is never heard, is told as an event. A loop that
-    was left may go on in another, with the next result.
+    Everything happens in the thread that iterates: between two results the runtime may be asked to zero or to reset. A
+    sensor that has a baseline or counts per newton, and of which no scan arrives, is reported as an event. A loop that
+    was left may be continued by another, from the next result on.
 
     Attributes:
         statistics: of the results so far.
@@ -51,18 +51,18 @@ class Stream:
         Args:
             source: open.
             runtime: makes the results.
-            on_event: is told what happens beside scans, in its place between results.
+            on_event: called with each event, in its place between results.
             on_wait: called several times a second while no scan comes.
             stop: ends the stream after the scans in hand.
-            duration_s: longest time to run, from the first step on, in [s]; of a recording that is read as fast as
-                results are made, so much of its own time.
-            commands: asked between scans.
-            statistics: filled on the way, so that they are there however the stream ends.
+            duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
+                results are made, measured in the time of the recording.
+            commands: polled between scans.
+            statistics: filled on the way, so that they are available however the stream ends.
             clock_s: monotonic, in [s].
-            clock_ns: the clock of the scans, in [ns].
+            clock_ns: clock of the scans, in [ns].
 
         Raises:
-            UsageError: a duration that cannot be.
+            UsageError: the duration is out of range.
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)
@@ -82,7 +82,7 @@ class Stream:
 
     @property
     def counters(self) -> dict[str, int]:
-        """The source's up to now, which may be ahead of the last result, and the stream's up to that."""
+        """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
         statistics = self.statistics
         counters = self._source.counters()
         counters["dropped"] = statistics.dropped
@@ -96,7 +96,7 @@ class Stream:
         return self._running
 
     def __next__(self) -> Result:
-        """The next result, as it comes.
+        """Return the next result as soon as it is made.
 
         Raises:
             LinkLostError: after every scan before it got its result.
@@ -124,7 +124,10 @@ class Stream:
                 self._on_wait()
 
     def _taken(self) -> Iterator[list[Scan | Notice]]:
-        """What the source gives, until it ends, `stop` is set, or the time is over: that of scans, where they wait."""
+        """Yield the scans and notices of the source, until it ends, `stop` is set, or the time is over.
+
+        A patient source's time is that of its scans.
+        """
         length_s = math.inf if self._duration_s is None else self._duration_s
         begun_s = self._clock_s()
         first_ns: int | None = None
@@ -155,10 +158,10 @@ class Stream:
         deadline = self._deadlines.get(scan.sensor)
         if deadline is None:
             deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
-        if not scan.unread_ns:  # what lay there came at no pace
+        if not scan.unread_ns:  # scans that waited unread came at no pace
             deadline.follow(scan.time_ns)
         heard_again = self._silence.follow(scan, deadline.period_ns)
-        if result.pattern is not None and not self._source.patient:  # whose scans are of another time than the clock's
+        if result.pattern is not None and not self._source.patient:  # its scans have another clock
             statistics.late += deadline.check(scan.time_ns, done_ns)
             result = replace(result, latency_us=(done_ns - scan.time_ns) / 1e3)
         statistics.add(result)
@@ -168,7 +171,7 @@ class Stream:
         return result
 
     def _heed(self, notice: Notice) -> None:
-        """What was known before an outage is worth nothing behind it."""
+        """Forget readings and taps from before an outage, and report the notice as an event."""
         if notice.kind in ("lost", "silent", "back"):
             self._runtime.lose_touch(notice.sensors)
             self._silence.begin_anew(notice.time_ns, notice.sensors)

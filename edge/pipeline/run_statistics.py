@@ -1,4 +1,4 @@
-"""Figures of a run, in memory that does not grow with it."""
+"""Statistics of a run, in memory that does not grow with it."""
 
 import math
 from bisect import bisect_left
@@ -15,13 +15,13 @@ SHORTEST_NS: Final = 1_000_000_000
 """Of a run whose rate is told: the first scans have waited for the model, and come all at once, which over less makes
 some 100 Hz look like 135."""
 STAGES: Final = ("zeroing", "incomplete", "idle", "dropped", "contact")
-"""How far a sensor's scans may come on their way to a pattern."""
+"""Stages of a sensor's scans on their way to a pattern."""
 LONGEST_US: Final = 2.0**26
-"""About a minute; longer run times are counted as this long."""
+"""Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
 
 
 class Histogram:
-    """Quantiles of positive numbers from logarithmic buckets."""
+    """Histogram of positive numbers with logarithmic buckets, for quantiles."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -35,7 +35,7 @@ class Histogram:
         self._buckets[math.ceil(math.log2(min(max(value, 1.0), LONGEST_US)) * BUCKETS_PER_OCTAVE)] += 1
 
     def quantile(self, share: float) -> float | None:
-        """Upper edge of the bucket that holds the `share`-th value; None without values."""
+        """Return the upper edge of the bucket that holds the `share`-th value; None without values."""
         if self.count == 0:
             return None
         wanted = max(1, math.ceil(share * self.count))
@@ -44,27 +44,27 @@ class Histogram:
 
 
 class Statistics:
-    """What a run did, for its summary.
+    """Statistics of a run, for its summary.
 
     Attributes:
-        source: what kind of source the last scan came from; empty before the first.
+        source: kind of source of the last scan; empty before the first.
         scans: results made, one for every scan.
-        patterns: of these, with a pattern.
-        reused: of these, with the pattern before, since nothing had changed.
-        dropped: in contact, but overtaken by a newer scan before the inference.
+        patterns: results with a pattern.
+        reused: results with the last pattern, since nothing had changed.
+        dropped: results in contact, but overtaken by a newer scan before the inference.
         late: patterns that were ready later than one period after their scan.
-        overruns: scans thrown away unseen because nobody took them in time.
-        missed: scans that never came, as far as gaps show.
+        overruns: scans discarded unread because nobody took them in time.
+        missed: scans that never arrived, as far as gaps show.
         unwritten: records left out for readers that were too slow.
-        events: how often what happened, by its kind.
+        events: number of events by kind.
         torn_wire: scans with taxels missing.
         torn_source: complete scans that were only partly renewed.
         repeated: complete scans with nothing renewed.
         run_time_us: histogram of the inference's run time.
         latency_us: histogram of the time from scan to pattern.
-        commands_refused: lines on stdin, and messages of viewers, that were no command.
-        model_patterns: of the patterns, how many each model made.
-        sink_trouble: what is wrong with the sinks at last; None while all is well.
+        commands_refused: lines on stdin, and messages of viewers, that were not commands.
+        model_patterns: number of patterns made by each model.
+        sink_trouble: trouble of the sinks at the end; None while all is well.
     """
 
     def __init__(self) -> None:
@@ -123,19 +123,19 @@ class Statistics:
         self.events[event.kind] = self.events.get(event.kind, 0) + 1
 
     def rate_hz(self) -> dict[str, float]:
-        """Scans a second of each sensor over the whole run, where there were two or more."""
+        """Return the scans a second of each sensor over the whole run, for sensors with two or more."""
         return {name: rate_hz for name, span in self._spans.items() if (rate_hz := span.rate_hz()) is not None}
 
     def duration_s(self) -> float:
-        """From first scan to last of the sensor that was heard for the longest, in [s]."""
+        """Return the longest time from the first scan to the last of any sensor, in [s]."""
         return max((span.duration_ns for span in self._spans.values()), default=0) / 1e9
 
     def summary(self, *, source: str, wanted_rate_hz: float | None = None) -> str:
-        """The run in a few lines of text.
+        """Return the run in a few lines of text.
 
         Args:
-            source: the source as the user knows it.
-            wanted_rate_hz: the rate that was asked for, to be held against.
+            source: the source as the user names it.
+            wanted_rate_hz: the requested rate, shown for comparison.
         """
         lines = [
             f"{source}: {self.scans} scans, {self.patterns} patterns ({self.reused} reused), {self.dropped} dropped, "
@@ -173,7 +173,7 @@ class Statistics:
         return "\n".join(lines)
 
     def _without_pattern(self) -> list[str]:
-        """Why sensors had no pattern; one that nothing touched is told of only where no other had one."""
+        """Return why sensors had no pattern; one without contact is listed only if no sensor had a pattern."""
         lines: list[str] = []
         for name, result in sorted(self._farthest.items()):
             why = {

@@ -1,4 +1,4 @@
-"""The rate at which scans come, smoothed."""
+"""Rate at which scans arrive, smoothed."""
 
 from typing import Final
 
@@ -6,7 +6,7 @@ SMOOTHING: Final = 0.05
 
 
 class Rate:
-    """Scans a second, smoothed over about twenty scans.
+    """Rate of scans a second, smoothed over about twenty scans.
 
     Attributes:
         rate_hz: None before the second scan.

@@ -1,4 +1,4 @@
-"""Links as one source, read beside its user, so that nothing waits for inference; and what is known of its sensors."""
+"""Source of scans from links, read in threads of its own so that nothing waits for inference."""
 
 import threading
 import time
@@ -16,23 +16,24 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
-"""Five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
+"""Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
 
 
 class Source:
-    """Opens links, reads them, and closes them; what nobody takes in time is thrown away, oldest first.
+    """Source that opens links, reads them and closes them; scans not taken in time are discarded, oldest first.
 
-    Reading begins when it is opened: what comes while a model loads waits here. Scans of one link stay in their order;
-    a link that is slow or away holds up no other, and one that is lost for good ends the source. A patient link is read
-    by whoever takes, a scan at a time, so that nothing is thrown away or overtaken. A source is opened once.
+    Reading begins when it is opened: scans that come while a model loads wait here. Scans of one link stay in their
+    order; a link that is slow or away holds up no other, and one that is lost for good ends the source. A patient link
+    is read by the thread that takes, a scan at a time, so that nothing is discarded or overtaken. A source is opened
+    once.
 
     Attributes:
-        name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all of theirs.
-        patient: the link waits for its reader, and its scans are of another time than now.
-        sensor_file: what is known of its sensors.
-        rate_hz: of each sensor, where one was asked for, in [Hz].
-        overruns: scans thrown away.
-        thread_ids: by the system's numbers, of what reads beside whoever takes.
+        name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all their names.
+        patient: True if the link waits for its reader, and its scans have another clock than now.
+        sensor_file: properties of its sensors.
+        rate_hz: requested rate of each sensor, in [Hz]; None without.
+        overruns: scans discarded.
+        thread_ids: system's numbers of the threads that read.
     """
 
     def __init__(
@@ -47,13 +48,13 @@ class Source:
 
         Args:
             links: one or more, opened and closed by this source.
-            capacity_scans: how many scans may wait.
-            sensor_file: what is known of the sensors; nothing without.
+            capacity_scans: number of scans that may wait.
+            sensor_file: properties of the sensors; empty by default.
             rate_hz: of each sensor, in [Hz].
-            force: use of a device also what the sensor file has of an emulated sensor.
+            force: use on a device also properties that the sensor file has from an emulated sensor.
 
         Raises:
-            SourceError: some are emulated and some are not: results of both kinds must not be taken for one.
+            SourceError: some are emulated and some are not: results of both kinds must not be mixed.
         """
         _one_kind(links)
         self.name = ", ".join(link.name for link in links)
@@ -68,8 +69,8 @@ class Source:
         self._opened = self._closed = False
         self._waiting: list[Scan | Notice] = []
         self._lock = threading.Lock()
-        # Holds one thing while something waits, or no more will come. Unlike a Condition it wakes its reader without
-        # Python on either side: half of what a scan cost was waking.
+        # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
+        # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
         self._capacity_scans = capacity_scans
         self._through = False
@@ -97,17 +98,17 @@ class Source:
 
     @property
     def kind(self) -> SourceKind:
-        """What kind of source it is.
+        """Kind of source.
 
         Raises:
-            UsageError: it was not opened yet, and some do not know before.
+            UsageError: it is not open yet, and some links learn their kind only then.
         """
         if not self._opened:
             raise self._not_open()
         return self._links[0].kind
 
     def counters(self) -> dict[str, int]:
-        """What was received, skipped and missed so far, by name; sums over all links."""
+        """Return the counts of received, skipped and missed items so far, by name; sums over all links."""
         counters = self._links[0].counters()
         for link in self._links[1:]:
             for name, count in link.counters().items():
@@ -116,25 +117,25 @@ class Source:
 
     @property
     def unix_offset_ns(self) -> int | None:
-        """Added to the time of a scan gives [ns] since 1970, 0 where nobody knows; None where it is of now."""
+        """Offset from scan time to [ns] since 1970, 0 if unknown; None for a live source."""
         return (self._links[0].unix_offset_ns or 0) if self.patient else None
 
     @property
     def origin(self) -> SourceKind | None:
-        """Of a recording, what kind of source its scans come from; None where that is not known, or it is `kind`."""
+        """Kind of source that the scans of a recording come from; None if unknown, or equal to `kind`."""
         return one_origin(link.origin for link in self._links)
 
     def unix_time_s(self) -> float:
-        """The time in [s] since 1970: now, or where the scans are of another time that of the last one taken."""
+        """Return the time in [s] since 1970: now, or for a patient source that of the last scan taken."""
         offset_ns = self.unix_offset_ns
         return time.time() if offset_ns is None else (self._last_ns + offset_ns) / 1e9
 
     def take(self, timeout_s: float) -> list[Scan | Notice] | None:
-        """All that waits, in its order, after waiting at most `timeout_s` for something; None when no more will come.
+        """Return all that waits, in order, after waiting at most `timeout_s` for it; None when no more will come.
 
         Raises:
-            LinkLostError: and whatever else ended the reading, after all scans before it were taken.
-            UsageError: it is not open: what waited when it was closed is old.
+            LinkLostError: or another error that ended the reading, after all scans before it were taken.
+            UsageError: it is not open: scans that waited when it was closed are old.
         """
         if not self._opened or self._closed:
             raise self._not_open()
@@ -176,7 +177,7 @@ class Source:
                 self._waiting.append(scan)
 
     def _make_room(self) -> None:
-        """Throw away the oldest scan; a notice stays in its place, since it parts the scans before from those after."""
+        """Discard the oldest scan; notices keep their place, since they part the scans before from those after."""
         for index, waiting in enumerate(self._waiting):
             if isinstance(waiting, Scan):
                 del self._waiting[index]

@@ -1,4 +1,4 @@
-"""Sensors that fall silent while others go on, and scans that left no trace. No I/O, no clock."""
+"""Detection of sensors that fall silent while others go on, and count of missing scans. No I/O, no clock."""
 
 import math
 from collections.abc import Iterable
@@ -11,20 +11,22 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import SENSOR_SILENT_NS
 
 GAP_PERIODS: Final = 1.5
-"""Between two scans; jitter, and the 16 ms for which some adapters hold scans back, make less of 10 ms."""
+"""Periods between two scans that make a gap; jitter, and the 16 ms for which some adapters hold scans, stay below at
+10 ms."""
 
 SETTLING_SCANS: Final = 5
-"""At their pace behind a gap, before what is missing in it is counted: of these the one that was least late tells."""
+"""Scans at their pace after a gap before the missing ones are counted; the least late of them decides."""
 PACED_SCANS: Final = 32
-"""Without a gap, from which on their mean period is better known than the median of the newest: by that, 1 % off, a
-stall of a second would seem to have swallowed a scan."""
+"""Scans without a gap from which on their mean period is more exact than the median of the newest: with that, 1 % off,
+a stall of a second would seem to have swallowed a scan."""
 SHORTEST_PERIOD_NS: Final = 500_000
-"""Twice as fast as any sensor is read: scans nearer to each other lay there, and tell no period."""
+"""Shortest period of a sensor, half of that of the fastest: scans nearer to each other waited somewhere, and give no
+period."""
 
 
 @dataclass(slots=True)
 class _Gap:
-    """Of a sensor: the scan before it, the period, and by how many periods a scan behind it is least too late."""
+    """Gap of a sensor: the scan before it, the period, and the least lateness in periods of the scans after it."""
 
     before: Scan
     period_ns: float
@@ -33,21 +35,21 @@ class _Gap:
 
 
 class Silence:
-    """Follows when each sensor was heard.
+    """Watch on the arrival of each sensor's scans.
 
-    The wire numbers no scans: how many are missing between two is told by the sensor's own period, and exact only as
-    far as that is.
+    The wire does not number scans: the number missing between two follows from the sensor's own period, and is only as
+    exact as that.
 
     Attributes:
-        missed: scans that did not come, as far as gaps show.
+        missed: scans that did not arrive, as far as gaps show.
     """
 
     def __init__(self, expected: Iterable[str] = (), *, recorded: bool = False) -> None:
         """Begin without a scan.
 
         Args:
-            expected: names of sensors that there should be.
-            recorded: scans are of a recording, which has no cable to see to.
+            expected: names of sensors that should be there.
+            recorded: True if the scans are of a recording, which has no cable to check.
         """
         self._recorded = recorded
         self.missed = 0
@@ -62,11 +64,11 @@ class Silence:
         self._since_ns: dict[str, int] = {}
 
     def begin_anew(self, time_ns: int, sensors: str = "") -> None:
-        """A link was away until `time_ns` [ns]: none of its sensors, whose names begin so, was silent before."""
+        """Restart the silence of sensors whose names begin so at `time_ns` [ns], when their link came back."""
         self._since_ns[sensors] = time_ns
 
     def follow(self, scan: Scan, period_ns: int | None) -> Event | None:
-        """Take the next scan of a sensor, whose period is known or not; tells if the sensor is heard again."""
+        """Take the next scan of a sensor with its period in [ns], if available; return an event if it was silent."""
         before, self._last[scan.sensor] = self._last.get(scan.sensor), scan
         if before is None:
             self._expected.discard(scan.sensor)
@@ -92,7 +94,7 @@ class Silence:
         gap_ns = scan.on_bus_ns - before.on_bus_ns
         gap = self._gaps.get(scan.sensor)
         if gap is not None and period_ns > GAP_PERIODS * gap.period_ns:
-            del self._gaps[scan.sensor]  # it was of the pace, which was not known: what is read late comes in bursts
+            del self._gaps[scan.sensor]  # a wrong pace only looked like a gap: scans read late come in bursts
             self._periods_ns.pop(scan.sensor, None)
             self._paced_from[scan.sensor] = scan
         elif gap_ns > GAP_PERIODS * period_ns:
@@ -110,9 +112,9 @@ class Silence:
                 self._paced_from[scan.sensor] = scan
 
     def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
-        """Over all scans since the last gap, or before it, where there were enough.
+        """Return the mean period over all scans since the last gap, or before it, if there were enough.
 
-        Over few, bursts make the median too small, and hardly the mean.
+        Over few scans, bursts make the median too small, and hardly the mean.
         """
         first = self._paced_from[scan.sensor]
         scans = scan.number - first.number
@@ -122,7 +124,7 @@ class Silence:
         return self._periods_ns.get(scan.sensor, max(period_ns, mean_ns))
 
     def look(self) -> list[Event]:
-        """Sensors found silent since the last call, while another was heard; of all of them, the link tells."""
+        """Return events of sensors newly silent while another is not; the link reports a silence of all of them."""
         if len(self._last) + len(self._expected) < 2 or self._first_ns is None:
             return []
         newest_ns = max(scan.time_ns for scan in self._last.values())

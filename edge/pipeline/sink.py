@@ -1,4 +1,4 @@
-"""What every sink offers; adding a sink is one file with this interface and its form in `edge.sinks.registry`."""
+"""Interface of every sink; a new sink is one file with this interface and its form in `edge.sinks.registry`."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -8,11 +8,11 @@ from edge.perception.result import Result
 
 
 class Sink(Protocol):
-    """Where results go. Inherit it to get what is optional.
+    """Destination of results. Inherit it to get the optional methods.
 
     Attributes:
-        unwritten: records left out so far, because whoever reads them is too slow.
-        trouble: what its user must know of it, in plain words; None while all is well.
+        unwritten: records left out so far, because the reader is too slow.
+        trouble: what is wrong with it, in plain words for the user; None while all is well.
     """
 
     unwritten: int = 0
@@ -22,7 +22,7 @@ class Sink(Protocol):
         return None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Take one result, and what was received, dropped and lost up to it.
+        """Take one result, with the counters of received, dropped and lost scans up to it.
 
         Raises:
             SinkError: it cannot be written.
@@ -31,7 +31,7 @@ class Sink(Protocol):
         ...
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Take what happened beside scans, and the counters up to then.
+        """Take an event, with the counters up to then.
 
         Raises:
             SinkError: it cannot be written.
@@ -39,10 +39,10 @@ class Sink(Protocol):
         """
 
     def wait(self) -> None:
-        """Called several times a second while no scan comes; raises as `write` does."""
+        """Do what is due, several times a second while no scan comes; raises as `write` does."""
 
     def close(self) -> None:
-        """Finish what was written.
+        """Finish the written records.
 
         Raises:
             SinkError: it cannot be finished.

@@ -1,4 +1,4 @@
-"""What a sensor file and what is asked for beside it come to."""
+"""Settings of the sensors, from a sensor file and the options next to it."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,15 +16,15 @@ from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
 
 def settled(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
-    """What is known of the sensors.
+    """Return the settings of the sensors.
 
     Args:
-        sensor: what edge-sr doctor wrote, if there is one.
-        id_map: name of an id map, or a map of a program's own, if one was asked for.
+        sensor: file that edge-sr doctor wrote, if there is one.
+        id_map: name of an id map, or a map of a program's own, if one was requested.
 
     Raises:
         SensorFileError: the sensor file cannot be used.
-        UsageError: no such id map; or the file is of another, and so would be its order and its baseline.
+        UsageError: the id map does not exist, or the file is of another, with another order and baseline.
     """
     if isinstance(id_map, ModelMap):
         if sensor is not None:
@@ -49,18 +49,18 @@ def links_to(
     rate_hz: float | None = None,
     give_up_s: float | None = math.inf,
 ) -> list[Link]:
-    """The links to what was asked for, not yet entered.
+    """Return the links to the requested sources, not yet entered.
 
     Args:
-        texts: as in firmware_bridge.links.parse; without any, the adapter of the sensor file or the one there is.
-        known: of the sensors.
-        model: which CAN id is which taxel, instead of the id map that is known.
-        rate_hz: at which recordings are played, in [Hz].
-        give_up_s: how long a lost source may be away, in [s]; None leaves its loss to the caller.
+        texts: as in firmware_bridge.links.parse; without any, the adapter of the sensor file or the only one.
+        known: settings of the sensors.
+        model: assignment of CAN ids to taxels, used instead of the id map in the settings.
+        rate_hz: rate at which recordings are played, in [Hz].
+        give_up_s: longest time that a lost source may be away, in [s]; None leaves its loss to the caller.
 
     Raises:
         SourceError: as in open_sources; NoDeviceError and RecordingError as well.
-        UsageError: a source that is no text; the demo's recording is not installed.
+        UsageError: a source is not a text; the demo's recording is not installed.
     """
     for text in texts:
         if not isinstance(text, str):
@@ -75,18 +75,18 @@ def links_to(
 
 
 def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:
-    """What is known, and of sensors that it does not name how they sat when they were recorded."""
+    """Return the settings, with the recorded mountings of sensors that they do not name."""
     recorded = {name: SensorEntry(mounting) for link in links for name, mounting in link.mountings.items()}
     return replace(known, sensors=recorded | dict(known.sensors))
 
 
 def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
-    """Refuse to use of a device what was found of an emulated sensor.
+    """Refuse to use settings of an emulated sensor on a device.
 
     Args:
-        known: of the sensors.
+        known: settings of the sensors.
         kind: of the opened source.
-        force: use it all the same.
+        force: use them all the same.
 
     Raises:
         SensorFileError: the sensor file is of an emulated sensor, in part or whole.
@@ -103,10 +103,10 @@ def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
 
 
 def references(baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile) -> Mapping[str, Baseline]:
-    """What the free pads read before: stored baselines, or their file, go before those of the sensor file.
+    """Return the baselines of free pads: stored ones, or their file, take precedence over those of the sensor file.
 
     Raises:
-        RecordingError: the baseline file cannot be used, or is of another order.
+        RecordingError: the baseline file cannot be used, or is of another taxel order.
     """
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, known.orders)

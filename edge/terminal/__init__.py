@@ -1,1 +1,1 @@
-"""What programs in a terminal share: arguments, bars, text, signals."""
+"""Common parts of programs in a terminal: arguments, bars, text, signals."""

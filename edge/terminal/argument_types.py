@@ -1,4 +1,4 @@
-"""What the options of all commands have in common: one line for wrong usage, kinds of numbers, what names a source."""
+"""Common parts of the options of all commands: one line for wrong usage, types of numbers, the options of a source."""
 
 import argparse
 import math
@@ -13,18 +13,18 @@ MOST_PORT: Final = 65535
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports wrong usage in one line."""
+    """Argument parser that reports wrong usage in one line."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **settings)
 
     def error(self, message: str) -> NoReturn:
-        """End with the message and where there is more."""
+        """End with the message and a hint at the help."""
         self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help tells more)\n")
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
-    """Options of every command that reads a sensor."""
+    """Add the options of every command that reads a sensor."""
     parser.add_argument(
         "--source",
         metavar="SRC",
@@ -52,7 +52,7 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 
 
 def positive(text: str) -> float:
-    """A number above 0."""
+    """Parse a number above 0."""
     try:
         value = float(text)
     except ValueError:
@@ -63,12 +63,12 @@ def positive(text: str) -> float:
 
 
 def not_negative(text: str) -> float:
-    """A number above 0, or 0."""
+    """Parse a number of 0 or more."""
     return 0.0 if text == "0" else positive(text)
 
 
 def whole(least: int) -> Callable[[str], int]:
-    """Whole numbers from `least`."""
+    """Return a parser of whole numbers from `least`."""
 
     def whole_number(text: str) -> int:
         if not (text.isascii() and text.isdigit()) or int(text) < least:
@@ -79,7 +79,7 @@ def whole(least: int) -> Callable[[str], int]:
 
 
 def port(text: str) -> int:
-    """A port of this machine; 0 stands for any free one."""
+    """Parse a port of this machine; 0 stands for any free one."""
     if not (text.isascii() and text.isdigit()) or int(text) > MOST_PORT:
         raise argparse.ArgumentTypeError(
             f"{text!r} is no port: expected 0 to {MOST_PORT}, or none; write FILE or command before it"

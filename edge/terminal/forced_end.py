@@ -1,4 +1,4 @@
-"""The end of a program that a signal asked to end: in time, if need be by force.
+"""End of a program after a signal: in time, if necessary by force.
 
 Python runs a handler of signals between two steps of its main thread, and so never while a call into a library does
 not return: a model that loops, a pipe that is full, a peer that is gone. The system's own part of a handler runs all
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 END_S: Final = 1.5
-"""From the signal to the end by force, within the two seconds that are promised."""
+"""Time from the signal to the end by force, within the two seconds that are promised."""
 STALLED_S: Final = 10.0
-"""A disk may do something else for so long while a recording is finished on it."""
+"""Longest pause in the growth of a recording that is being finished, since its disk may be busy."""
 EXIT_FORCED: Final = 6
 _LOOK_S: Final = 0.1
 _STDERR: Final = 2
@@ -32,12 +32,12 @@ _before_force: list[Callable[[], object]] = []
 
 @contextlib.contextmanager
 def ended_in_time(numbers: Collection[int]) -> Iterator[None]:
-    """End the process by force, with EXIT_FORCED, if this lasts for longer than END_S after one of these signals.
+    """End the process by force, with EXIT_FORCED, if the with block lasts longer than END_S after one of these signals.
 
-    Files that are being finished have the time they need for as long as they grow. Main thread alone.
+    Files that are being finished get the time they need for as long as they grow. Main thread alone.
 
     Args:
-        numbers: of signals that Python handles.
+        numbers: signals that Python handles.
     """
     waking, woken = socket.socketpair()
     woken.setblocking(False)
@@ -55,14 +55,14 @@ def ended_in_time(numbers: Collection[int]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def finishing(path: Path) -> Iterator[None]:
-    """Allow a file as much time as it takes to finish it, though the program was asked to end."""
+    """Allow a file the time it takes to finish it, although the program was asked to end."""
     with _kept(_finishing, path):
         yield
 
 
 @contextlib.contextmanager
 def before_force(act: Callable[[], object]) -> Iterator[None]:
-    """Have something done before the process is ended by force meanwhile; it must be short and never wait."""
+    """Register an action to do before an end of the process by force; it must be short and never wait."""
     with _kept(_before_force, act):
         yield
 
@@ -82,7 +82,7 @@ def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
             return
     files, left_s = _sizes(), END_S
     waking.settimeout(_LOOK_S)
-    # Not by the clock: where a machine is so busy that this thread comes late, so does what it waits for.
+    # Counted in waits, not by the clock: where a busy machine delays this thread, it delays what it waits for too.
     while left_s > 0:
         with contextlib.suppress(TimeoutError):
             if not waking.recv(_READ_BYTES):
@@ -93,12 +93,12 @@ def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
 
 
 def _sizes() -> dict[Path, int]:
-    """Files that are being finished, and how large they are, in bytes."""
+    """Return the files that are being finished, with their sizes in bytes."""
     sizes: dict[Path, int] = {}
     for path in tuple(_finishing):
         try:
             sizes[path] = path.stat().st_size
-        except OSError:  # not begun yet, or under its last name by now
+        except OSError:  # not begun yet, or already under its last name
             sizes[path] = 0
     return sizes
 
@@ -108,13 +108,13 @@ def _force() -> None:
         act()
     line = f"edge-sr: not ended {END_S:g} s after the signal, still in {_where()}: ended by force\n"
     with contextlib.suppress(OSError):
-        if select.select([], [_STDERR], [], 0)[1]:  # a pipe that nobody reads is why we may be here
+        if select.select([], [_STDERR], [], 0)[1]:  # an unread pipe may be what blocks the program
             os.write(_STDERR, line.encode(errors="replace"))
     os._exit(EXIT_FORCED)
 
 
 def _where() -> str:
-    """Name the function that the main thread has not returned from, with its file and line."""
+    """Return the function that the main thread has not returned from, with its file and line."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     if frame is None:
         return "its end"

@@ -1,7 +1,7 @@
 """Maps as text for a terminal: arrays in, lines out.
 
 With colour, one character cell shows two pixels, an upper half block in one colour on a ground of
-another. Without, a cell is a character, the denser the larger.
+another. Without colour, a cell is one character, denser for larger values.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,12 +29,12 @@ GAP: Final = 2
 WIDEST: Final = 40
 NARROWEST: Final = 20
 SHARP: Final = 8
-"""A width that is a multiple of it, and half as many lines, show a map of 4 x 4 with sharp borders."""
+"""Divisor of a map's width: with half as many lines, a map of 4 x 4 then has sharp borders."""
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One map to draw: (H, W) values, shown from `low` to `high` [unit]."""
+    """Map to draw: (H, W) values, shown from `low` to `high` [unit]."""
 
     title: str
     values: NDArray[np.floating]
@@ -44,11 +44,11 @@ class Panel:
 
 
 def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: str | None) -> Palette:
-    """The best palette that the output can show.
+    """Return the best palette that the output can show.
 
     Args:
-        environment: variables; NO_COLOR, TERM and COLORTERM are heard.
-        terminal: the output is one.
+        environment: variables; NO_COLOR, TERM and COLORTERM are used.
+        terminal: True if the output is a terminal.
         encoding: of the output.
     """
     try:
@@ -61,12 +61,12 @@ def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: 
 
 
 def draw(panels: Sequence[Panel], columns: int, palette: Palette) -> str:
-    """Panels side by side, or below each other where the terminal is too narrow.
+    """Draw panels side by side, or below each other if the terminal is too narrow.
 
     Args:
         panels: from left to right.
         columns: width of the terminal; no line is wider.
-        palette: how values are shown.
+        palette: colours or characters of the values.
     """
     width = min(WIDEST, (columns - GAP * (len(panels) - 1)) // len(panels))
     width -= width % SHARP
@@ -78,12 +78,12 @@ def draw(panels: Sequence[Panel], columns: int, palette: Palette) -> str:
 
 
 def resample(values: NDArray[np.floating], height: int, width: int) -> NDArray[np.float64]:
-    """Means of (H, W) values over the cells of a height x width grid; finer cells repeat values."""
+    """Return means of (H, W) values over the cells of a height x width grid; finer cells repeat values."""
     return _overlaps(values.shape[0], height) @ values.astype(np.float64) @ _overlaps(values.shape[1], width).T
 
 
 def _overlaps(old: int, new: int) -> NDArray[np.float64]:
-    """Share (new, old) that each old cell has in each new one, on one unit length."""
+    """Return the share (new, old) of each old cell in each new one, on one unit length."""
     old_edges, new_edges = np.arange(old + 1) / old, np.arange(new + 1) / new
     upper = np.minimum(new_edges[1:, None], old_edges[None, 1:])
     lower = np.maximum(new_edges[:-1, None], old_edges[None, :-1])
@@ -91,7 +91,7 @@ def _overlaps(old: int, new: int) -> NDArray[np.float64]:
 
 
 def _lines(panel: Panel, width: int, palette: Palette) -> list[str]:
-    """Title, map and scale, each `width` cells wide."""
+    """Return title, map and scale, each `width` cells wide."""
     span = panel.high - panel.low
     height = max(1, width // 2)
     pixel_rows = height if palette == "plain" else 2 * height
@@ -123,7 +123,7 @@ def _shades(shares: NDArray[np.float64]) -> NDArray[np.str_]:
 
 
 def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64], palette: Palette) -> str:
-    """One line of half blocks; a colour is named only where it changes."""
+    """Return one line of half blocks; a colour is set only where it changes."""
     text, last = [], ""
     for top, bottom in zip(_colour_codes(upper, palette), _colour_codes(lower, palette), strict=True):
         colour = f"\x1b[38;{top};48;{bottom}m"
@@ -133,7 +133,7 @@ def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64], palette: Pal
 
 
 def colours(shares: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Colours (..., 3), red, green and blue in 0..255, of shares (...) in 0..1."""
+    """Return colours (..., 3), red, green and blue in 0..255, of shares (...) in 0..1."""
     positions = np.linspace(0, 1, len(STOPS))
     channels = [np.interp(shares, positions, STOPS[:, channel]) for channel in range(3)]
     return np.stack(channels, axis=-1).astype(np.float64)

@@ -1,4 +1,4 @@
-"""A bar with rate and remaining time on what takes longer than two seconds; on a terminal alone, and nowhere else."""
+"""Progress bar with rate and remaining time for work of more than two seconds, on a terminal alone."""
 
 import os
 import sys
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 
 DELAY_S: Final = 2.0
 _RANK, _FIRST = "RANK", "0"
-"""Of torchrun's processes, which share a terminal, the first shows its bars."""
+"""Variable and value of the first of torchrun's processes, which share a terminal; it alone shows its bars."""
 _COUNTED: Final = "{desc} {percentage:3.0f}%|{bar}| {rate_fmt} {remaining} left{postfix}"
 _TIMED: Final = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 SECONDS: Final = "s"
-"""Unit of what lasts for a set time, whose rate says nothing."""
+"""Unit of work that lasts for a set time, whose rate means nothing."""
 _Thing = TypeVar("_Thing")
 
 
 class Progress:
-    """How far something is. Whatever ends it, the line is cleared."""
+    """Progress of a piece of work on one line, which is cleared at the end, whatever ends it."""
 
     def __init__(
         self,
@@ -37,13 +37,13 @@ class Progress:
         """Begin; nothing is shown yet.
 
         Args:
-            what: is done, in a word or two.
-            total: of units, when it is finished.
+            what: name of the work, in a word or two.
+            total: units of the whole work.
             unit: in the singular, such as "pose"; SECONDS for a wait.
             done: units that were finished before, and took no time now.
-            stream: a terminal, or nothing is shown; stderr by default.
+            stream: output, used only if it is a terminal; stderr by default.
             clock_s: monotonic, in [s].
-            delay_s: a bar is shown of what is not over by then, in [s].
+            delay_s: time before the bar appears, in [s].
         """
         self._what, self._total, self._unit = what, total, unit
         self._before = self._done = done
@@ -63,11 +63,11 @@ class Progress:
         self.close()
 
     def advance(self, units: float = 1) -> None:
-        """So many more are done."""
+        """Add finished units."""
         self.reach(self._done + units)
 
     def reach(self, done: float) -> None:
-        """So many are done."""
+        """Set the number of finished units."""
         more, self._done = done - self._done, done
         if self._bar is not None:
             self._bar.update(more)
@@ -75,14 +75,14 @@ class Progress:
             self._show()
 
     def note(self, text: str, *, at_once: bool = False) -> None:
-        """A few words behind the bar, shown with the next step, or at once where that is far off."""
+        """Set a few words after the bar, shown with the next step, or at once if that is far off."""
         self._note = text
         if self._bar is not None:
             self._bar.set_postfix_str(text, refresh=at_once)
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Room for lines of others on the same terminal."""
+        """Clear the bar within a with statement, for lines of others on the same terminal."""
         if self._bar is not None:
             self._bar.clear()
         yield
@@ -90,13 +90,13 @@ class Progress:
             self._bar.refresh()
 
     def close(self) -> None:
-        """Clear the line; more than once does no harm."""
+        """Clear the line; repeated calls do no harm."""
         self._watched = False
         if self._bar is not None:
             self._bar.close()
 
     def _show(self) -> None:
-        from tqdm import tqdm  # here and not above, for most of what is followed is over before
+        from tqdm import tqdm  # here and not above, since most work is over before
 
         waited_s = self._clock_s() - self._begun_s
         bar = tqdm(
@@ -110,22 +110,22 @@ class Progress:
             dynamic_ncols=True,
             miniters=0,
             bar_format=_TIMED if self._unit == SECONDS else _COUNTED,
-            delay=1e-9,  # what it would show at once is a bar without a rate
+            delay=1e-9,  # its first bar would have no rate
         )
-        bar.last_print_t -= waited_s  # it began when we did, or its rate would be that of an instant
+        bar.last_print_t -= waited_s  # the rate counts from the start of the work, not of the bar
         bar.set_postfix_str(self._note, refresh=False)
         bar.update(self._done - self._before)
         self._bar = bar
 
 
 def tracked(things: Iterable[_Thing], what: str, unit: str, total: int | None = None) -> Iterator[_Thing]:
-    """The things, one after the other, followed by a bar; each counts when the next is asked for.
+    """Yield things one after the other under a bar; each counts when the next is requested.
 
     Args:
-        things: what is gone through.
-        what: is done, in a word or two.
-        unit: what one is called.
-        total: how many there are, where they cannot say so.
+        things: things to go through.
+        what: name of the work, in a word or two.
+        unit: name of one thing, in the singular.
+        total: number of things, if they have no length.
     """
     count = len(things) if total is None and isinstance(things, Sized) else total
     if count is None:

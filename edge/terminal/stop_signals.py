@@ -1,4 +1,4 @@
-"""Ctrl-C and its like as an event, so that a run ends after the scans in hand."""
+"""Stop event on Ctrl-C and similar signals, so that a run ends after the scans in hand."""
 
 import contextlib
 import signal
@@ -10,7 +10,7 @@ from edge.terminal.forced_end import ended_in_time
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that the first signal sets; what is within has END_S to end then. A second signal ends it at once."""
+    """Yield an event that the first signal sets; the block then has END_S to end. A second signal ends it at once."""
     stop = threading.Event()
 
     def handle(number: int, frame: object) -> None:
