@@ -171,7 +171,7 @@ class ModelSession:
         if self.traction is not None and not np.isfinite(self.traction).all():
             raise ModelError(f"model '{self.name}' gave a traction that is not finite: export it again")
         deviation = self.deviation
-        # Not a number is neither above nor below anything, so it fails here too.
+        # NaN fails here too, since it is neither above nor below any number.
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
         return pattern

@@ -147,7 +147,7 @@ class Field:
         return self.parts or (self.name,)
 
     def in_record(self) -> Column:
-        """Return the column of the JSON record, where null stands for what is unknown."""
+        """Return the column of the JSON record, in which null stands for an unknown value."""
         if self.json is not None:
             return Column(self.attribute, self.json, None)
         if self.kind.shape and self.decimals is not None:

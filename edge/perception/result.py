@@ -82,12 +82,12 @@ class Result:
 
     @property
     def note(self) -> str | None:
-        """The notes in one line, for a person; None without any."""
+        """Notes in one line, for a person; None without any."""
         return joined(self.notes) if self.notes else None
 
     @property
     def event(self) -> str | None:
-        """The events in one line, for a person; None without any."""
+        """Events in one line, for a person; None without any."""
         return joined(self.events) if self.events else None
 
     def baseline_text(self) -> str:

@@ -202,7 +202,7 @@ class Runtime:
         return results
 
     def _follow(self, scan: Scan) -> tuple[Result, "_Due | None"]:
-        """The result without a pattern, and what a pattern is to be made from."""
+        """Return the result without a pattern, and the input of a pattern if one is due."""
         if scan.counts.shape != self._scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
         sensor = self._sensors.get(scan.sensor) or self._meet(scan)

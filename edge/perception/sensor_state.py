@@ -141,7 +141,7 @@ class Sensor:
         return None if self.baseline is None else deformation(self.watch.held, self.baseline, self._mounting)
 
     def fill(self, zeroed: NDArray[np.float32]) -> Readings | None:
-        """Readings with something for the dead taxels; None where none is dead, or too many are."""
+        """Return readings with estimates for the dead taxels; None if no taxel is dead, or too many are."""
         return self.filler(zeroed) if self.filler is not None and self.watch.may_be_estimated else None
 
     def follow_drift(self, scan: Scan, contact: bool) -> None:

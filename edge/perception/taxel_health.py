@@ -96,7 +96,7 @@ class TaxelWatch:
 
     @property
     def waiting(self) -> bool:
-        """A taxel has not been heard yet, and is not given up."""
+        """True while a taxel has not arrived yet and is not given up."""
         return not self.sound and not bool((self._heard | self.dead).all())
 
     @property
@@ -106,7 +106,7 @@ class TaxelWatch:
 
     @property
     def may_be_estimated(self) -> bool:
-        """Enough taxels live; half of them silent are no defect but a wrong id map."""
+        """True while enough taxels live; half of them silent are not a defect but a wrong id map."""
         silent = sum(reason == "silent" for reason in self.reasons.values())
         return len(self.reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
 

@@ -77,7 +77,7 @@ class Commands:
         self._producers.append(producer)
 
     def poll(self) -> list[Command]:
-        """Return what was asked of the runtime since the last call; what was to be recorded is done. Never waits."""
+        """Return the commands to the runtime since the last call and carry out those of recording; never waits."""
         while self.signalled:
             self.put(self.signalled.pop())
         for produce in self._producers:

@@ -10,7 +10,7 @@ from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32
-"""Of the run-time histogram: a quantile is at most 2.2 % too high."""
+"""Resolution of the run-time histogram: a quantile is at most 2.2 % too high."""
 SHORTEST_NS: Final = 1_000_000_000
 """Of a run whose rate is told: the first scans have waited for the model, and come all at once, which over less makes
 some 100 Hz look like 135."""

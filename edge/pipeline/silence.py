@@ -90,7 +90,7 @@ class Silence:
         return None
 
     def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
-        """Count what is missing behind a gap, once scans come at their pace again: what was late comes in a burst."""
+        """Count the scans missing in a gap, once scans come at their pace again: late ones come in a burst."""
         gap_ns = scan.on_bus_ns - before.on_bus_ns
         gap = self._gaps.get(scan.sensor)
         if gap is not None and period_ns > GAP_PERIODS * gap.period_ns:
