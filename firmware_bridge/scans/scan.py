@@ -1,4 +1,4 @@
-"""A scan: one reading of all taxels of one sensor, and which of them are new."""
+"""A scan: one reading of all taxels of one sensor, with masks of the new ones."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -9,25 +9,25 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import SensorGeometry
 
 ABSENT: Final = -1
-"""Stands where a taxel gave no reading in this scan; raw counts are unsigned, so no reading is -1."""
+"""Marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1."""
 
 
 LONGEST_SENSOR_NAME: Final = 64
 
 
 def is_sensor_name(name: str) -> bool:
-    """Whether a sensor may be called so: what a file says is shown, logged and written into others."""
+    """Return True if a name is valid for a sensor: names from files are shown, logged and written into others."""
     return name.isprintable() and 0 < len(name) <= LONGEST_SENSOR_NAME
 
 
 @dataclass(frozen=True, slots=True)
 class VendorReading:
-    """What the vendor's own software says beside the counts; None where it does not.
+    """Values that the vendor's software reports in addition to the counts; None where it does not.
 
     Attributes:
         newtons: (3, rows, cols) float32, axes x, y, z, in [N].
         temperature_k: (rows, cols) float32, in [K]; NaN where a taxel has no thermometer.
-        ups_hz: (rows, cols) float32, how often a second each taxel is renewed.
+        ups_hz: (rows, cols) float32, rate at which each taxel is renewed, in [Hz].
     """
 
     newtons: NDArray[np.float32] | None = None
@@ -41,18 +41,18 @@ class Scan:
 
     Attributes:
         sensor: name of the sensor on its link, such as the controller id "4".
-        number: counts the scans of this sensor from 0.
+        number: index of the scan, from 0 for each sensor.
         time_ns: monotonic time at which its newest reading arrived, in [ns].
         counts: (3, rows, cols) int32 raw counts, axes x, y, z; ABSENT where not fresh.
-        fresh: (rows, cols) bool, the taxel's reading arrived in this scan.
-        renewed: (rows, cols) bool, fresh and different from that taxel's reading before. Noise
+        fresh: (rows, cols) bool, True where the taxel's reading arrived in this scan.
+        renewed: (rows, cols) bool, True where it is fresh and differs from the taxel's reading before. Noise
             renews a live taxel almost surely, so a fresh taxel that is not renewed is most
             likely an old reading sent again.
-        device_ns: when its newest reading was on the bus or in the sensor's own hands, by the device's time stamps
-            mapped to monotonic time, in [ns]; None where it gives none. What `time_ns` is later is delay.
-        vendor: what the vendor's software says of the same moment; None of a link that reads the sensor itself.
-        unread_ns: it may have lain there for so long before it was read, in [ns], since nobody looked meanwhile; 0
-            where somebody did.
+        device_ns: time at which its newest reading was on the bus or in the sensor, by the device's time stamps mapped
+            to monotonic time, in [ns]; None without time stamps. The difference to `time_ns` is delay.
+        vendor: values of the vendor's software at the same moment; None for a link that reads the sensor itself.
+        unread_ns: longest time that it may have waited to be read, in [ns], since the link was not read meanwhile;
+            0 if the link was read.
     """
 
     sensor: str
@@ -67,40 +67,40 @@ class Scan:
 
     @property
     def not_before_ns(self) -> int:
-        """Monotonic time before which none of its readings was taken, as far as is known, in [ns].
+        """Estimated monotonic time before which no reading of it was taken, in [ns].
 
-        By the device's time stamps, or by when the link was last found empty: the first reading after an opening sets
-        the device's clock, and seems new where nobody read it for long.
+        It follows from the device's time stamps, and from the last time at which the link was empty: the first reading
+        after an opening sets the device's clock, and seems new even if it waited long to be read.
         """
         since_ns = self.time_ns - self.unread_ns
         return since_ns if self.device_ns is None else min(self.device_ns, since_ns)
 
-    # On sixteen taxels numpy's all() costs ten times what looking for a byte does, and these are asked of every scan.
+    # For sixteen taxels numpy's all() takes ten times as long as a search for a byte, and every scan needs these.
 
     @property
     def whole(self) -> bool:
-        """Every taxel's reading arrived and is new: nothing is torn or repeated."""
+        """True if every taxel's reading arrived and is new: nothing is torn or repeated."""
         return False not in self.renewed.tobytes()
 
     @property
     def complete(self) -> bool:
-        """Every taxel's reading arrived."""
+        """True if every taxel's reading arrived."""
         return False not in self.fresh.tobytes()
 
     @property
     def torn(self) -> bool:
-        """Some taxels are new and some are not, on the wire or at the source."""
+        """True if some taxels are new and some are not, on the wire or at the source."""
         renewed = self.renewed.tobytes()
         return (True in renewed and False in renewed) or not self.complete
 
     @property
     def repeated(self) -> bool:
-        """Every taxel arrived and none is new."""
+        """True if every taxel arrived and not one is new."""
         return self.complete and True not in self.renewed.tobytes()
 
     @property
     def vendor_force_n(self) -> tuple[float, float, float] | None:
-        """Force x, y, z on the pad in [N], by the vendor; None where it is not told, or holds for old readings."""
+        """Force x, y, z on the pad in [N], by the vendor; None if it is missing, or includes old readings."""
         if self.vendor is None or self.vendor.newtons is None or not self.complete:
             return None
         x, y, z = self.vendor.newtons.reshape(3, -1).sum(axis=1).tolist()
@@ -108,7 +108,7 @@ class Scan:
 
 
 class ScanSeries:
-    """The scans of one sensor in their order: numbers them and tells new readings from old ones."""
+    """Sequence of the scans of one sensor: numbers them and separates new readings from old ones."""
 
     def __init__(self, sensor: str, geometry: SensorGeometry) -> None:
         self._sensor = sensor
@@ -123,13 +123,13 @@ class ScanSeries:
         device_ns: int | None = None,
         vendor: VendorReading | None = None,
     ) -> Scan:
-        """The next scan.
+        """Return the next scan.
 
         Args:
             counts: (3, rows, cols), ABSENT where no reading came; kept and made read-only.
             time_ns: arrival of its newest reading, in [ns].
-            device_ns: of its newest reading, as in Scan.
-            vendor: what the vendor's software says of it.
+            device_ns: time of its newest reading, as in Scan.
+            vendor: values of the vendor's software.
         """
         fresh = counts[0] != ABSENT
         renewed = fresh & (counts != self._last).any(axis=0)
@@ -137,7 +137,7 @@ class ScanSeries:
         return self._number_on(counts, fresh, renewed, time_ns, device_ns, vendor)
 
     def close_whole(self, counts: NDArray[np.int32], time_ns: int, device_ns: int | None = None) -> Scan:
-        """The same for a scan that holds every taxel, at half the cost."""
+        """Return the next scan from counts that hold every taxel, at half the cost of `close`."""
         renewed = np.logical_or.reduce(counts != self._last)
         self._last = counts
         return self._number_on(counts, self._all_fresh, renewed, time_ns, device_ns)
