@@ -22,7 +22,7 @@ class Table:
         self._known: list[str] = []
 
     def take(self, key: str, read: Callable[[Any], Any], *, required: bool = True) -> Any:
-        """Return the value of a key, None if an optional one is missing; a ValueError of `read` states what it expected."""
+        """Return the value of a key, None if an optional one is missing; errors of `read` state what it expected."""
         self._known.append(key)
         if key not in self._values:
             return self.refuse(key, "missing", "it to be there") if required else None

@@ -91,7 +91,7 @@ class Baseline:
         scans: int,
         origin: Origin,
     ) -> Self:
-        """Return a baseline of the given counts (3, rows, cols), with its id."""
+        """Return a baseline of counts (3, rows, cols), with its id."""
         own = np.array(counts, dtype=np.float32)
         own.setflags(write=False)
         digest = hashlib.sha256(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
