@@ -1,4 +1,4 @@
-"""gs_usb, the protocol of candleLight adapters and their kin: requests, bit timing, and bytes to frames. No I/O.
+"""Protocol gs_usb of candleLight adapters and their kin: requests, bit timing, and bytes to frames. No I/O.
 
 The adapter sends host frames, little-endian, usually one in a USB transfer:
 
@@ -54,7 +54,7 @@ _FD_MORE_BYTES: Final = 64 - 8
 
 USUAL_SAMPLE_POINT: Final = 0.875
 _SAMPLE_POINTS: Final = (0.75, 0.90)
-"""Outside of these a bus of usual length does not work. Source: CiA 301, recommended bit timing."""
+"""Range of sample points within which a bus of usual length works. Source: CiA 301, recommended bit timing."""
 
 _header = struct.Struct("<IIBBBB")
 _frame = struct.Struct("<IIBBBB8s")

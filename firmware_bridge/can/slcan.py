@@ -1,4 +1,4 @@
-"""slcan text to CAN frames and back. No I/O.
+"""Decoder and encoder of CAN frames as slcan text. No I/O.
 
 A line ends at CR (or at BEL, an adapter's refusal). Within a line the frame is the text from the
 LAST frame letter (t T r R) to the CR: hex digits hold no such letter, so a letter in mid-line is
@@ -33,7 +33,7 @@ STAMPS_ON: Final = b"Z1\r"
 STAMPS_OFF: Final = b"Z0\r"
 
 LONGEST_LINE: Final = 30
-"""Characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp."""
+"""Most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp."""
 LAST_TIMESTAMP_MS: Final = 59_999
 
 LINES_TO_LEARN: Final = 4
@@ -77,7 +77,7 @@ class CanFrame(NamedTuple):
 
 
 class PackedFrames(NamedTuple):
-    """A run of usual frames, PACKED_BYTES or STAMPED_BYTES each."""
+    """Run of usual frames, PACKED_BYTES or STAMPED_BYTES each."""
 
     data: bytes
     frame_bytes: int

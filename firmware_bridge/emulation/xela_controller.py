@@ -132,7 +132,7 @@ class SlcanAdapter:
     """
 
     def __init__(self, *, acknowledges: bool = True, left_open: bool = False, old_canable: bool = False) -> None:
-        """Switch it on.
+        """Switch the adapter on.
 
         Args:
             acknowledges: True if it answers commands.

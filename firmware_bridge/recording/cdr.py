@@ -1,4 +1,4 @@
-"""ROS 2 messages as bytes, driven by the text of their own definition, so that the two cannot differ. No I/O.
+"""Encoding of ROS 2 messages by the text of their own definition, so that the two cannot differ. No I/O.
 
 The encoding is CDR version 1, little-endian, as every ROS 2 middleware writes it: four bytes of header, then each
 field at a multiple of its size; texts and sequences begin with their length. Bytes are not trusted: every length is

@@ -1,4 +1,4 @@
-"""CAN frames to scans, for links that hand out frames. No I/O, no clock."""
+"""Stages from CAN frames to scans, for links that receive frames. No I/O, no clock."""
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, decode
@@ -8,7 +8,7 @@ from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 
 class FrameScans:
-    """Stages from CAN frames to scans, for links that hand out frames.
+    """Stages from CAN frames to scans, for links that receive frames.
 
     Attributes:
         can_ids: the standard CAN ids received so far, of any device.

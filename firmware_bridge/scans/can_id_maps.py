@@ -1,4 +1,4 @@
-"""CAN frames to taxel readings of XELA uSkin sensors. No I/O.
+"""Maps from CAN frames to taxel readings of XELA uSkin sensors. No I/O.
 
 One taxel per frame, eight bytes: byte 0 unused, X, Y, Z as unsigned big-endian 16 bit, byte 7
 unused. The unused bytes are not zero. The id of a taxel depends on the controller's age:

@@ -1,4 +1,4 @@
-"""A device's time stamps on the host's clock. No I/O, no clock of its own.
+"""Conversion of a device's time stamps to the host's clock. No I/O, no clock of its own.
 
 A stamp is the time at which a frame was on the bus, an arrival the time at which it was read: later by the delay in
 adapter, bus and kernel, which is never negative. So the smallest recent difference is the best estimate of the offset

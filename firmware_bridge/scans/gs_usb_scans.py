@@ -1,4 +1,4 @@
-"""Bytes of a gs_usb adapter to scans: the pure stages in a row. No I/O, no clock."""
+"""Stages from the bytes of a gs_usb adapter to scans. No I/O, no clock."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Taxel readings to scans. No I/O, no clock.
+"""Assembly of taxel readings to scans. No I/O, no clock.
 
 The wire has no end-of-scan marker. A scan closes when every taxel has come, or the last one of the sensor's cycle, or
 when the next reading belongs to another cycle: after a pause, or where the order of the taxels has wrapped round

@@ -1,4 +1,4 @@
-"""slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
+"""Stages from slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
 
 from typing import Final
 

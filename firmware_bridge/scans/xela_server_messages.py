@@ -1,4 +1,4 @@
-"""Messages of the vendor's server to readings. No I/O, no clock.
+"""Decoder from messages of the vendor's server to readings. No I/O, no clock.
 
 A message is a JSON object: `message`, a number that counts up, or "Welcome"; `time` of sending, in [s] of the server's
 clock; and under "1", "2", ... the last reading of each sensor, new or not: `data`, the counts x, y, z of one taxel

@@ -1,4 +1,4 @@
-"""Readings of the vendor's server to scans. No I/O, no clock.
+"""Stage from readings of the vendor's server to scans. No I/O, no clock.
 
 The server sends its readings at its own pace, old ones again, and the reading of a taxel with older ones of its
 neighbours: 507 messages a second were observed for a sensor that renewed seven taxels meanwhile. So its pace has no

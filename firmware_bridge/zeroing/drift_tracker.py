@@ -34,13 +34,14 @@ REST_BLOCKS: Final = 4
 """Still blocks (two seconds) before drift is followed or a rest level compared: the pad has recovered from all but a
 hundredth of a press by then, and a robot that taps every few seconds still leaves that much time."""
 COMMON_PER_S: Final = 20.0
-"""Highest rate of the common drift that is followed, per axis, in [counts/s]: above any drift measured in use."""
+"""Highest rate of the common drift that is followed, per axis, in [counts/s]: 1000 counts a minute and more, above any
+drift on record."""
 COMMON_COUNTS: Final = 50.0
 """Largest common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by
 twice its 18 counts; this limit is still half of a contact's threshold."""
 OWN_SHARE: Final = 0.65
-"""Largest own drift of a taxel as a share of the common drift: the standard deviation is a quarter of the mean taxel's
-drift, so two of them can be six tenths of the median taxel's. A press has a share above one."""
+"""Largest own drift of a taxel as a share of the common drift: its spread is a quarter of the mean taxel's drift, so
+twice that can be six tenths of the median taxel's. A press has a share above one."""
 OWN_PER_S: Final = 0.05
 """Highest rate of a taxel's own drift beyond that share, in [counts/s]: 3 counts a minute. No measured drift needs
 more, and a touch loses about a count before it is detected."""

@@ -74,23 +74,23 @@ class Chance(FrameFault):
         self._share = share(parameter, self.usual_share)
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Strike, or pass it on."""
+        """Strike the frame by chance, or pass it on."""
         return self.strike(sent) if self.draw.random() < self._share else self.spare(sent)
 
     def spare(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Pass it on."""
+        """Pass the frame on."""
         yield sent
 
     @abstractmethod
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Yield the frames that replace it."""
+        """Yield the frames that replace the struck one."""
 
 
 class Lost(Chance):
     """Frames that are lost, as when a queue in the adapter overflows."""
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Lose it."""
+        """Mark the frame as lost."""
         yield sent._replace(fate="lost")
 
 
@@ -98,7 +98,7 @@ class Repeated(Chance):
     """Frames that come twice in a row."""
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Yield it twice."""
+        """Yield the frame twice."""
         yield sent
         yield sent._replace(fate="repeated")
 
@@ -111,14 +111,14 @@ class Reordered(Chance):
         self._held: list[BusFrame] = []
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Hold it back, unless another one is held back."""
+        """Hold the frame back, unless another one is held back."""
         if self._held:
             yield from self.spare(sent)
         else:
             self._held.append(sent._replace(fate="reordered"))
 
     def spare(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Yield it before the frame that is held back."""
+        """Yield the frame before the one that is held back."""
         yield sent
         yield from self.end()
 
@@ -132,7 +132,7 @@ class Foreign(Chance):
     """Frames of another device on the bus."""
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Yield a foreign frame before it."""
+        """Yield a foreign frame before the frame."""
         frame = CanFrame(FOREIGN_ID | self.draw.randrange(16), self.draw.randbytes(8))
         yield BusFrame(sent.time_s, frame, 0, "foreign")
         yield sent
@@ -159,14 +159,14 @@ class OneTaxel(FrameFault):
 
     @abstractmethod
     def strike(self, sent: BusFrame) -> BusFrame:
-        """Return the frame that replaces it."""
+        """Return the frame that replaces the struck one."""
 
 
 class DeadTaxel(OneTaxel):
     """Taxel that sends no frame."""
 
     def strike(self, sent: BusFrame) -> BusFrame:
-        """Lose it."""
+        """Mark the frame as lost."""
         return sent._replace(fate="dead")
 
 
@@ -228,7 +228,7 @@ class BusOff(FrameFault):
     """Adapter that has left the bus after too many errors; it returns by itself."""
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Lose it."""
+        """Mark the frame as lost."""
         yield sent._replace(fate="bus-off")
 
 

@@ -61,14 +61,14 @@ class LineFault(ABC):
 
     @abstractmethod
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Yield the pieces that replace it."""
+        """Yield the pieces that replace the struck line."""
 
 
 class Garbage(LineFault):
     """Bursts of any bytes before a line, every other one with a line end."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Yield a burst before it."""
+        """Yield a burst before the line."""
         length = self.draw.randint(SHORTEST_NOISE, LONGEST_NOISE)
         yield Piece(bytes(self.draw.choices(_NOISE_BYTES, k=length)) + self.draw.choice((b"", b"\r")), None)
         yield Piece(line, sent)
@@ -78,15 +78,15 @@ class Truncated(LineFault):
     """Lines that end too soon."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Cut it."""
+        """Cut the line."""
         yield Piece(line[: self.draw.randint(1, MOST_LEFT_BYTES)] + b"\r", sent._replace(fate="truncated"))
 
 
 class Merged(LineFault):
-    """Lines whose end is missing, or more of it, so that the next one follows at once."""
+    """Lines cut before their end, so that the next one follows at once."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Remove its end."""
+        """Remove the end of the line."""
         yield Piece(line[: self.draw.randint(1, len(line) - 1)], sent._replace(fate="merged"))
 
 
