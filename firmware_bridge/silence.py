@@ -29,8 +29,7 @@ LATEST_SCAN_S: Final = 2.0
 
 LINK_SILENT_S: Final = 0.7
 """Time without a scan after which a link is closed and opened again, in [s]: an adapter that was reset keeps its port,
-and is silent until its channel is reopened. A little more than a sensor's silence, which it would otherwise be mistaken
-for."""
+and is silent until its channel is reopened. A little more than a sensor's silence, which must not reopen the link."""
 ADAPTER_ASKED_NS: Final = 500_000_000
 """Time without a scan after which an adapter's status is requested, in [ns], since it can explain the silence; before
 the link is opened again."""

@@ -59,12 +59,11 @@ class Link(Protocol):
 
     Attributes:
         name: the source as a user would write it, such as "slcan:/dev/ttyUSB0".
-        kind: "device" for hardware, "replay" for a file, "emulated" for a pretended device.
+        kind: "device" for hardware, "replay" for a file, "emulated" for an emulated device.
         ended: True once a finite source has no more scans.
         trouble: trouble of the device to report to the user; None if there is none.
         patient: True where the link waits for its reader, and returns one scan for each `read`, whatever its time.
-        unix_offset_ns: offset that a patient link adds to the time of a scan to get [ns] since 1970; None if it is not
-            available.
+        unix_offset_ns: offset from the times of a patient link's scans to [ns] since 1970; None if it is not available.
         origin: kind of source of a recording's scans, however often it was played and recorded again; None if it is
             not available, or equals `kind`.
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.

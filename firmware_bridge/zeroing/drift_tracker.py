@@ -38,7 +38,7 @@ COMMON_PER_S: Final = 20.0
 drift on record."""
 COMMON_COUNTS: Final = 50.0
 """Largest common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by
-twice its 18 counts; this limit is still half of a contact's threshold."""
+twice its 18 counts; at this limit the summed z is still half of a contact's."""
 OWN_SHARE: Final = 0.65
 """Largest own drift of a taxel as a share of the common drift: its spread is a quarter of the mean taxel's drift, so
 twice that can be six tenths of the median taxel's. A press has a share above one."""
