@@ -1,1 +1,1 @@
-"""What is true of the device: bytes to frames, frames to scans, zeroing. Knows no model."""
+"""Device side: bytes to frames, frames to scans, zeroing. Independent of any network."""

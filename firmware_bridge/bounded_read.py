@@ -1,4 +1,4 @@
-"""Users' files, read up to a limit: a name can stand for a device without end as well as for a file."""
+"""Reading of users' files up to a limit, since a path can also lead to an endless device."""
 
 import errno
 from pathlib import Path
@@ -8,27 +8,27 @@ PIECE_BYTES: Final = 1 << 20
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
-    """A file's content.
+    """Read a whole file.
 
     Args:
-        path: of the file.
-        most_bytes: that it may hold.
+        path: path of the file.
+        most_bytes: largest allowed size, in bytes.
 
     Raises:
-        OSError: it cannot be read, or holds more; nothing beyond the limit was read.
+        OSError: it cannot be read, or is larger; no more than a piece beyond the limit is read.
     """
     with path.open("rb") as file:
         return read_up_to(file, most_bytes)
 
 
 def read_up_to(file: BinaryIO, most_bytes: int) -> bytes:
-    """The rest of an open file, as `read_bounded` reads a whole one.
+    """Read the rest of an open file, with the limit of `read_bounded`.
 
     Raises:
-        OSError: it cannot be read, or holds more.
+        OSError: it cannot be read, or is larger.
     """
     content = bytearray()
-    while piece := file.read(PIECE_BYTES):  # asked for all at once, it would take memory for the limit
+    while piece := file.read(PIECE_BYTES):  # one large read would allocate memory for the whole limit
         content += piece
         if len(content) > most_bytes:
             raise OSError(errno.EFBIG, f"larger than the {most_bytes:,} bytes that are read")

@@ -2,12 +2,12 @@
 
 BridgeError
 +-- DeviceError (OSError)
-|   +-- NoDeviceError          no adapter, or several, and none was named
+|   +-- NoDeviceError          no adapter, or several without a choice
 |   +-- LinkLostError          the link was there and is gone
 +-- BaselineRefusedError (ValueError)  the pad moved or was loaded while zeroing
 +-- RecordingError (ValueError)        a recording or baseline file that cannot be used
 +-- NpzError (ValueError)              an npz file that is not plain arrays
-+-- CdrError (ValueError)              bytes that are no such ROS message
++-- CdrError (ValueError)              bytes that are no ROS message of their type
 +-- SensorFileError (ValueError)       a sensor file that cannot be used
 +-- SourceError (ValueError)           a text that names no source
 
@@ -24,7 +24,7 @@ class DeviceError(BridgeError, OSError):
 
 
 class NoDeviceError(DeviceError):
-    """No sensor adapter, or several, and none was named."""
+    """No sensor adapter, or several without a choice."""
 
 
 class LinkLostError(DeviceError, ConnectionError):
@@ -32,7 +32,7 @@ class LinkLostError(DeviceError, ConnectionError):
 
 
 class BaselineRefusedError(BridgeError, ValueError):
-    """The scans given cannot serve as a baseline."""
+    """Scans that cannot serve as a baseline."""
 
 
 class RecordingError(BridgeError, ValueError):
@@ -44,7 +44,7 @@ class NpzError(BridgeError, ValueError):
 
 
 class CdrError(BridgeError, ValueError):
-    """Bytes that are no message of the type they are said to be."""
+    """Bytes that are no message of their stated type."""
 
 
 class SensorFileError(BridgeError, ValueError):

@@ -1,4 +1,4 @@
-"""What is installed only where it is asked for."""
+"""Optional dependencies, the extras of pyproject.toml, and the messages where they are missing."""
 
 import re
 import sys
@@ -11,10 +11,10 @@ _PACKAGE: Final = "tactile-edge-sr"
 
 
 def how_to_install(extra: str) -> str:
-    """The command that brings an extra of pyproject.toml, for a line that says what is missing."""
+    """Return the command that installs an extra of pyproject.toml, for the message that it is missing."""
     if (_FOLDER / "pyproject.toml").is_file():
         return f"pip install '{_FOLDER}[{extra}]'"
-    from importlib.metadata import PackageNotFoundError, requires  # here alone: it takes long to import
+    from importlib.metadata import PackageNotFoundError, requires  # imported here, since it takes long
 
     try:
         wanted = _wanted(requires(_PACKAGE) or [], extra)
@@ -24,7 +24,7 @@ def how_to_install(extra: str) -> str:
 
 
 def need(extra: str, *modules: str) -> None:
-    """Refuse to import a package of which an extra is missing; a command ends with the line alone.
+    """Refuse to import a package with a missing extra; a command ends with this message alone.
 
     Raises:
         ModuleNotFoundError: modules of the extra are not installed.
@@ -33,13 +33,13 @@ def need(extra: str, *modules: str) -> None:
     if not missing:
         return
     why = f"not installed: {', '.join(missing)}; {how_to_install(extra)}"
-    if sys.argv[:1] == ["-m"]:  # python -m looks for the command, which is within the package
+    if sys.argv[:1] == ["-m"]:  # python -m imports the package to find the command in it
         sys.exit(why)
     raise ModuleNotFoundError(why, name=missing[0])
 
 
 def _wanted(requirements: list[str], extra: str) -> list[str]:
-    """The extra's requirements of a package's metadata, each quoted for a shell."""
+    """Return the requirements of an extra from a package's metadata, each quoted for a shell."""
     wanted: list[str] = []
     for requirement in requirements:
         text, _, condition = requirement.partition(";")

@@ -1,4 +1,4 @@
-"""Write a file in place: beside it first, moved there when it is complete, the one before kept."""
+"""Writing of a file in place: a draft first, moved there once it is complete, with the former file kept."""
 
 import errno
 import os
@@ -14,17 +14,17 @@ BACKUP_SUFFIX: Final = ".bak"
 def write_in_place(
     path: str | Path, write: Callable[[Path], object], load: Callable[[Path], object], *, keep_before: bool = True
 ) -> None:
-    """Write a file so that at any time there is a whole one or none under its name, or the one before.
+    """Write a file so that at any time its name leads to a complete file, new or former, or to no file.
 
     Args:
-        path: of the file; one that is there stays as NAME.bak.
+        path: path of the file; an existing one stays as NAME.bak.
         write: writes a draft of the same name in another folder.
         load: reads the draft back, as its readers will.
-        keep_before: False for what is written over and over, and needs no .bak.
+        keep_before: False for files that are rewritten often, and need no .bak.
 
     Raises:
-        OSError: the file cannot be written, or is no plain file; what was there is there still. What `write` and `load`
-            raise comes through, and leaves it likewise.
+        OSError: the file cannot be written, or is no plain file; the former one is still there. Errors of `write` and
+            `load` are passed on, and leave the former one there as well.
     """
     path = Path(path)
     check_writable(path)
@@ -32,7 +32,7 @@ def write_in_place(
         draft = Path(folder) / path.name
         write(draft)
         with draft.open("rb") as file:
-            os.fsync(file.fileno())  # or a power cut could leave the name to an empty file
+            os.fsync(file.fileno())  # otherwise a power cut could leave an empty file under the name
         load(draft)
         if keep_before and path.exists():
             before = Path(folder) / (path.name + BACKUP_SUFFIX)
@@ -42,10 +42,10 @@ def write_in_place(
 
 
 def check_writable(path: Path) -> None:
-    """Find out whether a file can be written in place, before time is spent on what is to be in it.
+    """Check that a file can be written in place, before time is spent on its content.
 
     Raises:
-        OSError: it cannot.
+        OSError: it cannot be written.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

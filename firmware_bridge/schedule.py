@@ -8,24 +8,24 @@ from typing import Final
 NS_PER_S: Final = 1_000_000_000
 
 Clock = Callable[[], int]
-"""Monotonic time in [ns]."""
+"""Clock of monotonic time, in [ns]."""
 Sleep = Callable[[float], object]
-"""Sleeps for a time in [s]; may come back early or late."""
+"""Function that sleeps for a time in [s]; may return early or late."""
 
 
 def sleep_until(deadline_ns: int, clock: Clock = time.monotonic_ns, sleep: Sleep = time.sleep) -> int:
-    """Sleep until `deadline_ns`; returns the time at waking, in [ns]. Past deadlines return at once."""
+    """Sleep until `deadline_ns` and return the time at waking, in [ns]; at once if the deadline is past."""
     while (now_ns := clock()) < deadline_ns:
         sleep((deadline_ns - now_ns) / NS_PER_S)
     return now_ns
 
 
 class Ticker:
-    """Ticks at start + n / rate. A late tick does not move the ones after it.
+    """Source of ticks at start + n / rate. A late tick does not move the ones after it.
 
     Attributes:
-        late: ticks that were already past when they were asked for.
-        skipped: ticks that were left out, because the next one was past as well.
+        late: number of ticks that were already past when they were requested.
+        skipped: number of ticks left out, because the next one was past as well.
     """
 
     def __init__(self, rate_hz: float, clock: Clock = time.monotonic_ns, sleep: Sleep = time.sleep) -> None:
@@ -42,7 +42,7 @@ class Ticker:
     def wait(self) -> int:
         """Sleep until the next tick and return its number, from 1.
 
-        Behind by whole periods, it leaves those ticks out and gives the newest that is past.
+        If it is late by whole periods, it leaves those ticks out and returns the newest one that is past.
         """
         self._tick += 1
         now_ns = self._clock()
@@ -57,5 +57,5 @@ class Ticker:
         return self._tick
 
     def deadline_ns(self, tick: int) -> int:
-        """When a tick is due, in [ns] of the clock."""
+        """Return the time at which a tick is due, in [ns] of the clock."""
         return self._start_ns + round(tick * NS_PER_S / self._rate_hz)

@@ -1,46 +1,46 @@
-"""How long silence may last before it means something: every threshold, and why it has its value.
+"""Thresholds of silence: every time without data after which the bridge reacts, and the reason for its value.
 
 Two figures decide most of them. The slowest sensor on record renews a taxel four times a second, so a quarter of a
-second without a reading is no silence; and an adapter hands on what it holds after 16 ms at the latest. Thresholds of
-one reading or scan are in [ns], on the clock of the scans; those of a wait for something are in [s].
+second without a reading is no silence; and an adapter hands on its data after 16 ms at the latest. Thresholds of a
+reading or scan are in [ns], on the clock of the scans; those of a wait are in [s].
 """
 
 from typing import Final
 
 SLOWEST_PERIOD_NS: Final = 250_000_000
-"""Between two scans of the slowest sensor on record."""
+"""Time between two scans of the slowest sensor on record, in [ns]."""
 
 # ---- A sensor ----
 
 SENSOR_SILENT_NS: Final = 2 * SLOWEST_PERIOD_NS
-"""Without a scan, while another sensor goes on, a sensor is told to be silent, and the page draws it grey."""
+"""Time without a scan after which a sensor is reported silent, if another one goes on, and drawn grey, in [ns]."""
 TAPS_FORGOTTEN_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Without a scan, what a sensor felt before is worth nothing: a tap is over within."""
+"""Time without a scan after which earlier taps are dropped, in [ns]: a tap is over by then."""
 SCAN_GIVEN_UP_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""After its first reading a scan that is not whole is waited for no longer: older readings are another scan's."""
+"""Time after its first reading at which an incomplete scan is given up, in [ns]: later readings are another scan's."""
 SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""A reading older than this when the vendor's server sends it is one of a sensor that is heard no more."""
+"""Age at which a reading from the vendor's server belongs to a silent sensor, in [ns]."""
 TAXEL_SILENT_SCANS: Final = 50
-"""Scans without a taxel after which it is not lost for a moment: the user is told, and zeroing goes on without it."""
+"""Scans without a taxel after which its loss is reported, and zeroing goes on without it."""
 LATEST_SCAN_S: Final = 2.0
-"""The doctor finds a sensor wrong whose last scan is older than this when the watching ends."""
+"""Age of the last scan at the end of its watch above which the doctor reports a sensor, in [s]."""
 
 # ---- A link ----
 
 LINK_SILENT_S: Final = 0.7
-"""Without a scan, a link is closed and opened again: an adapter that was reset keeps its port and says nothing until
-its channel is opened anew. It is a little more than a sensor's silence, which it would else be taken for."""
+"""Time without a scan after which a link is closed and opened again, in [s]: an adapter that was reset keeps its port,
+and is silent until its channel is reopened. A little more than a sensor's silence, which must not reopen the link."""
 ADAPTER_ASKED_NS: Final = 500_000_000
-"""Without a scan, an adapter is asked for its status, for then there is something to learn; before the link is opened
-again."""
+"""Time without a scan after which an adapter's status is requested, in [ns], since it can explain the silence; before
+the link is opened again."""
 SERVER_QUIET_S: Final = 0.75
-"""Without a message, the vendor's server is asked whether it is there."""
+"""Time without a message after which the vendor's server is pinged, in [s]."""
 
 # ---- A person, or a program that waits ----
 
 SHOWN_SILENT_S: Final = 1.0
-"""Without a scan, the status line and the diagnostics say so; below, a person would see it flicker."""
+"""Time without a scan after which the status line and the diagnostics report it, in [s]: below, they would flicker."""
 GIVEN_UP_S: Final = 10.0
-"""Without a scan, zeroing and the doctor give up: a sensor that is plugged in meanwhile has come by then."""
+"""Time without a scan after which zeroing and the doctor give up, in [s]: a sensor just plugged in has come by then."""
 POLL_S: Final = 0.1
-"""How long a stop, a command or a silent link may go unnoticed: every wait for scans is cut in pieces of it."""
+"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces."""

@@ -1,1 +1,1 @@
-"""CAN adapters: their protocols, and what goes wrong on the bus. No I/O."""
+"""Protocols of the CAN adapters, and the errors on the bus. No I/O."""

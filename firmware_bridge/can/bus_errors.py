@@ -1,6 +1,6 @@
-"""What goes wrong on a CAN bus and in its controller: counted by sort, and how it stands now. No I/O, no clock.
+"""Errors on a CAN bus and in its controller: a count of each kind, and the present state. No I/O, no clock.
 
-An error frame is no frame from the bus: the controller makes it to tell of something.
+An error frame does not come from the bus: the controller creates it to report an event.
 Source: Linux include/uapi/linux/can/error.h, whose bits socketcan and gs_usb adapters share.
 """
 
@@ -9,14 +9,14 @@ from typing import Final
 BUS_OFF: Final = 0x40
 RESTARTED: Final = 0x100
 CONTROLLER: Final = 0x04
-"""What data byte 1 tells of."""
+"""Error class whose details are in data byte 1."""
 RX_OVERFLOW: Final = 0x01
 TX_OVERFLOW: Final = 0x02
 WARNING: Final = 0x04 | 0x08
 PASSIVE: Final = 0x10 | 0x20
 
 LOST_RECENTLY_NS: Final = 5_000_000_000
-"""So long is a loss of frames worth telling."""
+"""Time for which a loss of frames is reported, in [ns]."""
 
 _COUNTED: Final[tuple[str, ...]] = (
     "bus_off",
@@ -33,7 +33,7 @@ _TROUBLE: Final = {
 
 
 class BusErrors:
-    """Counts error frames by sort, and knows the state of the controller."""
+    """Counters of error frames by kind, and the state of the controller."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
@@ -42,11 +42,11 @@ class BusErrors:
         self._lost_ns: int | None = None
 
     def error_frame(self, classes: int, data: bytes, time_ns: int) -> None:
-        """Take an error frame.
+        """Process an error frame.
 
         Args:
-            classes: of errors, the bits of its id.
-            data: what it tells more.
+            classes: error classes, the bits of its id.
+            data: details of the error.
             time_ns: monotonic time of its arrival, in [ns].
         """
         self._told_before_opening = False
@@ -67,45 +67,45 @@ class BusErrors:
             self._counts["other_errors"] += 1
 
     def unsorted_error(self) -> None:
-        """Take an error frame of which nobody knows what it says."""
+        """Count an error frame whose content cannot be decoded."""
         self._counts["other_errors"] += 1
 
     def overflow(self, time_ns: int) -> None:
-        """Take an adapter's word that it had no room for frames, at `time_ns` [ns] of monotonic time."""
+        """Count a report of the adapter that its queue was full, at `time_ns` [ns] of monotonic time."""
         self._counts["overflows"] += 1
         self._lost_ns = time_ns
 
     def left_the_bus(self) -> None:
-        """Take it that the controller is bus-off; counted once until it is back."""
+        """Note that the controller is bus-off; counted once until it is back."""
         self._enter("bus_off")
 
     def reopened(self) -> None:
-        """Take it that the controller went on while nobody listened: its state holds until a frame says otherwise."""
+        """Note that the controller ran on while the link was closed: its state holds until a frame shows another."""
         self._told_before_opening = True
 
     def restarted(self) -> None:
-        """Take it that the controller began anew."""
+        """Note that the controller was restarted."""
         self._state = None
 
     def frame_heard(self) -> None:
-        """Take it that a frame came: who has left the bus hears none."""
+        """Note that a frame was received, which a controller in bus-off cannot do."""
         if self._state == "bus_off" or self._told_before_opening:
             self._state = None
         self._told_before_opening = False
 
     def trouble(self, time_ns: int) -> str | None:
-        """What the user must know of at `time_ns` [ns] of monotonic time; None while all is well."""
+        """Return the trouble to report to the user at `time_ns` [ns] of monotonic time, None if there is none."""
         troubles = [] if self._state is None else [_TROUBLE[self._state]]
         if self._lost_ns is not None and time_ns - self._lost_ns < LOST_RECENTLY_NS:
             troubles.append("the adapter has lost frames: they are not fetched fast enough")
         return "; ".join(troubles) or None
 
     def counters(self) -> dict[str, int]:
-        """By sort.
+        """Return the counters by name.
 
-        bus_off, error_passive: times that the controller got there; error_warnings; other_errors: frames that were
-        garbled, as far as it tells; controller_overflows: times that it had no room for a frame; overflows: the same
-        of the adapter's queue.
+        bus_off, error_passive: times that the controller entered the state; error_warnings; other_errors: garbled
+        frames, as far as the controller reports them; controller_overflows: times that it had no room for a frame;
+        overflows: the same of the adapter's queue.
         """
         return dict(self._counts)
 

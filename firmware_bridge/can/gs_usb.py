@@ -1,13 +1,13 @@
-"""gs_usb, the protocol of candleLight adapters and their kin: requests, bit timing, and bytes to frames. No I/O.
+"""Protocol gs_usb of candleLight adapters and their kin: requests, bit timing, and bytes to frames. No I/O.
 
 The adapter sends host frames, little-endian, usually one in a USB transfer:
 
     u32 echo_id | u32 can_id | u8 dlc | u8 channel | u8 flags | u8 reserved | 8 bytes of data [| u32 time stamp in us]
 
-echo_id is all ones where the frame came from the bus, else the number of one that we sent and that went out. can_id
-holds three flags (extended, remote, error). A transfer begins with a frame, and a packet that is not full ends it: what
-is not whole by then never will be. Within a transfer nothing marks where a frame begins, so a header is believed only
-if every field is one that an adapter could send; where it is not, bytes are skipped until it is.
+echo_id is all ones for a frame from the bus, else the number of a frame that this side sent and that went out. can_id
+holds three flags (extended, remote, error). A transfer begins with a frame, and a packet that is not full ends it: a
+frame that is incomplete by then stays incomplete. Within a transfer nothing marks the beginning of a frame, so a header
+is accepted only if an adapter could send every field of it; otherwise bytes are skipped until one is acceptable.
 
 Source: Linux drivers/net/can/usb/gs_usb.c; candleLight_fw include/gs_usb.h.
 """
@@ -32,11 +32,11 @@ CONFIG_BYTES: Final = 12
 
 HARDWARE_STAMPS: Final = 1 << 4
 LPC546XX_QUIRK: Final = 1 << 9
-"""This chip needs one byte behind every frame it gets."""
+"""Feature flag of a chip that needs one more byte after every frame sent to it."""
 
 RECEIVED: Final = 0xFFFFFFFF
 ECHO_IDS: Final = 10
-"""How many frames may be under way to the bus, as Linux has it; their echo ids are 0..9."""
+"""Most frames under way to the bus at once, as in Linux; their echo ids are 0..9."""
 
 OVERFLOW_FLAG: Final = 1 << 0
 FD_FLAG: Final = 1 << 1
@@ -54,7 +54,7 @@ _FD_MORE_BYTES: Final = 64 - 8
 
 USUAL_SAMPLE_POINT: Final = 0.875
 _SAMPLE_POINTS: Final = (0.75, 0.90)
-"""Outside of these a bus of usual length does not work. Source: CiA 301, recommended bit timing."""
+"""Range of sample points within which a bus of usual length works. Source: CiA 301, recommended bit timing."""
 
 _header = struct.Struct("<IIBBBB")
 _frame = struct.Struct("<IIBBBB8s")
@@ -62,7 +62,7 @@ _stamp = struct.Struct("<I")
 
 
 class BitTimingLimits(NamedTuple):
-    """What an adapter's CAN controller can do: its features, its clock in [Hz], and ranges in time quanta."""
+    """Capabilities of an adapter's CAN controller: features, clock in [Hz], and ranges in time quanta."""
 
     features: int
     clock_hz: int
@@ -77,10 +77,10 @@ class BitTimingLimits(NamedTuple):
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "BitTimingLimits":
-        """From the answer to the request BIT_TIMING_LIMITS.
+        """Decode the answer to the request BIT_TIMING_LIMITS.
 
         Raises:
-            ValueError: it is too short.
+            ValueError: the answer is too short.
         """
         if len(data) < LIMITS_BYTES:
             raise ValueError(f"bit timing limits have {len(data)} bytes, expected {LIMITS_BYTES}")
@@ -88,7 +88,7 @@ class BitTimingLimits(NamedTuple):
 
 
 class BitTiming(NamedTuple):
-    """The parts of a bit in time quanta, and how many clocks a quantum has."""
+    """Segments of a bit in time quanta, and the clock ticks in a quantum (brp)."""
 
     prop_seg: int
     phase_seg1: int
@@ -98,21 +98,21 @@ class BitTiming(NamedTuple):
 
     @property
     def quanta(self) -> int:
-        """Of a whole bit."""
+        """Number of time quanta in a bit."""
         return 1 + self.prop_seg + self.phase_seg1 + self.phase_seg2
 
     @property
     def sample_point(self) -> float:
-        """Where in a bit it is read, 0..1."""
+        """Position within a bit at which it is sampled, 0..1."""
         return (self.quanta - self.phase_seg2) / self.quanta
 
     def to_bytes(self) -> bytes:
-        """For the request BIT_TIMING."""
+        """Encode the payload of the request BIT_TIMING."""
         return struct.pack("<5I", *self)
 
 
 def bit_timing(limits: BitTimingLimits) -> BitTiming:
-    """The timing for 1 Mbit/s whose sample point is nearest to 87.5 %; of equal ones that of the finest quanta.
+    """Return the timing for 1 Mbit/s with the sample point nearest to 87.5 %; of equal ones that of the finest quanta.
 
     Raises:
         ValueError: this controller cannot do it.
@@ -127,10 +127,10 @@ def bit_timing(limits: BitTimingLimits) -> BitTiming:
 
 
 def channel_count(config: bytes) -> int:
-    """From the answer to the request DEVICE_CONFIG.
+    """Decode the number of channels from the answer to the request DEVICE_CONFIG.
 
     Raises:
-        ValueError: it is too short.
+        ValueError: the answer is too short.
     """
     if len(config) < CONFIG_BYTES:
         raise ValueError(f"device configuration has {len(config)} bytes, expected {CONFIG_BYTES}")
@@ -138,30 +138,30 @@ def channel_count(config: bytes) -> int:
 
 
 def host_format() -> bytes:
-    """Says that we speak little-endian; all but the first adapters speak nothing else."""
+    """Encode the choice of little-endian; all but the first adapters support nothing else."""
     return struct.pack("<I", 0x0000BEEF)
 
 
 def mode(*, started: bool, features: int = 0) -> bytes:
-    """For the request MODE: start the channel with some features, or reset it."""
+    """Encode the payload of the request MODE: start the channel with the features, or reset it."""
     return struct.pack("<II", started, features if started else 0)
 
 
 def encode_frame(frame: CanFrame, echo_id: int, limits: BitTimingLimits) -> bytes:
-    """A frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back when it has gone out."""
+    """Encode a frame to send on channel 0; `echo_id`, below ECHO_IDS, comes back once it has gone out."""
     raw_id = frame.can_id | EXTENDED * frame.extended | REMOTE * frame.remote
     data = _frame.pack(echo_id, raw_id, len(frame.data), 0, 0, 0, frame.data)
     return data + b"\0" if limits.features & LPC546XX_QUIRK else data
 
 
 class HostFrame(NamedTuple):
-    """What the adapter sent: a frame from the bus, or an error frame, with `error` the classes of errors.
+    """Frame received from the adapter: one from the bus, or an error frame.
 
     Attributes:
-        frame: as it was on the bus; of an error frame only its data mean something.
-        error: None of a frame from the bus.
-        stamp_us: of the adapter's clock, which wraps round after 32 bits, in [us]; None if it has none.
-        overflow: frames before this one were lost, since the adapter's queue was full.
+        frame: the frame as it was on the bus; only the data of an error frame have a meaning.
+        error: the error classes of an error frame, None for a frame from the bus.
+        stamp_us: time by the adapter's clock, which wraps round after 32 bits, in [us]; None if it has no clock.
+        overflow: True where frames before this one were lost, since the adapter's queue was full.
     """
 
     frame: CanFrame
@@ -171,10 +171,10 @@ class HostFrame(NamedTuple):
 
 
 class GsUsbDecoder:
-    """Cuts a byte stream into host frames. Any chunking gives the same frames and the same counters."""
+    """Decoder of a byte stream into host frames. Any chunking gives the same frames and the same counters."""
 
     def __init__(self, *, stamped: bool, channels: int = 1) -> None:
-        """Know how the adapter was started: with time stamps or not, and how many channels it has."""
+        """Configure the decoder as the adapter was started: with time stamps or not, and with so many channels."""
         self._stamped = stamped
         self._channels = channels
         self._frame_bytes = FRAME_BYTES + STAMP_BYTES * stamped
@@ -184,19 +184,19 @@ class GsUsbDecoder:
         self._skipped_bytes = 0
 
     def end_transfer(self) -> None:
-        """Give up a frame that is not whole: the next transfer begins with another."""
+        """Discard an incomplete frame: the next transfer begins with another one."""
         self._skipped_bytes += len(self._pending)
         self._pending, self._in_step = b"", True
 
     def feed(self, data: bytes) -> list[HostFrame]:
-        """Frames from channel 0 whose last byte lies in `data`; echoes and what we cannot want are left out."""
+        """Decode frames of channel 0 whose last byte lies in `data`; without echoes, FD frames and other channels."""
         buffer = self._pending + data
         end = len(buffer)
         position = 0
         taken: list[HostFrame] = []
         while end - position >= HEADER_BYTES:
             echo_id, raw_id, dlc, channel, flags, _ = _header.unpack_from(buffer, position)
-            # Where a frame must begin, one of a channel that was not announced is one as well.
+            # Where a frame must begin, a header of a channel that was not announced is valid as well.
             known = channel < self._channels or self._in_step
             if not known or not self._plausible(echo_id, raw_id, dlc, flags):
                 self._skipped_bytes += 1
@@ -220,7 +220,7 @@ class GsUsbDecoder:
         return taken
 
     def counters(self) -> dict[str, int]:
-        """Frames, those of each sort that is not given, and bytes that belong to none."""
+        """Return the counts of frames, of each kind that is left out, and of bytes that belong to no frame."""
         return self._counts | {"skipped_bytes": self._skipped_bytes}
 
     def _plausible(self, echo_id: int, raw_id: int, dlc: int, flags: int) -> bool:
@@ -234,7 +234,7 @@ class GsUsbDecoder:
     def _read(self, buffer: bytes, position: int, raw_id: int, dlc: int, flags: int) -> HostFrame:
         start = position + HEADER_BYTES
         is_error, remote = raw_id & ERROR != 0, raw_id & REMOTE != 0
-        # Nine to fifteen are lawful on the wire, and mean eight.
+        # A dlc of 9 to 15 is allowed on the wire, and means eight bytes.
         data = b"" if remote and not is_error else buffer[start : start + min(dlc, 8)]
         self._counts["error_frames" if is_error else "frames"] += 1
         stamp_us = _stamp.unpack_from(buffer, start + 8)[0] if self._stamped else None
@@ -256,7 +256,7 @@ def _timings(limits: BitTimingLimits) -> Iterator[BitTiming]:
             tseg1 = quanta - 1 - phase_seg2
             if not limits.tseg1_min <= tseg1 <= limits.tseg1_max:
                 continue
-            # The adapter adds the first two up; Linux halves them as well.
+            # The adapter sums the first two segments; they are halved as in Linux.
             prop_seg = tseg1 // 2
             sjw = max(1, min(limits.sjw_max, phase_seg2 // 2, tseg1 - prop_seg))
             timing = BitTiming(prop_seg, tseg1 - prop_seg, phase_seg2, sjw, brp)

@@ -1,22 +1,22 @@
-"""slcan text to CAN frames and back. No I/O.
+"""Decoder and encoder of CAN frames as slcan text. No I/O.
 
 A line ends at CR (or at BEL, an adapter's refusal). Within a line the frame is the text from the
 LAST frame letter (t T r R) to the CR: hex digits hold no such letter, so a letter in mid-line is
-the start of a whole frame behind the wreck of another, or of noise. That text must fit its own
-length digit exactly, or nothing is given.
+the start of a whole frame after the remains of another, or after noise. That text must fit its own
+length digit exactly, or the line gives no frame.
 
-An adapter stamps every line with a time, or none. Which, is learnt from LINES_TO_LEARN frames in a row
-of one form; from then on a frame of the other form is a bad line, until as many of those come in a row.
-So four data digits lost from a stamped line make no false frame without a stamp. Before anything is
-learnt, both are taken.
+An adapter stamps either every line with a time or no line. The decoder learns the form from LINES_TO_LEARN
+frames in a row of one form; from then on a frame of the other form is a bad line, until as many of those come
+in a row. So four data digits lost from a stamped line make no false frame without a stamp. Before a form is
+learnt, both are accepted.
 
-What a prefix can do: nothing to the frame behind it, which is checked as if it stood alone. A data
-digit corrupted INTO a letter starts a false frame, but too few characters follow it for eight data
-bytes; only the length digit of a stamped line leaves enough, and what follows that has no stamp.
+A prefix cannot harm the frame after it, which is checked as if it stood alone. A data digit corrupted
+INTO a letter starts a false frame, but too few characters follow it for eight data bytes; only the
+length digit of a stamped line leaves enough, and that false frame has no stamp.
 
 The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one
 line's length across two lines (the head of one frame with the tail of the next), give a well-formed
-frame that was never sent. Nobody can tell from the text. Such a value lives for one scan.
+frame that was never sent. The text does not show it. Such a value lasts for one scan.
 """
 
 import re
@@ -33,16 +33,16 @@ STAMPS_ON: Final = b"Z1\r"
 STAMPS_OFF: Final = b"Z0\r"
 
 LONGEST_LINE: Final = 30
-"""Characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp."""
+"""Most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp."""
 LAST_TIMESTAMP_MS: Final = 59_999
 
 LINES_TO_LEARN: Final = 4
-"""Frames in a row of the form that is not the learnt one: no damage to a line makes so many of them."""
+"""Frames in a row of one form after which it is learnt: damage to lines does not make so many of them."""
 
 PACKED_BYTES: Final = 10
-"""A usual frame packed: twelve bits of id, four of length (8), eight bytes of data."""
+"""Bytes of a usual frame packed: twelve bits of id, four of length (8), eight bytes of data."""
 STAMPED_BYTES: Final = 12
-"""The same and two bytes of time stamp, in [ms]."""
+"""Bytes of a usual frame packed with two bytes of time stamp, in [ms]."""
 
 _STAMP = rb"(?:[0-9A-Da-d][0-9A-Fa-f]{3}|[Ee](?:[0-9][0-9A-Fa-f]{2}|[Aa][0-5][0-9A-Fa-f]))"
 _USUAL = rb"(?:t[0-7][0-9A-Fa-f]{2}8[0-9A-Fa-f]{16}%s\r)+"
@@ -52,7 +52,7 @@ _REPLY = re.compile(rb"[zZ]?|[VN][0-9A-Za-z]{4}")
 
 
 class _Form(NamedTuple):
-    """Lines of frames of eight bytes with a standard id, which is what a sensor sends."""
+    """Form of the lines of frames of eight bytes with a standard id, the only frames that a sensor sends."""
 
     lines: re.Pattern[bytes]
     line_bytes: int
@@ -77,23 +77,23 @@ class CanFrame(NamedTuple):
 
 
 class PackedFrames(NamedTuple):
-    """A run of usual frames, PACKED_BYTES or STAMPED_BYTES each."""
+    """Run of usual frames, PACKED_BYTES or STAMPED_BYTES each."""
 
     data: bytes
     frame_bytes: int
 
 
 class SlcanDecoder:
-    """Cuts a byte stream into frames. Any chunking gives the same frames and the same counters.
+    """Decoder of a byte stream into frames. Any chunking gives the same frames and the same counters.
 
     Attributes:
-        status: what the adapter told of itself.
-        frames: so far, of any sort.
-        refusals: BELs so far.
-        late_stamps: lines lost so far because their time stamp was beyond LAST_TIMESTAMP_MS.
-        usual_line_bytes: a usual frame's line as the adapter sends it, with its CR; the shorter one before that is
-            learnt.
-        pending_bytes: of an unfinished line.
+        status: the state that the adapter has reported.
+        frames: number of frames so far, of any kind.
+        refusals: number of BELs so far.
+        late_stamps: number of lines lost so far because their time stamp was beyond LAST_TIMESTAMP_MS.
+        usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
+            form until the form is learnt.
+        pending_bytes: number of bytes of an unfinished line.
     """
 
     def __init__(self) -> None:
@@ -113,14 +113,14 @@ class SlcanDecoder:
         self.refusals = 0
 
     def begin_anew(self) -> None:
-        """Give up an unfinished line: the link broke, and what comes next does not belong to it, nor has its form."""
+        """Discard an unfinished line and the learnt form: the link broke, and the next bytes belong to neither."""
         self._skipped_bytes += len(self._pending)
         self._pending, self.pending_bytes = b"", 0
         self._form, self._same_in_a_row = None, 0
         self.usual_line_bytes = _FORMS[False].line_bytes
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """Frames whose last byte lies in `data`; what comes after it waits for the next call."""
+        """Decode the frames whose last byte lies in `data`; the bytes after them wait for the next call."""
         frames: list[CanFrame] = []
         for piece in self.cut(data):
             if isinstance(piece, CanFrame):
@@ -132,9 +132,9 @@ class SlcanDecoder:
         return frames
 
     def cut(self, data: bytes) -> list[PackedFrames | CanFrame]:
-        """The same frames in their order, those of the usual form packed, run by run, once that form is learnt.
+        """Decode the same frames in their order, those of the usual form packed, run by run, once that form is learnt.
 
-        A sensor sends no other form, and a run of sixteen costs about what one frame by itself does.
+        A sensor sends no other form, and a run of sixteen costs about as much as a single frame.
         """
         buffer = self._pending + data
         pieces: list[PackedFrames | CanFrame] = []
@@ -158,7 +158,7 @@ class SlcanDecoder:
                 self.frames += 1
                 pieces.append(frame)
             position = end.end()
-        # Of an unfinished line only the last characters can still become a frame: memory is bounded.
+        # Only the last characters of an unfinished line can still become a frame, so memory is bounded.
         cut = max(position, len(buffer) - LONGEST_LINE)
         self._skipped_bytes += cut - position
         self._pending = buffer[cut:]
@@ -166,7 +166,7 @@ class SlcanDecoder:
         return pieces
 
     def counters(self) -> dict[str, int]:
-        """Frames, lines of each other sort, and bytes that belong to none of them."""
+        """Return the counts of frames, of each other kind of line, and of bytes that belong to neither."""
         return {
             "frames": self.frames,
             "bad_lines": self._bad_lines,
@@ -180,7 +180,7 @@ class SlcanDecoder:
     def _read_line(self, line: bytes, *, refused: bool) -> CanFrame | None:
         self.refusals += refused
         start = max(line.rfind(letter) for letter in (b"t", b"T", b"r", b"R"))
-        # A frame ends at CR alone: a BEL says that what stands before it went wrong.
+        # A frame ends at CR alone: a BEL means that the command before it was refused.
         if start >= 0 and not refused:
             frame = _parse_frame(line[start:])
             if frame is not None and (frame.timestamp_ms or 0) > LAST_TIMESTAMP_MS:
@@ -199,7 +199,7 @@ class SlcanDecoder:
         return None
 
     def _takes(self, stamped: bool) -> bool:
-        """Whether a frame of this form is what the adapter sends; learns."""
+        """Return True if the adapter sends frames of this form, and learn the form from it."""
         self._same_in_a_row = self._same_in_a_row + 1 if stamped == self._newest_stamped else 1
         self._newest_stamped = stamped
         if self._same_in_a_row >= LINES_TO_LEARN:
@@ -209,7 +209,7 @@ class SlcanDecoder:
 
 
 def encode_frame(frame: CanFrame) -> bytes:
-    r"""A frame as an slcan line, with its CR.
+    r"""Encode a frame as an slcan line, with its CR.
 
     Raises:
         ValueError: the id, the data or the time stamp does not fit a CAN 2.0 frame.
@@ -229,7 +229,7 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 
 def _parse_frame(text: bytes) -> CanFrame | None:
-    """The frame that this is to the letter; its time stamp may be any."""
+    """Parse a frame that the text must match exactly, None if it does not; any time stamp is accepted."""
     match = _FRAME.fullmatch(text)
     if match is None:
         return None

@@ -1,10 +1,10 @@
-"""What an slcan adapter tells of itself: status flags, changes of state, errors on the bus. No I/O, no clock.
+"""Status that an slcan adapter reports: flags, changes of state, errors on the bus. No I/O, no clock.
 
-    Fxx         answer to `F`: eight flags (Lawicel CAN232 manual, version 3), which are cleared by the asking
+    Fxx         answer to `F`: eight flags (Lawicel CAN232 manual, version 3), which the request clears
     saRRRTTT    the state, a active, w warning, p passive, b bus-off, and two error counts (Linux slcan-core.c)
-    eNxx...     N errors on the bus, a letter each (the same)
+    eNxx...     N errors on the bus, a letter each (Linux slcan-core.c)
 
-EasySYNC adapters answer with other flags and no F before them: that is a bad line.
+EasySYNC adapters answer with other flags and without the F: that is a bad line.
 """
 
 import re
@@ -40,7 +40,7 @@ NOISE: Final = frozenset({"error_passive", "bus_error"})
 INTERVAL_NS: Final = 5_000_000_000
 MOST_UNANSWERED: Final = 3
 FRAMES_TO_FORGET: Final = 1600
-"""A loss that an error line told of is over when so many frames have come since: a second of one sensor."""
+"""Frames after which a loss that an error line reported is over: a second of one sensor."""
 
 BUS_OFF: Final = "the adapter reports bus-off: check bitrate, wiring and termination"
 BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame: check bitrate, wiring and termination"
@@ -51,10 +51,10 @@ _FLAGS = re.compile(rb"F[0-9A-Fa-f]{2}")
 
 
 class AdapterStatus:
-    """Counts what the adapter reports, and knows what of it a user must know.
+    """Counters of the adapter's reports, and the trouble that a user must learn of.
 
     Attributes:
-        counts: status_lines: unasked; status_answers: to `F`; and of each sort that was ever reported, how often.
+        counts: numbers of unsolicited status lines, of answers to `F`, and of each kind of report so far.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class AdapterStatus:
         self._lost_at_frame: int | None = None
 
     def hear(self, line: bytes, frames: int) -> bool:
-        """Take a line without its end, after so many frames in all; False if it is none of these."""
+        """Process a line without its end, after so many frames in all; False if it is no status line."""
         if _FLAGS.fullmatch(line):
             value = int(line[1:], 16)
             self._flags = frozenset(name for bit, name in FLAGS.items() if value & bit)
@@ -86,14 +86,14 @@ class AdapterStatus:
         return True
 
     def trouble(self, frames: int, *, flags_of_a_silence: bool = False) -> str | None:
-        """What a user must know, in plain words; None while all is well.
+        """Return the trouble to report to the user, None if there is none.
 
-        Bus-off is over when a frame comes; a loss that flags told of, when they next say nothing of it.
+        Bus-off is over when a frame comes; a loss that flags reported, when the next flags do not contain it.
 
         Args:
-            frames: so many have come in all.
-            flags_of_a_silence: no frame comes, and the flags were asked for since the last one did: an error now
-                and then is in the flags of any bus, and no trouble while frames come.
+            frames: number of frames so far.
+            flags_of_a_silence: True where no frame comes, and the flags were requested since the last one: the flags
+                of any bus hold an error now and then, which is no trouble while frames come.
         """
         if self._off_at_frame == frames:
             return BUS_OFF
@@ -103,12 +103,12 @@ class AdapterStatus:
         return FRAMES_LOST if recent or self._flags & LOSSES else None
 
     def forget(self) -> None:
-        """It answers no more: the flags that it told last hold no longer."""
+        """Forget the flags reported last, since the adapter no longer answers."""
         self._flags = frozenset()
 
     @property
     def answers(self) -> int:
-        """Number of times that `F` was answered."""
+        """Number of answers to `F`."""
         return self.counts["status_answers"]
 
     def _count(self, names: Iterable[str]) -> None:
@@ -118,16 +118,16 @@ class AdapterStatus:
 
 
 class StatusQuestions:
-    """When to ask for the flags.
+    """Schedule of the requests for the status flags.
 
-    After ADAPTER_ASKED_NS without a scan, since then there is something to learn, and else once in INTERVAL_NS at most:
-    adapters that obey one command a USB packet have something else to do, the answer stands in the midst of frames,
-    and asking clears the flags for whoever else might want them. One that refuses, or leaves MOST_UNANSWERED of them
-    unanswered, is asked no more.
+    The flags are requested after ADAPTER_ASKED_NS without a scan, when they can explain the silence, and otherwise at
+    most once in INTERVAL_NS: some adapters obey one command a USB packet, the answer arrives among the frames, and a
+    request clears the flags for every other reader. An adapter that refuses, or leaves MOST_UNANSWERED requests
+    unanswered, is not asked again.
     """
 
     def __init__(self, status: AdapterStatus) -> None:
-        """Ask the adapter that `status` hears of."""
+        """Prepare requests to the adapter whose lines `status` receives."""
         self._status = status
         self._refusals = 0
         self._answers = 0
@@ -139,21 +139,21 @@ class StatusQuestions:
 
     @property
     def answered_in_silence(self) -> bool:
-        """No scan comes, and flags were asked for since the last one did, and came."""
+        """True where no scan comes, and flags were requested and answered since the last one."""
         before = self._answers_before_silence
         return before is not None and self._status.answers > before
 
     def reopened(self) -> None:
-        """The channel was opened anew: who has ever answered is given another chance."""
+        """Allow requests again after the channel was reopened, if the adapter has ever answered."""
         if self._status.answers:
             self._unanswered = 0
 
     def due(self, scans: int, refusals: int, now_ns: int) -> bool:
-        """Whether to ask now, which is then taken as done; to be called at every read.
+        """Return True if a request is due, which then counts as sent; to be called at every read.
 
         Args:
-            scans: that this read gave.
-            refusals: BELs so far.
+            scans: number of scans that this read returned.
+            refusals: number of BELs so far.
             now_ns: monotonic, in [ns].
         """
         if scans:

@@ -1,4 +1,4 @@
-"""The injector's truth on disk, for who judges a reader in another process."""
+"""Files of the injector's truth, for the evaluation of a reader in another process."""
 
 import json
 import time
@@ -20,10 +20,10 @@ ACCOUNTS: Final = "accounts.json"
 
 
 class TruthFiles:
-    """Writes into a folder: every frame and its fate, begin and end of faults, and at the end the accounts."""
+    """Writer of a folder with every frame and its fate, begin and end of faults, and at the end the accounts."""
 
     def __init__(self, folder: Path) -> None:
-        """Keep where they go; nothing is written yet."""
+        """Store the folder; nothing is written yet."""
         self._folder = folder
         self._open = ExitStack()
         self._injector: Injector | None = None
@@ -48,7 +48,7 @@ class TruthFiles:
             (self._folder / ACCOUNTS).write_text(json.dumps(accounts))
 
     def injector(self, stretches: Sequence[Stretch], seed: int) -> Injector:
-        """One whose truth is written."""
+        """Return an injector whose truth is written to the folder."""
         self._injector = Injector(stretches, Truth(self._frames.write), seed, tell=self._tell)
         return self._injector
 
@@ -58,7 +58,7 @@ class TruthFiles:
 
 
 class Told(NamedTuple):
-    """What a folder says: frames as ROW, in the order in which they were handed on; events; accounts."""
+    """Content of a folder: frames as ROW, in the order in which they were handed on; events; accounts."""
 
     frames: NDArray[Any]
     events: list[dict[str, Any]]
@@ -66,7 +66,7 @@ class Told(NamedTuple):
 
 
 def read_truth(folder: Path) -> Told:
-    """What an emulator wrote that has ended."""
+    """Read the folder of an emulator that has ended."""
     return Told(
         np.fromfile(folder / FRAMES, dtype=ROW),
         [json.loads(line) for line in (folder / EVENTS).read_text().splitlines()],

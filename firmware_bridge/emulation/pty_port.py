@@ -1,4 +1,4 @@
-"""The far end of a pseudo-terminal: what stands for an adapter's port, its cable and its line."""
+"""Far end of a pseudo-terminal, which emulates an adapter's port, its cable and its line."""
 
 import fcntl
 import math
@@ -15,7 +15,7 @@ from firmware_bridge.errors import DeviceError
 
 LINE_SPEED_BAUD: Final = 3_000_000
 COUNTED_LATE_NS: Final = 10_000_000
-"""What was sent is counted as unread up to so much later, where the kernel has other work."""
+"""Longest delay, in [ns], until a busy kernel counts sent bytes as unread."""
 _COUNTS: Final = 4
 _SPEEDS_BAUD: Final = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
@@ -23,23 +23,23 @@ _SPEEDS_BAUD: Final = {
 
 
 class PseudoPort:
-    """A port whose clients may come and go, and be cut off.
+    """Port whose clients may come and go, and be disconnected.
 
     Attributes:
-        path: where a client finds it: the pseudo-terminal, or the link that was asked for.
-        plugged: the cable is in.
+        path: path for clients: the pseudo-terminal, or the requested link.
+        plugged: True while the cable is in.
     """
 
     def __init__(self, link: Path | None = None, *, ignores_line_speed: bool = False, seed: int = 0) -> None:
         """Prepare a port; it is not plugged in yet.
 
         Args:
-            link: made to point to the pseudo-terminal of the day, as udev keeps one by serial number.
-            ignores_line_speed: as USB-CDC adapters do.
-            seed: of what arrives at another speed.
+            link: link that always points to the present pseudo-terminal, like udev's link by serial number.
+            ignores_line_speed: True to accept any speed, as USB-CDC adapters do.
+            seed: seed of the noise that arrives at another speed.
 
         Raises:
-            ValueError: at `link` is something else, which is not ours to replace, or there is no such folder.
+            ValueError: another file is at `link`, or its folder does not exist.
         """
         if link is not None and not link.is_symlink():
             if link.exists():
@@ -55,12 +55,12 @@ class PseudoPort:
         self._far_fd = self._client_fd = -1
 
     def plug(self, *, elsewhere: bool = False) -> None:
-        """Put the cable in; `elsewhere`, under another name than before.
+        """Put the cable in; with `elsewhere`, under another name than before.
 
         Raises:
             DeviceError: the link cannot be made.
         """
-        # The client's side stays open here as well, so that clients may come and go.
+        # The client's side stays open in this process as well, so that clients may come and go.
         self._far_fd, self._client_fd = os.openpty()
         terminal = os.ttyname(self._client_fd)
         if elsewhere and terminal == self._terminal:
@@ -85,7 +85,7 @@ class PseudoPort:
         self.plugged = True
 
     def unplug(self) -> None:
-        """Pull the cable out: whoever reads is hung up on, and finds nothing at the link."""
+        """Pull the cable out: a reader gets a hang-up, and the link is removed."""
         if self.plugged:
             self.plugged = False
             if self._link is not None and self._link.is_symlink():
@@ -94,7 +94,7 @@ class PseudoPort:
             os.close(self._client_fd)
 
     def listen(self, timeout_s: float) -> bytes:
-        """What the client has written; waits at most so long for it."""
+        """Return the bytes that the client has written; waits at most `timeout_s` for them."""
         if not self.plugged:
             time.sleep(timeout_s)
             return b""
@@ -102,23 +102,23 @@ class PseudoPort:
         return self._through_line(os.read(self._far_fd, 4096)) if readable else b""
 
     def write(self, data: bytes) -> int:
-        """Send what finds room; an adapter has nowhere to keep the rest. Returns how much went out."""
+        """Send the bytes that find room and return their number; an adapter cannot keep the rest."""
         try:
             return os.write(self._far_fd, self._through_line(data)) if self.plugged else 0
         except BlockingIOError:
             return 0
 
     def unread_bytes(self) -> int:
-        """What the client has not fetched yet."""
+        """Return the number of bytes that the client has not fetched yet."""
         if not self.plugged:
             return 0
-        # Asking whether its side is readable makes the kernel bring up what it still holds back, but says no while
-        # there is less than the client wants at once (VMIN); asking for the number alone says none too early.
+        # select() on the client's side makes the kernel deliver the bytes that it still holds back, but reports nothing
+        # below the client's VMIN; FIONREAD alone would report 0 too early.
         select.select([self._client_fd], [], [], 0)
         return struct.unpack("i", fcntl.ioctl(self._client_fd, termios.FIONREAD, bytes(4)))[0]
 
     def left_bytes(self) -> int:
-        """What a client has left that fetches no more."""
+        """Return the number of bytes left by a client that has stopped reading."""
         counted = 0
         for _ in range(_COUNTS):
             counted = max(counted, self.unread_bytes())
@@ -126,7 +126,7 @@ class PseudoPort:
         return counted
 
     def _through_line(self, data: bytes) -> bytes:
-        """What arrives at the other end: bytes of another speed are read as fewer or more, and as noise."""
+        """Return the bytes that arrive at the other end: at another speed they become noise of another length."""
         speed_baud = _SPEEDS_BAUD.get(termios.tcgetattr(self._client_fd)[5])
         if self._ignores_line_speed or speed_baud == LINE_SPEED_BAUD:
             return data

@@ -1,7 +1,7 @@
-"""Emulator: a XELA controller behind an slcan adapter, on a pseudo-terminal.
+"""Emulator of a XELA controller with an slcan adapter, on a pseudo-terminal.
 
-No kinder than the device: silent until bitrate and open, deaf at the wrong line speed, and frames
-that the client does not fetch in time are lost. `emulator` is its command line.
+It is as strict as the device: silent until bitrate and open, deaf at the wrong line speed, and frames
+that the client does not fetch in time are lost. `slcan_main` is its command line.
 """
 
 import math
@@ -25,13 +25,13 @@ _LONGEST_DRAIN_S: Final = 0.5
 
 
 class Emulator:
-    """Plays recordings on `port`, from the moment the channel is first opened; hangs up at the end.
+    """Player of recordings on `port`, from the first opening of the channel; hangs up at the end.
 
     Attributes:
-        port: where a client finds it, once entered.
-        adapter: its state, and what it refused.
-        sent_frames: frames that went out whole.
-        lost_frames: frames that found no room, because the client did not read.
+        port: path for clients, once entered.
+        adapter: the adapter, with its state and the number of refused commands.
+        sent_frames: number of frames that went out whole.
+        lost_frames: number of frames without room, because the client did not read.
     """
 
     def __init__(
@@ -60,23 +60,23 @@ class Emulator:
             recordings: each track is one sensor on the bus.
             controllers: their controller ids 0..15; by default 4, 6, 8, ...
             rate_hz: scans a second of each sensor; by default as recorded.
-            loop: begin again after the last scan.
-            acknowledges: answer commands.
-            left_open: the channel is open from the start, as a client leaves it that was killed.
-            old_canable: answer nothing, and know no time stamps and no flags.
-            jitter_s: a scan comes up to so much early or late, in [s].
-            latency_s: the adapter hands on what it has once in this time, in [s].
-            frame_s: what a frame takes on the bus, in [s]; a real one carries no more than 480 scans a second.
-            first_frame: frames that are over when the channel is first opened; by default it is where a cycle begins.
-            ignores_line_speed: as USB-CDC adapters do.
-            seed: of jitter and unused bytes.
-            on_scan: told the controller and the monotonic time in [ns] when the last frame of a scan is handed on.
-            faults: what goes wrong on the way.
-            link: made to point to the pseudo-terminal; by default clients are given the terminal itself.
+            loop: True to begin again after the last scan.
+            acknowledges: True to answer commands.
+            left_open: True for a channel that is open from the start, as a killed client leaves it.
+            old_canable: True for no answers, no time stamps and no flags.
+            jitter_s: largest time by which a scan comes early or late, in [s].
+            latency_s: period in which the adapter hands on its frames, in [s].
+            frame_s: duration of a frame on the bus, in [s]; a real one carries no more than 480 scans a second.
+            first_frame: frames that are over when the channel is first opened; by default a cycle begins there.
+            ignores_line_speed: True to accept any speed, as USB-CDC adapters do.
+            seed: seed of jitter and unused bytes.
+            on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
+            faults: faults between bus and client.
+            link: link that points to the pseudo-terminal; by default clients use the terminal itself.
 
         Raises:
             ValueError: an option is out of range.
-            RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
+            RecordingError: a recording that this sensor cannot have made, or one without a rate.
         """
         for name, value in (("jitter_s", jitter_s), ("latency_s", latency_s), ("frame_s", frame_s)):
             if not 0 <= value < math.inf:
@@ -117,14 +117,14 @@ class Emulator:
         self._thread.join()
 
     def tell(self, line: bytes) -> None:
-        """Say a line that nobody asked for, such as `adapter.state_line(...)`."""
+        """Send an unsolicited line, such as `adapter.state_line(...)`."""
         if self._faults is None:
             self._line.write(line)
         else:
             self._send([Piece(line, None, answer=True)], time.monotonic_ns())
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has hung up; False if it has not in time."""
+        """Wait until it has hung up; return False on time-out."""
         return self._through.wait(timeout_s)
 
     def _serve(self) -> None:
@@ -160,7 +160,7 @@ class Emulator:
             lines.append(self.adapter.encode(frame, time_s))
             if frame.can_id in self._last_frames:
                 ended.append(self._last_frames[frame.can_id])
-        now_ns = time.monotonic_ns()  # before the write: who reads may be through before it is back
+        now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
         room = self._line.write(b"".join(lines))
         for line in lines:
             room -= len(line)
@@ -170,7 +170,7 @@ class Emulator:
             self._on_scan(controller, now_ns)
 
     def _hand_on_spoilt(self, faults: Injector, frames: Iterable[tuple[float, CanFrame]]) -> None:
-        """The same through faults, which also pull the cable and reset the adapter."""
+        """Hand on frames through faults, which also pull the cable and reset the adapter."""
         truth, pieces = faults.truth, list[Piece]()
         now_ns = time.monotonic_ns()
         for time_s, frame in frames:
@@ -196,7 +196,7 @@ class Emulator:
             self._line.plug(elsewhere=self._elsewhere)
 
     def _send(self, pieces: Sequence[Piece], now_ns: int) -> None:
-        """Write pieces, and tell the truth how far that went."""
+        """Write pieces, and report to the truth how much of each went out."""
         room = self._line.write(b"".join(piece.data for piece in pieces))
         for piece in pieces:
             written = min(max(room, 0), len(piece.data))
@@ -207,7 +207,7 @@ class Emulator:
             self.lost_frames += room < 0 and piece.sent is not None
 
     def _obey_until(self, deadline_s: float) -> bool:
-        """Serve commands until a time on the monotonic clock; False when told to stop."""
+        """Serve commands until a time on the monotonic clock; return False after a request to stop."""
         while not self._stop.is_set():
             left_s = deadline_s - time.monotonic()
             heard = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
@@ -224,7 +224,7 @@ class Emulator:
         was_open = self.adapter.channel_open
         unread_bytes = self._line.left_bytes() if b"C" in heard else self._line.unread_bytes()
         answer = self.adapter.feed(heard)
-        if self.adapter.channel_open != was_open:  # who closes or opens drops what is old, answers as well
+        if self.adapter.channel_open != was_open:  # closing and opening drop old bytes, answers as well
             self._faults.truth.close_channel(unread_bytes)
         if not self.adapter.channel_open:
             self._line.write(answer)
@@ -234,7 +234,7 @@ class Emulator:
         self._send([Piece(answer, None, answer=True)], time.monotonic_ns())
 
     def _drain(self, deadline_s: float = math.inf) -> None:
-        """Let the client fetch what is under way: hanging up takes it away from it."""
+        """Let the client fetch the bytes under way, which hanging up would discard."""
         while self.adapter.channel_open and self._line.unread_bytes() and time.monotonic() < deadline_s:
             if not self._obey_until(time.monotonic() + _DRAIN_POLL_S):
                 return

@@ -1,4 +1,4 @@
-"""A WebSocket server of poll and sockets, in the thread of whoever polls it, that can also fail as a machine does."""
+"""WebSocket server of poll and sockets, in the thread of its caller, that can also fail as a machine does."""
 
 import logging
 import selectors
@@ -15,10 +15,10 @@ from websockets.protocol import OPEN
 from websockets.server import ServerProtocol
 
 MOST_QUEUED_BYTES: Final = 1 << 20
-"""What a client leaves lying; messages beyond are lost."""
+"""Most unread bytes of a client; messages beyond are lost."""
 _STOP_POLL_S: Final = 0.05
 _ABORT: Final = struct.pack("ii", 1, 0)
-"""Of SO_LINGER: close at once and unfriendly, as the kernel does for a process that was killed."""
+"""Value of SO_LINGER that resets a connection, as the kernel does for a process that was killed."""
 _QUIET: Final = logging.getLogger("firmware_bridge.emulation.websocket_server")
 _QUIET.addHandler(logging.NullHandler())
 _QUIET.propagate = False
@@ -26,7 +26,7 @@ _QUIET.propagate = False
 
 @dataclass(eq=False)
 class _Client:
-    """One connection, and what has not found room in it yet."""
+    """One connection, and the bytes without room in it yet."""
 
     connection: socket.socket
     protocol: ServerProtocol = field(default_factory=lambda: ServerProtocol(logger=_QUIET))
@@ -35,12 +35,12 @@ class _Client:
 
 
 class WebSocketServer:
-    """Greets clients, and sends to all that are there; what they say is heard and forgotten.
+    """Server that greets clients and sends to all of them; their messages are read and dropped.
 
     Attributes:
         address: host and port.
-        sent_messages: put on the way to a client, greetings not counted.
-        lost_messages: that a client left no room for.
+        sent_messages: number of messages sent to a client, without greetings.
+        lost_messages: number of messages without room at a client.
     """
 
     def __init__(self, host: str, port: int, greeting: Callable[[], str]) -> None:
@@ -48,8 +48,8 @@ class WebSocketServer:
 
         Args:
             host: address to listen on.
-            port: 0 for one that is free.
-            greeting: what a client is told first, asked for when it has come.
+            port: port to listen on, 0 for a free one.
+            greeting: returns the first message to a client, called when it has connected.
         """
         self.address: tuple[str, int] = (host, port)
         self.sent_messages = 0
@@ -62,7 +62,7 @@ class WebSocketServer:
         self._listener: socket.socket | None = None
 
     def listen(self) -> None:
-        """Take clients, on the port it had before where it had one; nothing if it does."""
+        """Accept clients, on the former port if there was one; no effect if it already does."""
         if self._listener is not None:
             return
         self._listener = socket.create_server(self.address)
@@ -71,7 +71,7 @@ class WebSocketServer:
         self._selector.register(self._listener, selectors.EVENT_READ, None)
 
     def poll(self, timeout_s: float, *, attend: bool = True) -> None:
-        """Wait so long for something to do, and do it, unless nobody is to be attended to."""
+        """Wait at most `timeout_s` for events, and handle them if `attend`."""
         for key, events in self._selector.select(timeout_s):
             if key.fileobj is self._woken:
                 self._woken.recv(4096)
@@ -83,7 +83,7 @@ class WebSocketServer:
         self._wake.send(b"x")
 
     def say(self, text: str | bytes) -> None:
-        """Send this to every client, whatever it is; bytes as a binary message."""
+        """Send any text or bytes to every client; bytes as a binary message."""
         for client in list(self._clients):
             if client.protocol.state is not OPEN:
                 continue
@@ -105,7 +105,7 @@ class WebSocketServer:
             self._flush(client)
 
     def hang_up(self, stop: threading.Event) -> None:
-        """Close politely, once everything has gone out; at once when told to stop."""
+        """Close politely, once everything has gone out; at once if `stop` is set."""
         end_s = time.monotonic() + 1
         self.close_all(1001, "")
         while self._clients and time.monotonic() < end_s and not stop.is_set():
@@ -114,7 +114,7 @@ class WebSocketServer:
                     self._attend(key.data, events)
 
     def drop_dead(self) -> None:
-        """Break every connection, and listen no more."""
+        """Break every connection, and stop listening."""
         if self._listener is not None:
             self._selector.unregister(self._listener)
             self._listener.close()
@@ -124,7 +124,7 @@ class WebSocketServer:
             self._drop(client)
 
     def close(self) -> None:
-        """Give back what is left, when nobody polls any more."""
+        """Release the remaining resources, after the last poll."""
         self._wake.close()
         self._woken.close()
         self._selector.close()
@@ -155,7 +155,7 @@ class WebSocketServer:
             return
         try:
             connection, _ = self._listener.accept()
-        except OSError:  # gone before it was taken
+        except OSError:  # gone before it was accepted
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
@@ -166,7 +166,7 @@ class WebSocketServer:
     def _flush(self, client: _Client) -> None:
         for data in client.protocol.data_to_send():
             client.unsent += data
-            client.closing |= not data  # nothing to send stands for the end
+            client.closing |= not data  # empty data marks the end
         try:
             if client.unsent:
                 del client.unsent[: client.connection.send(client.unsent)]

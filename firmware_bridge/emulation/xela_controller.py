@@ -1,4 +1,4 @@
-"""A pretended XELA controller and the slcan adapter before it: what they say, and when. No I/O, no clock."""
+"""Emulated XELA controller and its slcan adapter: their output and its times. No I/O, no clock."""
 
 import heapq
 import math
@@ -17,7 +17,7 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import ABSENT
 
 FRAME_S: Final = 0.000_13
-"""A frame of eight bytes on a 1 Mbit/s bus, with stuffed bits."""
+"""Duration of a frame of eight bytes on a 1 Mbit/s bus, with stuffed bits, in [s]."""
 
 CR: Final = b"\r"
 BEL: Final = b"\a"
@@ -30,9 +30,9 @@ _WRONG_BITRATE: Final = 6
 def scan_frames(
     counts: NDArray[np.int32], controller: int, noise: random.Random, model: ModelMap = USPA44_MAP
 ) -> list[CanFrame]:
-    """One scan (3, rows, cols) as a controller sends it: a frame per taxel, by SDA, then by taxel on it.
+    """Encode one scan (3, rows, cols) as a controller does: a frame per taxel, by SDA, then by taxel on it.
 
-    Absent taxels send nothing. The bytes that carry no reading are filled from `noise`, never zero.
+    Absent taxels have no frame. The bytes that carry no reading are filled from `noise`, never zero.
     """
     frames: list[CanFrame] = []
     by_taxel = counts.reshape(3, -1).T.tolist()
@@ -45,7 +45,7 @@ def scan_frames(
 
 
 class Controller(NamedTuple):
-    """One sensor on the bus: what it plays, under which id 0..15, how many scans a second, of which pad."""
+    """One sensor on the bus: its track, its id 0..15, its scans a second, and the id map of its pad."""
 
     track: Track
     can_id: int
@@ -54,16 +54,16 @@ class Controller(NamedTuple):
 
 
 def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate_hz: float | None) -> list[Controller]:
-    """Whoever plays these recordings on one bus.
+    """Create the controllers that play these recordings on one bus.
 
     Args:
         recordings: each track is a controller.
-        can_ids: theirs, 0..15; by default 4, 6, 8, ...
+        can_ids: their ids, 0..15; by default 4, 6, 8, ...
         rate_hz: scans a second of each; by default as recorded.
 
     Raises:
-        ValueError: an id or the rate cannot be.
-        RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
+        ValueError: an id or the rate is invalid.
+        RecordingError: a recording that this sensor cannot have made, or one without a rate.
     """
     tracks = [(recording, track) for recording in recordings for track in recording.tracks]
     can_ids = can_ids or range(4, 4 + 2 * len(tracks), 2)
@@ -94,9 +94,9 @@ def bus_timeline(
     frame_s: float = FRAME_S,
     first_frame: int = 0,
 ) -> Iterator[tuple[float, CanFrame]]:
-    """All frames on the bus in their order, `frame_s` [s] long each, with their time in [s] from the first scan.
+    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan.
 
-    `first_frame` of them were over before anybody listened, so that who joins need not do so where a cycle begins.
+    The first `first_frame` of them are left out, so that a client can also join in the middle of a cycle.
     """
     lanes = [_lane(controller, jitter_s, seed, loop, frame_s) for controller in controllers]
     return islice(heapq.merge(*lanes, key=lambda timed: timed[0]), first_frame, None)
@@ -109,7 +109,7 @@ def _lane(
     number, free_s = 0, 0.0
     while True:
         for counts in controller.track.counts:
-            # The grid stays where it is however much single scans jitter; a scan waits for the one before.
+            # Jitter of single scans does not move the grid; a scan waits for the one before.
             time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
             for frame in scan_frames(counts, controller.can_id, noise, controller.model):
                 yield time_s, frame
@@ -120,25 +120,25 @@ def _lane(
 
 
 class SlcanAdapter:
-    """Obeys slcan commands as a strict adapter does.
+    """Emulated adapter that obeys slcan commands as strictly as a real one.
 
     Attributes:
-        channel_open: it passes on what is on the bus.
-        acknowledges: it answers commands (Lawicel's way); some firmwares never do.
-        refused: commands it did not obey.
-        flags: what `F` tells, Lawicel's bits; telling clears them.
-        state: on the bus: a active, w warning, p passive, b bus-off, and then it hears nothing.
-        sent: frames that it was given to put on the bus.
+        channel_open: True while it passes on the frames of the bus.
+        acknowledges: True if it answers commands (as Lawicel's do); some firmwares never do.
+        refused: number of commands that it refused.
+        flags: flags that `F` reports, Lawicel's bits; the report clears them.
+        state: state on the bus: a active, w warning, p passive, b bus-off, in which it receives no frame.
+        sent: the latest frames that clients sent to the bus.
     """
 
     def __init__(self, *, acknowledges: bool = True, left_open: bool = False, old_canable: bool = False) -> None:
-        """Switch it on.
+        """Switch the adapter on.
 
         Args:
-            acknowledges: it answers commands.
-            left_open: as a client leaves it that died without closing.
-            old_canable: it answers nothing, and does nothing at all on commands that CANable's first firmware
-                does not know, such as time stamps and flags.
+            acknowledges: True if it answers commands.
+            left_open: True for an open channel, as a client leaves it that died without closing.
+            old_canable: True for no answers, and no effect of commands that CANable's first firmware does not have,
+                such as time stamps and flags.
         """
         self.acknowledges = acknowledges and not old_canable
         self.flags = 0
@@ -153,18 +153,18 @@ class SlcanAdapter:
 
     @property
     def hears_the_bus(self) -> bool:
-        """Open at the bitrate that the sensor uses, and not bus-off."""
+        """True if the channel is open at the bitrate of the sensor, and not bus-off."""
         return self.channel_open and self._bitrate == _RIGHT_BITRATE and self.state != "b"
 
     def begin_anew(self) -> None:
-        """Start up again, as after a reset: closed, and at a bitrate that is not the sensor's."""
+        """Start up again, as after a reset: closed, and at another bitrate than the sensor's."""
         self.channel_open = False
         self._bitrate = _WRONG_BITRATE
         self._timestamps = False
         self._pending = b""
 
     def feed(self, data: bytes) -> bytes:
-        """Take bytes from the client; the bytes to answer with."""
+        """Process bytes from the client and return the answer."""
         *commands, pending = (self._pending + data).split(CR)
         self._pending = pending[-_LONGEST_COMMAND:]
         answers = [self._obey(command) for command in commands]
@@ -172,12 +172,12 @@ class SlcanAdapter:
         return b"".join(answers) if self.acknowledges else b""
 
     def state_line(self, state: str, rx_errors: int, tx_errors: int) -> bytes:
-        """Change the state; what adapters that tell so say of it, as the kernel's driver reads it."""
+        """Change the state and return the line that reports it, in the format of the kernel's driver."""
         self.state = state
         return b"s%s%03d%03d\r" % (state.encode(), rx_errors, tx_errors) if self.channel_open else b""
 
     def encode(self, frame: CanFrame, time_s: float) -> bytes:
-        """A frame from the bus as the client gets it."""
+        """Encode a frame from the bus as the client receives it."""
         if self._timestamps:
             frame = frame._replace(timestamp_ms=int(time_s * 1000) % (LAST_TIMESTAMP_MS + 1))
         return encode_frame(frame)

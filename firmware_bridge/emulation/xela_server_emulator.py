@@ -1,7 +1,7 @@
-"""Emulator: the vendor's xela_server on this machine, with sensors that play recordings.
+"""Emulator of the vendor's xela_server on this machine, with sensors that play recordings.
 
-No kinder than the real one: it says what it has at its own pace, old or new, keeps what a client does not fetch until
-that is old, and counts anew after a restart. `server_emulator` is its command line.
+It is as strict as the real one: it sends its readings at its own pace, old or new, queues messages for a slow client
+until they are old, and restarts its count after a restart. `xela_server_main` is its command line.
 """
 
 import math
@@ -16,14 +16,14 @@ from firmware_bridge.emulation.xela_server_model import GARBAGE, VendorServer
 
 DEFAULT_MESSAGE_HZ: Final = 100.0
 HOST: Final = "127.0.0.1"
-"""No other machine shall take what it says for a sensor's."""
+"""Address of this machine alone, so that no other one takes its messages for a sensor's."""
 _STOP_POLL_S: Final = 0.05
 
 
 class ServerEmulator:
-    """Serves what a VendorServer says, from the moment the first client is greeted; hangs up at the end.
+    """Server of a VendorServer's messages, from the greeting of the first client; hangs up at the end.
 
-    Every fault can be asked for from any thread, and has happened when the call returns.
+    Every fault can be requested from any thread, and has happened when the call returns.
 
     Attributes:
         url: ws://HOST:PORT, once entered.
@@ -41,11 +41,11 @@ class ServerEmulator:
         """Prepare to serve; nothing is opened yet.
 
         Args:
-            server: what it says.
-            message_hz: messages a second, whatever the sensors do.
-            port: 0 for one that is free.
-            garbage_every: so many messages are followed by one that no server should send; 0 for never.
-            on_cycle: told the sensor and the monotonic time in [ns] when a message tells of its next whole cycle.
+            server: source of the messages.
+            message_hz: messages a second, independent of the sensors.
+            port: port to listen on, 0 for a free one.
+            garbage_every: number of messages after which an invalid one follows; 0 for never.
+            on_cycle: called with the sensor and the monotonic time in [ns] of a message with its next whole cycle.
 
         Raises:
             ValueError: an option is out of range.
@@ -84,20 +84,20 @@ class ServerEmulator:
 
     @property
     def sent_messages(self) -> int:
-        """Put on the way to a client, greetings and garbage not counted."""
+        """Number of messages sent to a client, without greetings."""
         return self._server.sent_messages
 
     @property
     def lost_messages(self) -> int:
-        """That a client left no room for."""
+        """Number of messages without room at a client."""
         return self._server.lost_messages
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has hung up; False if it has not in time."""
+        """Wait until it has hung up; return False on time-out."""
         return self._through.wait(timeout_s)
 
     def kill(self) -> None:
-        """End as a process that is killed: connections break, nobody listens."""
+        """End as a killed process does: connections break, and the port is closed."""
         self._ask(self._server.drop_dead)
 
     def start_again(self) -> None:
@@ -105,11 +105,11 @@ class ServerEmulator:
         self._ask(self._begin_anew)
 
     def freeze(self) -> None:
-        """Neither send nor answer, with every connection open, as when it hangs or the network is gone."""
+        """Stop sending and answering, with every connection open, as when it hangs or the network is gone."""
         self._ask(lambda: setattr(self, "_frozen", True))
 
     def thaw(self) -> None:
-        """Go on after `freeze`; what would have been said meanwhile never is."""
+        """Go on after `freeze`; the messages of the time between are never sent."""
         self._ask(lambda: setattr(self, "_frozen", False))
 
     def count_from(self, sequence: int) -> None:
@@ -117,7 +117,7 @@ class ServerEmulator:
         self._ask(lambda: setattr(self, "_sequence", sequence))
 
     def say(self, text: str | bytes) -> None:
-        """Send this to every client, whatever it is; bytes as a binary message."""
+        """Send any text or bytes to every client; bytes as a binary message."""
         self._ask(lambda: self._server.say(text))
 
     def close_all(self, code: int = 1001, reason: str = "") -> None:
@@ -137,7 +137,7 @@ class ServerEmulator:
                 self._server.poll(self._time_to_next_s(), attend=not self._frozen)
                 self._do_what_is_asked()
                 if self._frozen:
-                    # Selecting what nobody reads would not wait.
+                    # A select on unread data would not wait.
                     self._stop.wait(1 / self._message_hz)
                 elif self._start_s is not None and self._time_to_next_s() == 0 and not self._tick(self._start_s):
                     break
@@ -163,12 +163,12 @@ class ServerEmulator:
         return max(0.0, self._start_s + self._ticks / self._message_hz - time.monotonic())
 
     def _tick(self, start_s: float) -> bool:
-        """Say what is known; False when there is no more to say."""
+        """Send the next message; return False if there is no more to send."""
         elapsed_s = self._ticks / self._message_hz
         if self._vendor.ended(elapsed_s):
             return False
         behind = math.floor((time.monotonic() - start_s) * self._message_hz) - self._ticks
-        self._ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it does not make up for it
+        self._ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
         text = self._vendor.message(self._sequence, elapsed_s, time.time())
         self._sequence += 1
         now_ns = time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""A pretended xela_server: what it says, and when it knows what. No I/O, no clock."""
+"""Emulated xela_server: its messages, and the readings in them at any time. No I/O, no clock."""
 
 import json
 import math
@@ -17,10 +17,10 @@ from firmware_bridge.scans.xela_server_messages import PRETENDED_VERSION, WELCOM
 
 VERSIONS: Final = ("1.7.6", "1.7.7", "1.8.0")
 NEWTONS_PER_COUNT: Final = np.array([0.0007, 0.0007, 0.00085])[:, None, None]
-"""About what sensors in the field have; of x, y, z."""
+"""Newtons per count of x, y, z, about those of real sensors."""
 TEMPERATURE_K: Final = 302.5
 _ROUNDED: Final = 1e-6
-"""Of a cycle: a message that goes out with it knows of it, however its time was rounded."""
+"""Tolerance, in cycles: a message sent at the time of a cycle holds it, however that time was rounded."""
 SIM_RATE_HZ: Final = 100.0
 SIM_SCANS: Final = 200
 GARBAGE: Final[tuple[str | bytes, ...]] = (
@@ -37,11 +37,11 @@ GARBAGE: Final[tuple[str | bytes, ...]] = (
     "null",
     "x" * 50_000,
 )
-"""What no server should send, one after the other; none of it may hurt a client."""
+"""Invalid messages, sent one after the other; a client must survive each of them."""
 
 
 class _Player(NamedTuple):
-    """A sensor that plays a track: its readings without gaps, and which of them were there."""
+    """Sensor that plays a track: its readings without gaps, and a mask of the real ones."""
 
     counts: NDArray[np.int32]
     present: NDArray[np.bool_]
@@ -49,10 +49,10 @@ class _Player(NamedTuple):
 
 
 class VendorServer:
-    """What a server that reads some sensors knows of them at any time, and how its version says it.
+    """Model of a server with some sensors: its readings at any time, in the format of its version.
 
     Attributes:
-        silent: taxels of all sensors that are renewed no more, row-major from the top left.
+        silent: taxels of all sensors that are no longer renewed, row-major from the top left.
     """
 
     def __init__(
@@ -72,14 +72,14 @@ class VendorServer:
             recordings: each track is one sensor.
             version: one of VERSIONS.
             rate_hz: cycles a second of each sensor; by default as recorded.
-            spread: over how much of a cycle its taxels come, 0..1; at 0 all at once.
-            queue_s: how old what it says is, in [s].
-            loop: begin again after the last cycle.
-            others: model and number of taxels of sensors that are no 4x4 ones, as the last of all.
+            spread: share of a cycle over which its taxels come, 0..1; at 0 all at once.
+            queue_s: age of the readings that it sends, in [s].
+            loop: True to begin again after the last cycle.
+            others: model and number of taxels of sensors other than 4x4 ones, after all the others.
 
         Raises:
             ValueError: an option is out of range.
-            RecordingError: a recording that this sensor cannot have made, or one that tells no rate.
+            RecordingError: a recording that this sensor cannot have made, or one without a rate.
         """
         if version not in VERSIONS:
             raise ValueError(f"version is {version!r}, expected one of {', '.join(VERSIONS)}")
@@ -96,29 +96,29 @@ class VendorServer:
 
     @property
     def sensors(self) -> int:
-        """How many sensors it plays."""
+        """Number of sensors that it plays."""
         return len(self._players)
 
     def ended(self, elapsed_s: float) -> bool:
-        """Every cycle of every sensor was there to be told of."""
+        """Return True once every cycle of every sensor could be sent."""
         if self._loop:
             return False
         heard_s = elapsed_s - self._queue_s
         return all(heard_s * one.rate_hz - self._spread >= len(one.counts) for one in self._players)
 
     def cycle(self, sensor: int, elapsed_s: float) -> int:
-        """The newest cycle of a sensor, counted from 0, whose taxels all have come; -1 before the first."""
+        """Return the newest whole cycle of a sensor, counted from 0; -1 before the first."""
         player = self._players[sensor]
         last_taxel = (USPA44.taxel_count - 1) / USPA44.taxel_count
         newest = math.floor((elapsed_s - self._queue_s) * player.rate_hz + _ROUNDED - self._spread * last_taxel)
         return max(-1, newest) if self._loop else min(max(-1, newest), len(player.counts) - 1)
 
     def welcome(self, unix_s: float) -> str:
-        """Its greeting."""
+        """Return the greeting."""
         return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version + PRETENDED_VERSION})
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
-        """What it says of all sensors at a time in [s] from its start, by its own clock `unix_s` [s]."""
+        """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
         told: dict[str, Any] = {
             "message": sequence,
             "time": unix_s,
@@ -165,7 +165,7 @@ class VendorServer:
 
 
 def sim_recording() -> Recording:
-    """What stands for a sensor where none is wired: waves over the pad."""
+    """Return a synthetic recording for use without a sensor: waves over the pad."""
     phase = 2 * np.pi * np.arange(SIM_SCANS)[:, None, None, None] / SIM_SCANS
     place = np.arange(USPA44.taxel_count).reshape(1, 1, USPA44.rows, USPA44.cols)
     rest = np.array([33_000, 33_000, 37_000])[None, :, None, None]
@@ -185,7 +185,7 @@ def _player(recording: Recording, track: Track, rate_hz: float | None) -> _Playe
         raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
     counts = track.counts.reshape(len(track.counts), 3, -1).copy()
     present = counts[:, 0] != ABSENT
-    # What does not come the server goes on sending as it was; what never came yet is 0.
+    # The server repeats the last reading of an absent taxel; before its first reading it sends 0.
     counts[0][:, ~present[0]] = 0
     for scan in range(1, len(counts)):
         counts[scan][:, ~present[scan]] = counts[scan - 1][:, ~present[scan]]

@@ -1,1 +1,1 @@
-"""One file per link to a sensor; the only I/O of the bridge."""
+"""Links to sensors, one file each; the only I/O of the bridge."""

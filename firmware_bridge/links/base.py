@@ -1,4 +1,4 @@
-"""What every link offers; adding a link is one file with this interface, and its form in `parse`."""
+"""Interface of every link; a new link is one file with this interface, and its form in `parse`."""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -9,11 +9,11 @@ from firmware_bridge.scans.scan import Scan
 
 
 class Wait(NamedTuple):
-    """When to call `read(0)` next: once the descriptor is readable, and after `longest_s` in any case.
+    """Condition of the next `read(0)`: once the descriptor is readable, and after `longest_s` in any case.
 
     Attributes:
-        descriptor: of the open link.
-        longest_s: in [s].
+        descriptor: file descriptor of the open link.
+        longest_s: longest wait, in [s].
     """
 
     descriptor: int
@@ -25,16 +25,16 @@ NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
 
 class Notice(NamedTuple):
-    """What a link has to tell beside its scans.
+    """Message of a link in addition to its scans.
 
     Attributes:
         time_ns: monotonic time, in [ns].
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
-            whatever was known of its sensors' readings is old; "trouble", it works, but reports something; "well", it
-            no longer does; "note", what is to be known of a recording.
+            all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
+            longer does; "note", a remark on a recording.
         source: name of the link.
-        text: in a user's words.
-        sensors: how the names of the sensors begin that it is about.
+        text: message to the user.
+        sensors: common prefix of the names of the sensors concerned.
     """
 
     time_ns: int
@@ -52,22 +52,21 @@ class SerialLine(NamedTuple):
 
 
 class Link(Protocol):
-    """A source of scans. Inherit it to get what is optional.
+    """Source of scans. A subclass inherits the optional parts.
 
     A link opens on `__enter__` and closes on `__exit__`. One that was lost may be opened again after it was closed,
-    any number of times: it then finds its device again, and forgets what it had half read.
+    any number of times: it then searches for its device again, and discards open scans.
 
     Attributes:
         name: the source as a user would write it, such as "slcan:/dev/ttyUSB0".
-        kind: "device" for hardware, "replay" for a file, "emulated" for a pretended device.
-        ended: no more scans will come, because the source is finite and is through.
-        trouble: what the device reports that the user must know of, in plain words; None while all is well.
-        patient: it waits for its reader, and has one scan for each `read`, of whatever time: nothing can be overtaken.
-        unix_offset_ns: of a patient link: added to the time of a scan gives [ns] since 1970; None where that is not
-            known.
-        origin: of a recording, however often it was played and recorded again: what kind of source its scans come from;
-            None where that is not known, or it is `kind`.
-        mountings: of sensors whose scans come with their taxels in place, as a recording has them: how they sat.
+        kind: "device" for hardware, "replay" for a file, "emulated" for an emulated device.
+        ended: True once a finite source has no more scans.
+        trouble: trouble of the device to report to the user; None if there is none.
+        patient: True where the link waits for its reader, and returns one scan for each `read`, whatever its time.
+        unix_offset_ns: offset from the times of a patient link's scans to [ns] since 1970; None if it is not available.
+        origin: kind of source of a recording's scans, however often it was played and recorded again; None if it is
+            not available, or equals `kind`.
+        mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
     """
 
     name: str
@@ -84,7 +83,7 @@ class Link(Protocol):
     def __exit__(self, *exc_info: object) -> None: ...
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; waits at most `timeout_s` for the first.
+        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
 
         Raises:
             LinkLostError: the link was there and is gone.
@@ -92,31 +91,31 @@ class Link(Protocol):
         ...
 
     def wait_on(self) -> Wait | None:
-        """Return what to wait for before `read(0)`, which then does not wait; None where a read may take long.
+        """Return the condition to wait for before `read(0)`, which then does not wait; None where a read may take long.
 
-        A link that waits for something else than a descriptor, or is about to open, takes a thread of its own.
+        A link that waits for something else than a descriptor, or is about to open, needs a thread of its own.
         """
         return None
 
     def notices(self) -> list[Notice]:
-        """What there is to tell since the last call, all of it from before the scans that the last `read` gave."""
+        """Return the notices since the last call, all from before the scans that the last `read` returned."""
         return []
 
     def counters(self) -> dict[str, int]:
-        """What was received, skipped and missed so far, by name; also after it was closed."""
+        """Return the counts of data received, skipped and missed so far, by name; also after it was closed."""
         ...
 
     def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids that came so far, of whatever device; none where the link sees no ids."""
+        """Return the standard CAN ids received so far, of any device; empty where the link sees no ids."""
         return frozenset()
 
     def serial_line(self) -> SerialLine | None:
-        """Return the serial line of an open link; None where it has none."""
+        """Return the serial line of an open link, None if it has no such line."""
         return None
 
 
 def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
-    """Of what is played together: one that is emulated makes all of it so; else what all of them are."""
+    """Return the common origin of recordings played together: "emulated" if one is; None if they differ otherwise."""
     found = set(origins)
     if "emulated" in found:
         return "emulated"

@@ -1,4 +1,4 @@
-"""A CAN interface of python-can: socketcan, PEAK, Kvaser and others; esd is on socketcan."""
+"""Link over a CAN interface of python-can: socketcan, PEAK, Kvaser and others; esd is on socketcan."""
 
 import errno
 import logging
@@ -26,21 +26,21 @@ TICK_NS: Final = 1_000
 
 PRETENDED: Final = ("virtual", "udp_multicast")
 _WITHOUT_BITRATE: Final = (*PRETENDED, "socketcan")
-"""Elsewhere set, or none at all."""
+"""Interfaces without a bitrate of their own: it is set elsewhere, or does not exist."""
 _NOT_THROUGH_PYTHON_CAN: Final = {
     "slcan": "use slcan:PORT: python-can's waits 2 s, carries 32 scans a second at its usual speed, and one byte of "
     "noise ends it",
     "gs_usb": "use gs_usb:SERIAL: python-can's never sees that the adapter was unplugged or has lost frames",
 }
-# Some of python-can's interfaces let through whatever a driver that is not there, or not whole, leads to.
+# Some of python-can's interfaces let through every error that a missing or incomplete driver causes.
 _NO_DRIVER: Final = (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError)
 
 
 class CanBusLink(Link):
-    """Scans from a sensor on an interface that python-can knows.
+    """Link to a sensor on an interface that python-can supports.
 
-    A wall clock that is set back while nothing comes lets `read` wait for so much longer, since python-can counts its
-    time-outs by it.
+    A wall clock that is set back while no frame comes makes `read` wait longer by that much, since python-can measures
+    its time-outs with it.
     """
 
     def __init__(
@@ -55,14 +55,14 @@ class CanBusLink(Link):
         """Prepare a link; nothing is opened yet.
 
         Args:
-            interface: one of python-can's, such as "socketcan".
-            channel: as the interface names it, such as "can0".
-            model: which CAN id is which taxel.
+            interface: interface of python-can, such as "socketcan".
+            channel: name of the channel on the interface, such as "can0".
+            model: map from CAN ids to taxels.
             triggers: frames that wake older controllers, sent once after opening.
-            clock_ns: monotonic, in [ns].
+            clock_ns: monotonic clock, in [ns].
 
         Raises:
-            SourceError: python-can knows no such interface, or this link is not for it.
+            SourceError: python-can has no such interface, or this link does not support it.
             DeviceError: python-can is not installed.
         """
         self.name = f"can:{interface}:{channel}"
@@ -90,7 +90,7 @@ class CanBusLink(Link):
     def __enter__(self) -> Self:
         if self._interface == "socketcan":
             _check_network(self._channel)
-            self._errors.reopened()  # a socket restarts no controller, and the kernel tells of bus-off once
+            self._errors.reopened()  # a socket restarts no controller, and the kernel reports bus-off once
         else:
             self._errors.restarted()
         self._scans.begin_anew()
@@ -110,7 +110,7 @@ class CanBusLink(Link):
             self._close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; waits at most `timeout_s` for the first.
+        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
 
         Raises:
             LinkLostError: the interface is gone, or down.
@@ -126,7 +126,7 @@ class CanBusLink(Link):
                 if message is None and self._bus.state is self._can.BusState.ERROR:
                     self._errors.left_the_bus()
             except (self._can.CanError, OSError) as error:
-                self._errors.restarted()  # as a network does that comes up, or an adapter that is plugged in
+                self._errors.restarted()  # a network that comes up, or an adapter that is plugged in, restarts
                 raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
             now_ns = self._clock_ns()
             if message is None:
@@ -141,12 +141,12 @@ class CanBusLink(Link):
                 return scans
 
     def counters(self) -> dict[str, int]:
-        """Frames by sort, and the counters of bus and assembler; clock_restarts: steps back of the stamps' clock."""
+        """Return the counts of frames by kind, bus and assembler; clock_restarts: steps back of the stamps' clock."""
         counts = self._counts | {"clock_restarts": self._device_clock.restarts}
         return counts | self._errors.counters() | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids that came so far."""
+        """Return the standard CAN ids received so far."""
         return frozenset(self._scans.can_ids)
 
     def _take(self, message: Any, time_ns: int) -> list[Scan]:
@@ -155,7 +155,7 @@ class CanBusLink(Link):
             if self._interface == "socketcan":
                 self._errors.error_frame(message.arbitration_id, bytes(message.data), time_ns)
             else:
-                self._errors.unsorted_error()  # each driver says it in its own way
+                self._errors.unsorted_error()  # each driver reports it in its own way
             return []
         self._errors.frame_heard()
         if message.is_fd:
@@ -163,14 +163,14 @@ class CanBusLink(Link):
             return []
         self._counts["frames"] += 1
         frame = CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_remote_frame)
-        # Of the wall clock, of the driver's own, or none: zero.
+        # By the wall clock or the driver's own clock; zero where there is no stamp.
         stamp_us = round(message.timestamp * 1e6)
         device = self._device_clock.at(stamp_us, time_ns) if stamp_us else None
         return self._scans.feed(frame, time_ns, device)
 
     def _open(self) -> Any:
         settings: dict[str, Any] = {} if self._interface in _WITHOUT_BITRATE else {"bitrate": BITRATE_BIT_S}
-        if self._interface == "socketcan":  # the kernel does it; elsewhere it would cost more than it saves
+        if self._interface == "socketcan":  # the kernel filters; on other interfaces a filter costs more than it saves
             settings["can_filters"] = [{"can_id": 0, "can_mask": 0, "extended": False}]
         numbered = self._channel.isascii() and self._channel.isdigit() and self._interface not in _WITHOUT_BITRATE
         channel = int(self._channel) if numbered else self._channel
@@ -190,7 +190,7 @@ class CanBusLink(Link):
 
 
 def _python_can() -> ModuleType:
-    # What it has to say comes as an error; its log would say it again on stderr.
+    # Its problems arrive as exceptions; its log would repeat them on stderr.
     logging.getLogger("can").addHandler(logging.NullHandler())
     try:
         import can
@@ -200,7 +200,11 @@ def _python_can() -> ModuleType:
 
 
 def _check_network(name: str) -> None:
-    """Say what to do about a network that is not there or down, which socketcan opens as if nothing were."""
+    """Refuse a network that is missing or down, which socketcan opens without an error.
+
+    Raises:
+        DeviceError: the network is missing or down.
+    """
     networks = {network.name: network for network in can_networks()}
     if name not in networks:
         raise DeviceError(

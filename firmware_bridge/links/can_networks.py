@@ -1,4 +1,4 @@
-"""The CAN networks that the kernel has, as sysfs tells of them, and how one is brought up. Opens nothing."""
+"""CAN networks of the kernel, as sysfs lists them, and the command that brings one up. Opens no device."""
 
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -7,19 +7,19 @@ from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 
 SYS_ROOT: Final = Path("/sys")
 _CAN_TYPE: Final = "280"
-"""ARPHRD_CAN."""
+"""Type of a CAN network in sysfs, ARPHRD_CAN."""
 _UP: Final = 1
-"""IFF_UP."""
+"""Flag of a network that is up, IFF_UP."""
 _PRETENDED: Final = ("vcan", "vxcan")
 
 
 class CanNetwork(NamedTuple):
-    """One network.
+    """One CAN network.
 
     Attributes:
-        name: such as can0.
-        up: whether frames can come.
-        driver: of its adapter; None for what slcand or vcan makes, which hangs on no device.
+        name: name of the network, such as can0.
+        up: True if frames can come.
+        driver: driver of its adapter; None for a network of slcand or vcan, which has no device.
     """
 
     name: str
@@ -28,7 +28,10 @@ class CanNetwork(NamedTuple):
 
     @property
     def problem(self) -> str | None:
-        """That it is down, and what to do; the kernel leaves a controller bus-off unless it is told for how long."""
+        """Message that the network is down, with the command that brings it up; None if it is up.
+
+        It sets restart-ms, since the kernel otherwise leaves a controller in bus-off.
+        """
         if self.up:
             return None
         how = f" type can bitrate {BITRATE_BIT_S} restart-ms 100" if self.driver else ""
@@ -36,10 +39,10 @@ class CanNetwork(NamedTuple):
 
 
 def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
-    """The CAN networks there are, by name.
+    """List the CAN networks of this machine, by name.
 
     Args:
-        sys_root: where sysfs is.
+        sys_root: folder of sysfs.
     """
     return [
         CanNetwork(
@@ -53,7 +56,7 @@ def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
 
 
 def is_pretended(name: str) -> bool:
-    """Whether a network of this name has no wire, and whoever speaks there only pretends."""
+    """Return True if a network of this name has no wire, so that every device on it is emulated."""
     return name.startswith(_PRETENDED)
 
 

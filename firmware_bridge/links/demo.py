@@ -1,4 +1,4 @@
-"""The demo: an emulated sensor in a process of its own, read over its pseudo-terminal."""
+"""Demo: an emulated sensor in a process of its own, read over its pseudo-terminal."""
 
 import select
 import subprocess
@@ -16,7 +16,7 @@ END_TIMEOUT_S: Final = 5.0
 
 
 class DemoLink(Link):
-    """A recording played by the emulator, through the ordinary serial path.
+    """Link to a recording played by the emulator, through the ordinary serial path.
 
     The emulator ends with this link, and with this process however it ends.
     """
@@ -36,7 +36,7 @@ class DemoLink(Link):
     def __enter__(self) -> Self:
         rate = [] if self._rate_hz is None else ["--rate-hz", str(self._rate_hz)]
         loop = ["--loop"] if self._loop else []
-        # A session of its own: Ctrl-C is for us, and the cable must not go before we have closed.
+        # A session of its own: Ctrl-C is for this process, which must close the link before the emulator ends.
         self._process = subprocess.Popen(
             [
                 sys.executable,
@@ -72,10 +72,10 @@ class DemoLink(Link):
             self._reap()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; waits at most `timeout_s` for the first byte.
+        """Return the scans that closed since the last call; waits at most `timeout_s` for the first byte.
 
         Raises:
-            LinkLostError: the emulator is gone before its end.
+            LinkLostError: the emulator ended before the end of the recording.
         """
         if self._link is None or self._process is None:
             raise ValueError("the link is not open: use it in a with statement")
@@ -84,7 +84,7 @@ class DemoLink(Link):
         try:
             scans = self._link.read(timeout_s)
         except LinkLostError:
-            # It hangs up when it has played everything, and only then ends well.
+            # It hangs up when it has played everything, and only then ends without an error.
             if not _ends_well(self._process):
                 raise
             self.ended = True
@@ -93,14 +93,14 @@ class DemoLink(Link):
         return scans
 
     def counters(self) -> dict[str, int]:
-        """Counters of the serial link, the last ones after it was closed."""
+        """Return the counters of the serial link, the last ones after it was closed."""
         return self._link.counters() if self._link else self._counts
 
     def _reap(self) -> None:
         process, self._process = self._process, None
         if process is None:
             return
-        with process:  # closes the pipes, which ends it, and waits
+        with process:  # closes the pipes, which ends the emulator, and waits
             if process.stdin:
                 process.stdin.close()
             try:

@@ -1,4 +1,4 @@
-"""What a sensor may be behind on this machine, and what stands in its way. Opens nothing, sends nothing."""
+"""Discovery of devices that may lead to a sensor on this machine, and of their problems. Opens and sends nothing."""
 
 import json
 import os
@@ -22,14 +22,14 @@ class Found(NamedTuple):
     """One port, adapter or network interface.
 
     Attributes:
-        kind: how it is read.
-        path: of a port; bus and address of a USB device; name of an interface.
+        kind: kind of device, which determines its link.
+        path: path of a port; bus and address of a USB device; name of an interface.
         usb_id: vendor and product, "0403:6015".
-        serial_number: of the USB device.
-        looks_like: what it is taken for.
-        adapter: whether that is something a sensor is usually behind.
-        source: what to write behind --source.
-        problems: what is wrong with it, and what to do, a line each.
+        serial_number: serial number of the USB device.
+        looks_like: description of the device.
+        adapter: True if sensors are usually connected by such a device.
+        source: argument of --source that selects it.
+        problems: its problems with their remedies, a line each.
     """
 
     kind: Literal["serial", "gs_usb", "socketcan"]
@@ -43,7 +43,7 @@ class Found(NamedTuple):
 
 
 def devices() -> tuple[list[Found], list[str]]:
-    """Everything there is: serial ports, gs_usb adapters, CAN interfaces; and what could not be looked at, and why."""
+    """List all serial ports, gs_usb adapters and CAN interfaces, and the reasons why some could not be listed."""
     notes: list[str] = []
     gs_usb: list[Found] = []
     try:
@@ -59,13 +59,13 @@ def serial_devices(
     proc_root: Path = Path("/proc"),
     may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
 ) -> list[Found]:
-    """The serial ports, in their order.
+    """Describe the serial ports, in their order.
 
     Args:
-        ports: of `serial_ports`.
-        sys_root: where sysfs is.
-        proc_root: where procfs is.
-        may_open: whether this user may read and write a path.
+        ports: ports from `serial_ports`.
+        sys_root: folder of sysfs.
+        proc_root: folder of procfs.
+        may_open: returns True if this user may read and write a path.
     """
     serials = [port.serial_number for port in ports]
     found: list[Found] = []
@@ -102,11 +102,11 @@ def serial_devices(
 
 
 def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | None] | None = None) -> list[Found]:
-    """The CAN interfaces that the kernel has, by name.
+    """List the CAN interfaces of the kernel, by name.
 
     Args:
-        sys_root: where sysfs is.
-        bitrate_hz: of an interface, in bit/s, None where it cannot be known; by default `ip` is asked.
+        sys_root: folder of sysfs.
+        bitrate_hz: returns the bitrate of an interface, in [bit/s], None if not available; by default from `ip`.
     """
     bitrate_hz = bitrate_hz or _bitrate_hz
     found: list[Found] = []
@@ -122,7 +122,7 @@ def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | 
 
 
 def _gs_usb_adapters() -> list[Found]:
-    # Loads libusb, which nothing else here needs.
+    # Imported here, since only this needs libusb.
     from firmware_bridge.links.gs_usb_devices import gs_usb_devices, udev_rule
 
     return [
@@ -152,13 +152,13 @@ def _text(path: Path) -> str | None:
 
 
 def _latency_ms(path: str, sys_root: Path) -> int:
-    """How long a USB serial chip holds bytes back, in [ms]; 0 where it does not tell."""
+    """Return the time for which a USB serial chip holds bytes back, in [ms]; 0 if it does not report one."""
     text = _text(sys_root / "bus/usb-serial/devices" / Path(path).name / "latency_timer") or ""
     return int(text) if text.isdecimal() else 0
 
 
 def _holders(path: str, proc_root: Path) -> list[str]:
-    """Who else has it open, as far as this user may see: of other users' processes only root may."""
+    """List the other processes that have it open; those of other users are visible to root alone."""
     real_path = Path(path).resolve()
     holders: list[str] = []
     for process in sorted(proc_root.glob("[0-9]*"), key=lambda process: int(process.name)):
@@ -177,7 +177,7 @@ def _opened(process: Path) -> set[Path]:
 
 
 def _bitrate_hz(name: str) -> int | None:
-    """As `ip` tells it: sysfs does not."""
+    """Return the bitrate from `ip`, in [bit/s], since sysfs does not contain it; None if not available."""
     ip = shutil.which("ip")
     if ip is None:
         return None

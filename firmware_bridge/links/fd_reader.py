@@ -1,13 +1,13 @@
-"""Reading a terminal with as few wake-ups as a scan is worth, and none later than the last byte of a whole one.
+"""Reader of a terminal with few wake-ups a scan, the last of them at the last byte of a whole scan.
 
 A scan comes in many small pieces over some 2 ms, and waking Python up for each costs more than decoding them.
-So the kernel is told to call the terminal readable only when FULL_BYTES wait in it (VMIN, which poll() keeps to where
-VTIME is 0). Of a scan whose length is known, all but the last FULL_BYTES are fetched first; what makes FULL_BYTES
-again, and wakes us at once, is then its very last byte. Setting VMIN anew for each scan would be simpler, but costs an
-FTDI chip a USB transfer each time.
+So the kernel is set to call the terminal readable only when FULL_BYTES wait in it (VMIN, which poll() respects where
+VTIME is 0). If the length of a scan is given, all but its last FULL_BYTES are fetched first; then its very last byte
+completes FULL_BYTES again, and wakes the reader at once. Setting VMIN for each scan would be simpler, but costs an FTDI
+chip a USB transfer each time.
 
-A sensor with a silent taxel has no whole scans: what closes one is the next cycle's first frame, which may lie unseen
-for 2 ms, seldom 5.
+A sensor with a silent taxel has no whole scans: the next cycle's first frame closes each, and may wait for 2 ms, seldom
+5, before it is read.
 """
 
 import errno
@@ -25,22 +25,22 @@ except ImportError:
     fcntl = termios = None
 
 FULL_BYTES: Final = 255
-"""The most that VMIN can say; a scan of sixteen taxels has 352."""
+"""Highest value of VMIN; a scan of sixteen taxels has 352 bytes."""
 LONGEST_WAIT_S: Final = 0.02
-"""How long fewer than FULL_BYTES may lie unseen: what is no scan, or the half of one, has no reader in a hurry."""
+"""Longest time that fewer than FULL_BYTES wait to be read, in [s]: without a whole scan there is no hurry."""
 LONGEST_REST_S: Final = 0.004
-"""How long the end of a scan is waited for once its first bytes are here: sixteen frames take 2.1 ms on the bus."""
+"""Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
 STEP_S: Final = 0.0003
-"""Between looks where VMIN cannot tell, because less than FULL_BYTES are missing."""
+"""Time between polls, in [s], where VMIN does not help, because less than FULL_BYTES are missing."""
 
 
 class BurstReader:
-    """Reads bytes from the descriptor of a serial port that is in raw mode and does not block.
+    """Reader of bytes from the descriptor of a serial port that is in raw mode and does not block.
 
     Attributes:
-        descriptor: of the port.
-        held_until_s: the beginning of a scan was fetched, and its end is waited for until then; None else.
-        empty_s: when no more than the beginning of a scan lay there the last time that was looked.
+        descriptor: file descriptor of the port.
+        held_until_s: time until which the reader waits for the end of a scan, its beginning fetched; None otherwise.
+        empty_s: latest time at which no more than the beginning of a scan was waiting.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class BurstReader:
         clock_s: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        """Ask the kernel to gather bytes.
+        """Configure the kernel to gather bytes.
 
         Raises:
-            OSError: the port is gone. termios.error, which is none, as well.
+            OSError: the port is gone. termios.error, which is no OSError, is possible as well.
         """
         self.descriptor = descriptor
         self._clock_s = clock_s
@@ -70,15 +70,15 @@ class BurstReader:
             termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> bytes:
-        """Return what has come, when `wanted_bytes` have, or when no more do.
+        """Return the bytes received, once `wanted_bytes` have come, or no more come.
 
         Args:
-            timeout_s: longest wait for the first byte, in [s]. At 0 nothing is waited for: what is only the beginning
-                of a scan is kept, and the rest asked for by another call after `longest_wait_s`.
-            wanted_bytes: until a scan can close; the same until something is returned.
+            timeout_s: longest wait for the first byte, in [s]. At 0 the call does not wait: the beginning of a scan is
+                kept, and the caller requests the rest by another call after `longest_wait_s`.
+            wanted_bytes: number of bytes until a scan can close; constant until bytes are returned.
 
         Raises:
-            OSError: the port is gone, and everything that came before was given.
+            OSError: the port is gone, and all earlier bytes have been returned.
         """
         end_s = self._clock_s() + timeout_s
         while True:
@@ -92,7 +92,7 @@ class BurstReader:
                 return data
 
     def longest_wait_s(self, wanted_bytes: int) -> float:
-        """Return how long the next call of `read` may be put off while the descriptor is not readable, in [s]."""
+        """Return the longest time until the next call of `read` while the descriptor is not readable, in [s]."""
         if self.held_until_s is None:
             hurried = wanted_bytes < FULL_BYTES and self._clock_s() - self._newest_s <= LONGEST_REST_S
             return 0.0 if hurried else LONGEST_WAIT_S
@@ -100,10 +100,10 @@ class BurstReader:
         return left_s if wanted_bytes >= FULL_BYTES else min(left_s, STEP_S)
 
     def _step(self, full: bool, wanted_bytes: int) -> bytes:
-        """Return what is there, unless it is the beginning of a scan whose end is on its way.
+        """Return the bytes there, unless they are the beginning of a scan whose end is on its way.
 
         Args:
-            full: FULL_BYTES lie there, or the port is gone.
+            full: True if FULL_BYTES are waiting, or the port is gone.
             wanted_bytes: as in `read`.
         """
         now_s = self._clock_s()
@@ -131,7 +131,7 @@ class BurstReader:
         return data
 
     def look(self) -> None:
-        """Look whether more waits than the beginning of a scan; if not, keep when that was.
+        """Update `empty_s` if no more than the beginning of a scan is waiting.
 
         Raises:
             OSError: the port is gone.
@@ -141,10 +141,10 @@ class BurstReader:
             self.empty_s = self._clock_s()
 
     def _take(self, data: bytes, wanted_bytes: int) -> bytes:
-        """`data` and what is there, up to `wanted_bytes`. An error behind bytes is left for the next call to meet."""
+        """Return `data` with the bytes there, up to `wanted_bytes`. An error after bytes is left to the next call."""
         while len(data) < wanted_bytes:
             try:
-                # Asked for VMIN, the kernel hands out 64 bytes a call however many there are.
+                # With VMIN set, the kernel returns 64 bytes a call however many there are.
                 piece = os.read(self.descriptor, wanted_bytes - len(data))
                 if not piece:
                     raise OSError(errno.EIO, "hung up")

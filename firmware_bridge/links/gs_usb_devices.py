@@ -1,4 +1,4 @@
-"""Which gs_usb adapters there are, and which of them is meant. Loads pyusb and libusb."""
+"""List of the gs_usb adapters of this machine, and selection of one. Loads pyusb and libusb."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,9 +17,9 @@ GS_USB_IDS: Final = {
     (0x1CD2, 0x606F): "CES CANext FD",
     (0x16D0, 0x10B8): "ABE CANdebugger FD",
 }
-"""Vendor and product. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity's own."""
+"""Adapters by vendor and product id. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity."""
 
-# A device whose texts cannot be read is still one: pyusb says "no langid" where it may not open it.
+# A device without readable texts is still listed: pyusb reports "no langid" where it may not open it.
 _NO_TEXT: Final = (usb.core.USBError, ValueError, NotImplementedError)
 
 
@@ -39,10 +39,10 @@ class GsUsbDevice(NamedTuple):
 
 
 def usb_backend() -> IBackend:
-    """libusb: that of the package libusb-package, else the system's.
+    """Return libusb: that of the package libusb-package, else the system's.
 
     Raises:
-        DeviceError: there is none that works.
+        DeviceError: no libusb works.
     """
     try:
         from libusb_package import get_libusb1_backend
@@ -55,7 +55,7 @@ def usb_backend() -> IBackend:
 
 
 def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
-    """All gs_usb adapters of this machine, by bus and address.
+    """List all gs_usb adapters of this machine, by bus and address.
 
     Raises:
         DeviceError: USB cannot be read.
@@ -64,10 +64,10 @@ def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
 
 
 def find_gs_usb(serial_number: str | None, backend: IBackend | None = None) -> tuple[GsUsbDevice, usb.core.Device]:
-    """The adapter with this serial number; for None the only one there is.
+    """Return the adapter with this serial number; for None the only one there is.
 
     Raises:
-        NoDeviceError: there is none, or there are several.
+        NoDeviceError: there is no such adapter, or there are several.
         DeviceError: USB cannot be read.
     """
     found = _found(backend)
@@ -88,7 +88,7 @@ def find_gs_usb(serial_number: str | None, backend: IBackend | None = None) -> t
 
 
 def udev_rule(usb_id: tuple[int, int]) -> str:
-    """The line to type so that users may open such a device."""
+    """Return the shell command that allows users to open such a device."""
     rule = f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{usb_id[0]:04x}", ATTR{{idProduct}}=="{usb_id[1]:04x}", MODE="0666"'
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-gs_usb.rules && sudo udevadm control -R, then plug it again"
 

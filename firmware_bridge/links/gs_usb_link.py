@@ -1,4 +1,4 @@
-"""A gs_usb adapter (candleLight and its kin) on USB, without the kernel's driver."""
+"""Link over a gs_usb adapter (candleLight and its kin) on USB, without the kernel's driver."""
 
 import array
 import errno
@@ -29,22 +29,22 @@ ENDPOINT_OUT: Final = 0x02
 USUAL_PACKET_BYTES: Final = 64
 REQUEST_TIMEOUT_MS: Final = 1000
 QUIET_MS: Final = 20
-"""Frames of a stopped channel that are still in the adapter follow each other much faster."""
+"""Silence after which a stopped channel is empty, in [ms]: frames left in the adapter follow each other much faster."""
 MOST_OLD_TRANSFERS: Final = 1000
-"""Its queue has 64; one that goes on for longer does not obey."""
+"""Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
 
 _BUSY = "in use: end what holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
 
 
 class GsUsbLink(Link):
-    """Scans from a sensor behind a gs_usb adapter.
+    """Link to a sensor on a gs_usb adapter.
 
-    What an adapter still holds when its client goes, or starts anew without fetching it, can leave it mute until it is
-    unplugged (candleLight_fw issues 46 and 165). So the channel is stopped and what is left is fetched, both on
-    opening, since an earlier client may have died, and on closing; and the USB device is never reset.
+    Frames left in an adapter when its client ends, or restarts without fetching them, can leave it mute until it is
+    unplugged (candleLight_fw issues 46 and 165). So the channel is stopped and the remaining frames are fetched, both
+    on opening, since an earlier client may have died, and on closing; and the USB device is never reset.
 
     Attributes:
-        serial_number: of the adapter; once it is known, only that adapter is opened again.
+        serial_number: serial number of the adapter; once it is read, only that adapter is opened again.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class GsUsbLink(Link):
         """Prepare a link; nothing is opened yet.
 
         Args:
-            serial_number: of the adapter, or None for the only one there is.
-            model: which CAN id is which taxel.
+            serial_number: serial number of the adapter, or None for the only one there is.
+            model: map from CAN ids to taxels.
             triggers: frames that wake older controllers, sent once after opening.
-            backend: of pyusb; by default libusb.
-            clock_ns: monotonic, in [ns].
+            backend: backend of pyusb; by default libusb.
+            clock_ns: monotonic clock, in [ns].
         """
         self.name = "gs_usb" if serial_number is None else f"gs_usb:{serial_number}"
         self.kind: SourceKind = "device"
@@ -98,14 +98,14 @@ class GsUsbLink(Link):
         device, self._device = self._device, None
         if device is None:
             return
-        with suppress(usb.core.USBError):  # gone already: nobody left to tell
+        with suppress(usb.core.USBError):  # gone already: no adapter to stop
             self._stop(device)
         self._release(device)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; waits at most `timeout_s` for the first.
+        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
 
-        An adapter sends each frame in a transfer of its own: as many are fetched as it takes until a scan closes.
+        An adapter sends each frame in a transfer of its own: transfers are fetched until a scan closes.
 
         Raises:
             LinkLostError: the adapter is gone.
@@ -131,15 +131,15 @@ class GsUsbLink(Link):
                 return scans
 
     def counters(self) -> dict[str, int]:
-        """Received bytes, transfers, and the counters of decoder, bus and assembler."""
+        """Return the counts of received bytes and transfers, and the counters of decoder, bus and assembler."""
         return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids that came so far."""
+        """Return the standard CAN ids received so far."""
         return frozenset(self._scans.can_ids)
 
     def _fetch(self, device: usb.core.Device, timeout_ms: int) -> bytes:
-        # libusb waits for ever where the time-out is 0.
+        # libusb waits for ever with a time-out of 0.
         try:
             count: int = device.read(ENDPOINT_IN, self._packet, timeout_ms)  # pyright: ignore[reportAssignmentType]
         except usb.core.USBTimeoutError:
@@ -162,10 +162,10 @@ class GsUsbLink(Link):
         except usb.core.USBError as error:
             if error.errno is not None:
                 raise
-            device.set_configuration()  # pyusb found none set; to set one again would reset the adapter
+            device.set_configuration()  # no configuration is set; setting one again would reset the adapter
             configuration = device.get_active_configuration()
         usb.util.claim_interface(device, INTERFACE)
-        # One packet a transfer: a longer one would wait for more wherever frames fill their packets.
+        # One packet a transfer: a longer transfer would wait for more where frames fill their packets.
         interface = usb.util.find_descriptor(configuration, bInterfaceNumber=INTERFACE)
         endpoint = usb.util.find_descriptor(interface, bEndpointAddress=ENDPOINT_IN)
         packet_bytes = getattr(endpoint, "wMaxPacketSize", 0) & 0x7FF

@@ -1,4 +1,4 @@
-"""Another link, its sensors named after it, their taxels put where they lie on the pad."""
+"""Wrapper of a link that names its sensors after it and puts their taxels in place on the pad."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,21 +11,21 @@ from firmware_bridge.scans.scan import Scan
 
 
 class MountedLink(Link):
-    """A link of which names and places are known that it does not know itself.
+    """Link with sensor names and places of taxels that the wrapped link does not have.
 
-    Links that sort readings by their id take a `placed_map` instead of places, which costs nothing.
+    Links that sort readings by their id take a `placed_map` instead of places, which costs no time.
 
     Attributes:
-        wrapped: the link.
+        wrapped: the wrapped link.
     """
 
     def __init__(self, link: Link, name: str = "", places: Mapping[str, Mounting] = MappingProxyType({})) -> None:
         """Wrap a link that is not open yet.
 
         Args:
-            link: gives the scans.
-            name: sensor "4" of "left" is "left/4"; without one, sensors are called as the link does.
-            places: of taxels that come in the order of an id map, by the link's name of their sensor.
+            link: link that returns the scans.
+            name: prefix of the sensors: "4" of "left" is "left/4"; without one they keep the names of the link.
+            places: mountings of sensors whose taxels come in the order of an id map, by the link's name of each.
         """
         self.name = link.name
         self.kind: SourceKind = link.kind
@@ -41,14 +41,14 @@ class MountedLink(Link):
 
     def __enter__(self) -> Self:
         self.wrapped.__enter__()
-        self.kind = self.wrapped.kind  # some know it only now
+        self.kind = self.wrapped.kind  # some links determine it only on opening
         return self
 
     def __exit__(self, *exc_info: object) -> None:
         self.wrapped.__exit__(*exc_info)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call, named and in place; waits at most `timeout_s` for the first."""
+        """Return the scans that closed since the last call, named and in place; waits at most `timeout_s`."""
         scans = self.wrapped.read(timeout_s)
         self.ended, self.trouble = self.wrapped.ended, self.wrapped.trouble
         if self._places:
@@ -56,24 +56,24 @@ class MountedLink(Link):
         return [replace(scan, sensor=f"{self._prefix}{scan.sensor}") for scan in scans] if self._prefix else scans
 
     def wait_on(self) -> Wait | None:
-        """Return what the link waits for."""
+        """Return the wait condition of the wrapped link."""
         return self.wrapped.wait_on()
 
     def can_ids(self) -> frozenset[int]:
-        """Return the link's."""
+        """Return the CAN ids of the wrapped link."""
         return self.wrapped.can_ids()
 
     def serial_line(self) -> SerialLine | None:
-        """Return the link's."""
+        """Return the serial line of the wrapped link."""
         return self.wrapped.serial_line()
 
     def notices(self) -> list[Notice]:
-        """The link's, under the user's name for it."""
+        """Return the notices of the wrapped link, with the user's name for it."""
         return [
             notice._replace(sensors=f"{self._prefix}{notice.sensors}", text=f"{self._told}{notice.text}")
             for notice in self.wrapped.notices()
         ]
 
     def counters(self) -> dict[str, int]:
-        """The link's."""
+        """Return the counters of the wrapped link."""
         return self.wrapped.counters()

@@ -1,4 +1,4 @@
-"""From what a user writes to a link."""
+"""Parser of the sources that a user names, into links."""
 
 import math
 import re
@@ -36,9 +36,9 @@ _BAUD = re.compile(r"[1-9][0-9]{0,7}")
 _CAN_NETWORK = re.compile(r"v?(?:x|sl)?can[0-9]+")
 _RECORDINGS: Final = (".mcap", ".npz", ".csv")
 _FINITE: Final = ("demo", "replay:")
-"""Sources that come to an end, and do not come back from it."""
+"""Beginnings of finite sources, which are not opened again after their end."""
 
-# Each link is loaded only where it is asked for: start-up time and memory are for what runs.
+# Each link is imported only where it is used, to save start-up time and memory.
 
 
 def open_sources(
@@ -50,16 +50,16 @@ def open_sources(
     *,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> list[Link]:
-    """The links that `texts` name, not yet entered; what is lost is opened again.
+    """Create the links that `texts` name, not yet entered; a lost one is opened again.
 
     Args:
-        texts: each one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4". Of several sources, those without
-            a name are called by their place, source1 and so on.
+        texts: each one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4". Among several sources, those
+            without a name are called by their place, source1 and so on.
         rate_hz: as in `open_source`.
         demo_recording: as in `open_source`.
         model: as in `open_source`.
-        give_up_s: how long a lost source may be away, in [s]; None leaves its loss to the caller.
-        mountings: how sensors sit, by name, that of their source included.
+        give_up_s: longest outage of a source, in [s]; None leaves its loss to the caller.
+        mountings: mountings of sensors, by name including that of their source.
 
     Raises:
         SourceError: no such form, or one name twice.
@@ -87,18 +87,18 @@ def open_source(
     model: ModelMap = USPA44_MAP,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> Link:
-    """The link that `text` names, not yet entered; for None the one known adapter there is.
+    """Create the link that `text` names, not yet entered; for None that of the only recognised adapter.
 
     Args:
         text: one of FORMS.
-        rate_hz: scans a second at which recordings are played; a device has its own.
-        demo_recording: what "demo" plays, and "demo:loop" again and again.
-        model: which CAN id is which taxel, for a device.
-        mountings: how its sensors sit, by name. What edge-sr recorded is in place already.
+        rate_hz: scans a second at which recordings are played; a device has its own rate.
+        demo_recording: recording that "demo" plays, and "demo:loop" again and again.
+        model: map from CAN ids to taxels, for a device.
+        mountings: mountings of its sensors, by name. Recordings of edge-sr are in place already.
 
     Raises:
         SourceError: no such form.
-        NoDeviceError: no adapter, or several, and none was named.
+        NoDeviceError: no adapter, or several without a choice.
         RecordingError: a recording that cannot be used.
     """
     model = placed_map(model, mountings)
@@ -131,12 +131,12 @@ def open_source(
 
 
 def recording_paths(text: str) -> list[str]:
-    """Files that FILE[,FILE] names; one may have a comma in its name."""
+    """Split FILE[,FILE] into paths; the name of a single existing file may have a comma in it."""
     return [text] if Path(text).exists() else text.split(",")
 
 
 def place_recordings(link: Link, paths: Sequence[str | Path], mountings: Mapping[str, Mounting]) -> Link:
-    """A link that plays these files, the taxels of each in place: those of a CSV lie as they are wired."""
+    """Wrap a link that plays these files so that all taxels are in place: those of a CSV are as wired."""
     raw = {path.stem for path in map(Path, paths) if path.suffix.lower() == ".csv"}
     return _placed(link, {name: one for name, one in mountings.items() if name in raw})
 
@@ -173,7 +173,7 @@ def _is_of(sensor: str, source: str) -> bool:
 
 
 def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: bool = False) -> Link:
-    """Taxels in their places, for a link without CAN ids; forces along the pad's axes, where it tells of any."""
+    """Put taxels in their places for a link without CAN ids, and turn its forces, if any, to the pad's axes."""
     moved = {name: one for name, one in mountings.items() if one.moves_taxels or (tells_newtons and one.reverses_axes)}
     if not moved:
         return link
@@ -188,7 +188,7 @@ def _refusal(text: str) -> SourceError:
 
 
 def _meant(text: str) -> str | None:
-    """The form of what is named without one."""
+    """Return the likely form of a source named without one, None if there is no guess."""
     if _CAN_NETWORK.fullmatch(text):
         return f"can:socketcan:{text}"
     path = Path(text.partition("@")[0])

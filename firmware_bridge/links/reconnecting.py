@@ -1,4 +1,4 @@
-"""A link that comes back: what is lost or silent is opened again, for as long as it takes."""
+"""Wrapper that opens a lost or silent link again, for as long as it takes."""
 
 import math
 import time
@@ -12,14 +12,14 @@ from firmware_bridge.silence import LINK_SILENT_S
 
 FIRST_RETRY_S: Final = 0.1
 SOON_RETRY_S: Final = 0.5
-"""With what opening takes, a link that is back is used within a second."""
+"""Longest pause between tries in the first minute, in [s]: with the opening, a link that is back is used within 1 s."""
 LATE_RETRY_S: Final = 2.0
 SOON_S: Final = 60.0
-"""Of an outage; after that somebody went to fetch a cable, and a robot's processor has better to do."""
+"""Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
 
 
 class LastingLink(Link):
-    """Reads a link and opens it again whenever it is lost, and now and then while it is silent."""
+    """Link that opens the wrapped link again whenever it is lost, and now and then while it is silent."""
 
     def __init__(
         self,
@@ -32,9 +32,9 @@ class LastingLink(Link):
         """Wrap a link that is not open yet.
 
         Args:
-            link: whose first opening must succeed.
-            give_up_s: an outage, or a silence, may last so long, in [s]; at 0 no outage, but any silence.
-            clock_ns: monotonic, in [ns].
+            link: wrapped link, whose first opening must succeed.
+            give_up_s: longest outage or silence, in [s]; 0 allows no outage, but any silence.
+            clock_ns: monotonic clock, in [ns].
             sleep: sleeps for a time in [s].
         """
         self.name = link.name
@@ -71,13 +71,13 @@ class LastingLink(Link):
             self._link.__exit__(*exc_info)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; none while the link is away.
+        """Return the scans that closed since the last call; an empty list while the link is away.
 
-        A link that is lost or silent is closed and opened by the next call, which may take long and says so before:
-        `wait_on` then gives None.
+        The next call closes and opens a link that is lost or silent, which may take long: before it, `wait_on`
+        returns None.
 
         Raises:
-            LinkLostError: it was away for longer than may be.
+            LinkLostError: it was away for longer than allowed.
         """
         if not self._open:
             self._come_back(timeout_s)
@@ -101,24 +101,24 @@ class LastingLink(Link):
         return scans
 
     def wait_on(self) -> Wait | None:
-        """Return what the link waits for; None while it is to be opened again."""
+        """Return the wait condition of the wrapped link; None while it is to be opened again."""
         return self._link.wait_on() if self._open else None
 
     def notices(self) -> list[Notice]:
-        """What happened to the link since the last call."""
+        """Return the events of the link since the last call."""
         notices, self._notices = self._notices, []
         return notices + self._link.notices()
 
     def counters(self) -> dict[str, int]:
-        """The link's own; outages: how often it was lost or fell silent; reopenings: how often it was opened again."""
+        """Return the wrapped link's counters, its outages (losses and silences) and its reopenings."""
         return {**self._link.counters(), "outages": self._outages, "reopenings": self._reopenings}
 
     def can_ids(self) -> frozenset[int]:
-        """Return the link's."""
+        """Return the CAN ids of the wrapped link."""
         return self._link.can_ids()
 
     def serial_line(self) -> SerialLine | None:
-        """Return the link's."""
+        """Return the serial line of the wrapped link."""
         return self._link.serial_line()
 
     def _end_outage(self, now_ns: int) -> None:
@@ -128,7 +128,7 @@ class LastingLink(Link):
         self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
 
     def _suspect(self) -> None:
-        """Open a silent link anew, ever more seldom."""
+        """Schedule another opening of a silent link, less often each time."""
         now_ns = self._clock_ns()
         if self.ended or self._give_up_s == 0 or now_ns - self._heard_ns < self._silent_s * 1e9:
             return
@@ -152,7 +152,7 @@ class LastingLink(Link):
         else:
             self._reopenings += 1
             self._entered = self._open = True
-            if self._link.kind != self.kind:  # every result would go on to say the other
+            if self._link.kind != self.kind:  # every result would go on to state the first kind
                 raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start anew")
 
     def _close(self, why: str, now_ns: int | None = None) -> None:
@@ -172,7 +172,7 @@ class LastingLink(Link):
         self._delay_s = min(2 * self._delay_s, LATE_RETRY_S)
 
     def _come_back(self, timeout_s: float) -> None:
-        """Close what is still open, and open it again: at once where it is silent, else when it is time to try."""
+        """Close the link if it is still open, and open it again: at once if it was silent, else when a try is due."""
         if self._entered:
             self._entered = False
             self._link.__exit__(None, None, None)

@@ -1,4 +1,4 @@
-"""Recordings played back, at the speed they were made or as fast as they are read."""
+"""Link that plays recordings, at their own speed or as fast as they are read."""
 
 import heapq
 import math
@@ -26,10 +26,10 @@ class _Due(NamedTuple):
 
 
 class ReplayLink(Link):
-    """Scans from recordings, all started together. It never leaves a scan out; late ones come at once.
+    """Link to recordings, all started together. It never leaves a scan out; late ones come at once.
 
     Attributes:
-        recordings: that it plays.
+        recordings: the recordings that it plays.
     """
 
     def __init__(
@@ -44,16 +44,16 @@ class ReplayLink(Link):
         """Load the recordings.
 
         Args:
-            paths: of the recordings.
+            paths: paths of the recordings.
             rate_hz: scans a second of each sensor, also of one with recorded times if paced; by default the recorded
                 times, else the recorded rate.
-            paced: at that speed, from now on; else each scan when it is asked for, at its recorded time.
-            clock: monotonic time in [ns].
+            paced: True plays at that speed, from now on; else each `read` returns a scan at its recorded time.
+            clock: monotonic clock in [ns].
             sleep: sleeps for a time in [s].
 
         Raises:
             RecordingError: a file cannot be used.
-            SourceError: the rate is no rate, a file tells neither times nor rate, or two files name the same sensor.
+            SourceError: the rate is invalid, a file has neither times nor a rate, or two files name the same sensor.
         """
         if rate_hz is not None and not 0 < rate_hz < math.inf:
             raise SourceError(f"rate is {rate_hz} Hz, expected a positive number")
@@ -103,7 +103,7 @@ class ReplayLink(Link):
         pass
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that fell due since the last call; waits at most `timeout_s` for the first. If patient, the next."""
+        """Return the scans due since the last call; waits at most `timeout_s` for the first. If patient, the next."""
         if self._next is None:
             return []
         if self.patient:
@@ -120,12 +120,12 @@ class ReplayLink(Link):
         return scans
 
     def notices(self) -> list[Notice]:
-        """What is to be known of the files, once."""
+        """Return the notes on the files, once."""
         notes, self._notes = self._notes, []
         return [Notice(self._start_ns, "note", self.name, note) for note in notes]
 
     def counters(self) -> dict[str, int]:
-        """Scans, and how many of them were torn or repeated, as the recording has them."""
+        """Return the counts of scans, and of the torn and repeated ones among them, as in the recording."""
         return dict(self._counts)
 
     def _close(self, due: _Due) -> Scan:
@@ -143,7 +143,7 @@ class ReplayLink(Link):
 
 
 def _recorded(track: Track, renewed: NDArray[np.bool_], row: int, time_ns: int) -> Scan:
-    """A scan as it was, however much of the recording before it is missing."""
+    """Return a scan as it was, even if a part of the recording before it is missing."""
     counts = track.counts[row].copy()
     fresh, new = counts[0] != ABSENT, renewed[row].copy()
     for array in (counts, fresh, new):

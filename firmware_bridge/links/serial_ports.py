@@ -1,4 +1,4 @@
-"""Which serial ports there are, and which of them is a sensor's adapter."""
+"""List of the serial ports of this machine, and recognition of a sensor's adapter among them."""
 
 import re
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from serial.tools.list_ports_common import ListPortInfo
 from firmware_bridge.errors import NoDeviceError
 
 FTDI_X: Final = (0x0403, 0x6015)
-"""Of FTDI's chip, and so of what XELA ships, and of grippers and cables as well."""
+"""Id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables."""
 
 KNOWN_ADAPTERS: Final = {
     FTDI_X: "VScom USB-CAN Plus",
-    (0xAD50, 0x60C4): "CANable, slcan firmware",  # the id of CANtact, from which it comes
+    (0xAD50, 0x60C4): "CANable, slcan firmware",  # the id of CANtact, from which its firmware is derived
     (0x16D0, 0x117E): "CANable 2, slcan firmware",
 }
 
@@ -32,13 +32,13 @@ class Port(NamedTuple):
     """One serial port.
 
     Attributes:
-        path: such as /dev/ttyUSB0.
+        path: path of the port, such as /dev/ttyUSB0.
         usb_id: vendor and product; None for a port that is not on USB.
-        serial_number: of the USB device, which several ports may share.
-        description: for a reader.
-        product: what the device calls itself.
-        manufacturer: what it says it is made by.
-        interface: which port of a device with several, such as "1.0".
+        serial_number: serial number of the USB device, which several ports may share.
+        description: description for the user.
+        product: name that the device reports.
+        manufacturer: manufacturer that the device reports.
+        interface: port of a device with several ones, such as "1.0".
     """
 
     path: str
@@ -51,9 +51,9 @@ class Port(NamedTuple):
 
     @property
     def adapter(self) -> str | None:
-        """Name of the adapter, if it looks like one known to be used with these sensors.
+        """Name of the adapter, if it looks like one that is used with these sensors; None otherwise.
 
-        Of a chip that many devices have, the device's own words decide, where it has any.
+        For a chip that many devices have, the texts of the device decide, if there are any.
         """
         words = " ".join(word for word in (self.product, self.manufacturer) if word)
         if self.usb_id is None or (self.usb_id == FTDI_X and words and not _CAN_ADAPTER.search(words)):
@@ -67,7 +67,7 @@ class Port(NamedTuple):
 
 
 def serial_ports() -> list[Port]:
-    """All serial ports of this machine, by path."""
+    """List all serial ports of this machine, by path."""
     return sorted(
         Port(
             info.device,
@@ -84,17 +84,17 @@ def serial_ports() -> list[Port]:
 
 def _comports() -> list[ListPortInfo]:
     for _ in range(MOST_LOOKS):
-        # pyserial takes for a number what it could not read of a device that is just being pulled out.
+        # pyserial converts texts to numbers that it could not read from a device that is being unplugged.
         with suppress(TypeError, ValueError, OSError):
             return list(list_ports.comports())
     return []
 
 
 def find_adapter(ports: Sequence[Port]) -> Port:
-    """The one known adapter among `ports`.
+    """Return the only recognised adapter among `ports`.
 
     Raises:
-        NoDeviceError: there is none, or there are several.
+        NoDeviceError: there is no adapter, or there are several.
     """
     found = [port for port in ports if port.adapter is not None]
     if len(found) == 1:
@@ -108,10 +108,10 @@ def find_adapter(ports: Sequence[Port]) -> Port:
 
 
 def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
-    """The port whose USB device has this serial number.
+    """Return the port whose USB device has this serial number.
 
     Raises:
-        NoDeviceError: there is none, or there are several.
+        NoDeviceError: there is no such port, or there are several.
     """
     found = [port for port in ports if port.serial_number == serial_number]
     if len(found) != 1:
@@ -124,21 +124,21 @@ def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
 
 
 class PluggedAdapter:
-    """An adapter, wherever it is plugged in: known by the USB serial number that its port had first.
+    """Adapter that is recognised at any port by the USB serial number that it had first.
 
-    Of a device with several ports it is the same one of them.
+    If the device has several ports, it is always the same one of them.
     """
 
     def __init__(self, path: str) -> None:
-        """Know it by the path of its port, until `find` has seen more."""
+        """Identify it by the path of its port, until `find` has its serial number."""
         self._path = path
         self._port: Port | None = None
 
     def find(self, ports: Sequence[Port]) -> str:
-        """Path of its port among those there are now; the path given where it has no serial number.
+        """Return the path of its port among the present ones, or the first path if it has no serial number.
 
         Raises:
-            NoDeviceError: it is not there, or another cannot be told from it.
+            NoDeviceError: it is missing, or another one has the same identity.
         """
         if self._port is None:
             real_path = Path(self._path).resolve()

@@ -1,4 +1,4 @@
-"""An slcan adapter on a serial port."""
+"""Link over an slcan adapter on a serial port."""
 
 import errno
 import os
@@ -29,19 +29,20 @@ from firmware_bridge.scans.slcan_scans import SlcanScans
 DEFAULT_BAUD: Final = 3_000_000
 WRITE_TIMEOUT_S: Final = 1.0
 QUIET_S: Final = 0.02
-"""A little over the 16 ms for which an FTDI chip may hold bytes back."""
+"""Silence after which the line counts as quiet, in [s]: a little over the 16 ms for which an FTDI chip holds bytes."""
 LONGEST_SETTLE_S: Final = 0.3
 _LOOK_S: Final = 0.002
 _PIECE_BYTES: Final = 4096
 _MOST_PIECES: Final = 1024
 SLOWEST_STAMPED_BAUD: Final = 1_000_000
-"""Two sensors at 100 scans a second are 832 kbit/s of stamped lines, and 704 of plain ones."""
+"""Slowest line on which stamps are requested, in [bit/s]: two sensors at 100 scans a second take 832 kbit/s with
+stamps, and 704 without."""
 MOST_SILENT_OPENINGS: Final = 10
-"""In a row after which stamps are asked for no more, until a scan has come: a link that lasts opens for days."""
+"""Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
 MOST_LATE_STAMPS: Final = 4
-"""Lines lost to stamps that are no milliseconds of a minute, before this adapter is told to leave them out."""
+"""Lines lost to stamps that are no milliseconds of a minute, after which stamps of this adapter are switched off."""
 LATE_STAMPS_FRAMES: Final = 1000
-"""So thick they must come: a digit that flips on the wire now and then says nothing of the adapter's clock."""
+"""Frames within which those lines must come: an occasional flipped digit is no evidence on the adapter's clock."""
 
 # pyserial lets termios.error through, which is no OSError; Windows has no termios.
 _PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
@@ -49,20 +50,20 @@ _BUSY = "in use: end what holds it, such as slcand, xela_server or another edge-
 
 
 class SlcanSerialLink(Link):
-    """Scans from a sensor behind an slcan adapter.
+    """Link to a sensor on an slcan adapter.
 
     Opening sends close, bitrate, time stamps on and open, and waits for no acknowledgement, since some
     adapters never send one. What arrives before the line falls silent is older than the opening and dropped.
     Closing sends close and time stamps off: some adapters keep that setting, and not every program expects stamps.
     They keep it in an EEPROM, which wears, so a bus that stays silent is not asked for stamps at every opening.
 
-    It may be opened any number of times. An adapter with a USB serial number is then found again under
-    whatever name its port has.
+    It may be opened any number of times. An adapter with a USB serial number is then recognised under any
+    name of its port.
 
     Attributes:
         port: path of the serial port.
-        baudrate: of the serial line, in bit/s.
-        low_latency: the platform took the request not to hold bytes back.
+        baudrate: speed of the serial line, in [bit/s].
+        low_latency: True if the platform accepted the request not to hold bytes back.
     """
 
     def __init__(
@@ -78,13 +79,13 @@ class SlcanSerialLink(Link):
 
         Args:
             port: path of the serial port.
-            baudrate: of the serial line, in bit/s; USB-CDC adapters ignore it.
-            rtscts: hardware flow control.
-            model: which CAN id is which taxel.
+            baudrate: speed of the serial line, in [bit/s]; USB-CDC adapters ignore it.
+            rtscts: True for hardware flow control.
+            model: map from CAN ids to taxels.
             triggers: frames that wake older controllers, sent once after opening.
         """
         self.name = f"slcan:{port}"
-        # No hardware sensor is a pseudo-terminal: who is behind one only pretends.
+        # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.ended = False
         self.trouble: str | None = None
@@ -125,19 +126,19 @@ class SlcanSerialLink(Link):
         port, self._serial, self._bursts = self._serial, None, None
         if port is None:
             return
-        with suppress(*_PORT_ERRORS):  # gone already: nobody left to tell
+        with suppress(*_PORT_ERRORS):  # gone already: no adapter to stop
             _wait_until_sent(port)
             for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
                 port.write(command)
                 _wait_until_sent(port)
-            self._dropped_bytes += _take_waiting(port.fileno())  # pyserial's next opening would, and count nothing
+            self._dropped_bytes += _take_waiting(port.fileno())  # pyserial's next opening would drop them uncounted
         with suppress(*_PORT_ERRORS):
-            if port.out_waiting:  # what a dead device does not take would hold up the closing
+            if port.out_waiting:  # bytes that a dead device does not accept would delay the closing
                 port.reset_output_buffer()
         port.close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; waits at most `timeout_s` for the first byte.
+        """Return the scans that closed since the last call; waits at most `timeout_s` for the first byte.
 
         Raises:
             LinkLostError: the port is gone.
@@ -151,7 +152,7 @@ class SlcanSerialLink(Link):
             if self._bursts.held_until_s is not None:
                 return []
             self._unread.empty_ns = round(self._bursts.empty_s * 1e9)
-            with suppress(OSError):  # of an error behind bytes the next call tells
+            with suppress(OSError):  # the next call reports an error after bytes
                 self._bursts.look()
         except OSError as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
@@ -165,7 +166,7 @@ class SlcanSerialLink(Link):
         if self._stamps_on and self._stamps_are_none():
             self._asks_stamps = self._stamps_on = False
             self._stamps_to_set = STAMPS_OFF
-        elif scans and self._asks_stamps and not self._stamps_on:  # left out while nothing came
+        elif scans and self._asks_stamps and not self._stamps_on:  # switched off while no scan came
             self._stamps_on = True
             self._stamps_to_set = STAMPS_ON
         if timeout_s > 0 and self._stamps_to_set is not None:
@@ -173,18 +174,18 @@ class SlcanSerialLink(Link):
         return scans
 
     def wait_on(self) -> Wait | None:
-        """Return the port's descriptor; None while the channel is to be opened anew, which waits for a quiet line."""
+        """Return the port's descriptor; None while the channel must be reopened, which waits for a quiet line."""
         if self._bursts is None or self._stamps_to_set is not None:
             return None
         return Wait(self._bursts.descriptor, self._bursts.longest_wait_s(self._scans.bytes_until_scan()))
 
     def counters(self) -> dict[str, int]:
-        """Counters of decoder and assembler, bytes received, and bytes that an opening or a closing dropped."""
+        """Return the counts of received bytes and of bytes dropped on opening or closing, and the stages' counters."""
         sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
         return sizes | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids that came so far."""
+        """Return the standard CAN ids received so far."""
         return frozenset(self._scans.can_ids)
 
     def serial_line(self) -> SerialLine:
@@ -217,7 +218,7 @@ class SlcanSerialLink(Link):
         self._frames_at_opening = frames
         self._late_stamps_from = self._scans.decoder.late_stamps, frames
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
-        # One write each: some adapters obey only the first command in a USB packet.
+        # One write for each command: some adapters obey only the first one in a USB packet.
         for command in (CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M):
             port.write(command)
             _wait_until_sent(port)
@@ -237,11 +238,11 @@ class SlcanSerialLink(Link):
         return False
 
     def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:
-        """With time stamps on or off, from a line that has fallen silent: of two forms at once most would be lost."""
+        """Reopen the channel with time stamps on or off, on a quiet line: of two forms at once most would be lost."""
         self._stamps_to_set = None
         for command in (CLOSE, stamps):
             _say(port, command)
-        with suppress(*_PORT_ERRORS):  # gone, which reading tells
+        with suppress(*_PORT_ERRORS):  # gone, which the next read reports
             self._drop_old_bytes(port)
             if self._bursts is not None:
                 self._bursts.look()
@@ -249,7 +250,7 @@ class SlcanSerialLink(Link):
         _say(port, OPEN)
 
     def _drop_old_bytes(self, port: serial.Serial) -> None:
-        """Leave out what arrives before the line falls silent, and count it: so no byte vanishes unseen."""
+        """Drop and count the bytes that arrive before the line falls silent."""
         now_s = time.monotonic()
         quiet_s, end_s = now_s + QUIET_S, now_s + LONGEST_SETTLE_S
         while now_s < min(quiet_s, end_s):
@@ -262,30 +263,30 @@ class SlcanSerialLink(Link):
 
 
 def _say(port: serial.Serial, command: bytes) -> None:
-    with suppress(*_PORT_ERRORS):  # gone, which reading tells, or full, and then nobody would answer
+    with suppress(*_PORT_ERRORS):  # gone, which the next read reports, or full: then no answer would come
         _wait_until_sent(port)
         os.write(port.fileno(), command)
         _wait_until_sent(port)
 
 
 def _take_waiting(descriptor: int) -> int:
-    """Read what waits and return how many bytes that were; of a flood, a bounded part."""
+    """Read the waiting bytes, a bounded number of them, and return their count."""
     taken = 0
-    with suppress(BlockingIOError):  # all is fetched
+    with suppress(BlockingIOError):  # all bytes are read
         for _ in range(_MOST_PIECES):
             taken += len(os.read(descriptor, _PIECE_BYTES))
     return taken
 
 
 def _ask(port: serial.Serial, question: bytes) -> None:
-    """Send a question without waiting until it is gone; an adapter that takes nothing would not answer either."""
+    """Send a request without waiting for the output; an adapter that accepts no bytes would not answer either."""
     with suppress(*_PORT_ERRORS):
         if not port.out_waiting:
             os.write(port.fileno(), question)
 
 
 def _wait_until_sent(port: serial.Serial) -> None:
-    # Not flush(): it waits for ever where flow control never lets go.
+    # Not flush(): it waits for ever if flow control never releases the line.
     end_s = time.monotonic() + WRITE_TIMEOUT_S
     while port.out_waiting and time.monotonic() < end_s:
         time.sleep(0.001)

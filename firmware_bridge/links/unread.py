@@ -1,4 +1,4 @@
-"""How long what comes may have lain unread, by our own clock: it knows when nobody looked."""
+"""Longest time that data may have waited to be read, by the host's clock."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,36 +7,36 @@ from typing import Final
 from firmware_bridge.scans.scan import Scan
 
 LONG_UNREAD_NS: Final = 50_000_000
-"""More than twice what a link waits for at once: whoever was away for longer did not run."""
+"""Time without a read from which the process counts as stalled, in [ns]: more than twice the longest wait of a link."""
 WAITED_NS: Final = 1_000_000
-"""Where reading took longer than this, nothing lay there when it began."""
+"""Duration of a read, in [ns], above which no data was waiting when it began."""
 
 
 class Unread:
-    """Follows when a link was last found empty.
+    """Tracker of the latest time at which a link was empty.
 
     Attributes:
-        empty_ns: monotonic time at which nothing lay there, as its reader last saw, in [ns]; None before.
+        empty_ns: latest monotonic time at which its reader saw it empty, in [ns]; None before that.
     """
 
     def __init__(self) -> None:
         self.empty_ns: int | None = None
 
     def found(self, begun_ns: int, ended_ns: int) -> None:
-        """Take it that something came while it was read from `begun_ns` to `ended_ns`."""
+        """Note that data came during a read from `begun_ns` to `ended_ns`, in [ns] of monotonic time."""
         if self.empty_ns is not None and begun_ns - self.empty_ns > LONG_UNREAD_NS:
-            return  # nobody ran: how long this took says nothing before all of it is fetched
+            return  # the process stalled: until all data is read, the duration of a read is no evidence
         if ended_ns - begun_ns > WAITED_NS:
             self.empty_ns = begun_ns
 
     def mark(self, scans: Sequence[Scan], time_ns: int, clock_begun_ns: int | None) -> list[Scan]:
-        """Return scans, each with how long it may have lain there, where that is long.
+        """Return the scans, each with the longest time it may have waited, if that is long.
 
         Args:
-            scans: read at `time_ns`.
-            time_ns: monotonic, in [ns].
-            clock_begun_ns: as in `DeviceClock`. A clock that was set by what lay there does not know how old that is:
-                its times are left out.
+            scans: scans read at `time_ns`.
+            time_ns: monotonic time, in [ns].
+            clock_begun_ns: `begun_ns` of the `DeviceClock`. A clock that was set by data that may have waited has no
+                reliable times, so they are left out.
         """
         unread_ns = 0 if self.empty_ns is None else time_ns - self.empty_ns
         if unread_ns <= LONG_UNREAD_NS:

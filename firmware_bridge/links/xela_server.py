@@ -1,4 +1,4 @@
-"""The vendor's server, over WebSocket."""
+"""Link to the vendor's server, over WebSocket."""
 
 import socket
 import time
@@ -29,19 +29,19 @@ from firmware_bridge.silence import SERVER_QUIET_S
 DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0
 REOPENING_S: Final = 1.0
-"""Of a server that was met: one that hangs must not hold up for longer who reads other sources beside it."""
+"""Time-out of a reopening, in [s]: a server that hangs must not delay other sources for longer."""
 FIRST_MESSAGE_S: Final = 0.5
-"""A server greets at once; one that has nothing to say is no error."""
+"""Wait for the first message, in [s]: a server greets at once; no message is no error."""
 ANSWER_S: Final = 1.0
-"""Who reads this link by itself is told of a pulled cable, or of a server that hangs, after 1.75 s without a message.
-LastingLink opens it anew before that, and what hangs is told by its handshake."""
+"""Time-out of a ping, in [s]: a link read by itself reports a pulled cable, or a server that hangs, after 1.75 s
+without a message. LastingLink reopens it before that, and a server that hangs then fails in the handshake."""
 CLOSING_S: Final = 0.2
 MOST_WAITING: Final = 64
-"""Messages taken at once; what is beyond waits for the next read."""
+"""Most messages of one read; later ones wait for the next."""
 
 
 class ServerAddress(NamedTuple):
-    """Where a server is."""
+    """Address of a server."""
 
     host: str
     port: int
@@ -49,14 +49,14 @@ class ServerAddress(NamedTuple):
 
 
 class XelaServerLink(Link):
-    """Scans from the vendor's xela_server, all sensors of the right geometry.
+    """Link to the vendor's xela_server, with all its sensors of the right geometry.
 
-    A server in its simulation mode says nothing of it: its scans count as a device's.
+    A server does not report its simulation mode: its scans then count as a device's.
 
     Attributes:
-        url: of the server.
-        version: of the server, as it says.
-        trouble: sensors that are left out or silent, and whether what the server says is old.
+        url: URL of the server.
+        version: version that the server reports.
+        trouble: sensors that are left out or silent, and readings that are old.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class XelaServerLink(Link):
 
         Args:
             url: ws://HOST[:PORT].
-            geometry: of the sensors; others of the server are left out.
-            clock_ns: monotonic, in [ns].
+            geometry: geometry of the sensors; others of the server are left out.
+            clock_ns: monotonic clock, in [ns].
 
         Raises:
             SourceError: no such URL.
@@ -90,7 +90,7 @@ class XelaServerLink(Link):
 
     @property
     def version(self) -> str:
-        """Of the server, as it says; empty until it has."""
+        """Version that the server reports; empty until it has."""
         return self._scans.version
 
     def __enter__(self) -> Self:
@@ -112,11 +112,11 @@ class XelaServerLink(Link):
         self._open.close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Scans that closed since the last call; waits at most `timeout_s` for the first message.
+        """Return the scans that closed since the last call; waits at most `timeout_s` for the first message.
 
         Raises:
             LinkLostError: the server is gone, or fell silent and does not answer.
-            DeviceError: none of its sensors is one that can be used.
+            DeviceError: it has no sensor that can be used.
         """
         if self._connection is None:
             raise ValueError("the link is not open: use it in a with statement")
@@ -126,7 +126,7 @@ class XelaServerLink(Link):
         return self._take(timeout_s)
 
     def counters(self) -> dict[str, int]:
-        """Received bytes and the counters of decoder and scans."""
+        """Return the count of received bytes, and the counters of decoder and scans."""
         return {"received_bytes": self._received_bytes} | self._scans.counters()
 
     def _take(self, timeout_s: float) -> list[Scan]:
@@ -143,9 +143,9 @@ class XelaServerLink(Link):
                     self._received_bytes += len(message)
                     scans += self._scans.feed(message, self._heard_ns)
             except TimeoutError:
-                self._watch(connection)  # which finds now and then that the connection has just closed
+                self._watch(connection)  # raises at times, if the connection has just closed
         except ConnectionClosed as error:
-            if scans:  # what came before the end counts; the next read tells of it
+            if scans:  # scans from before the end count; the next read reports the end
                 return scans
             raise LinkLostError(f"{self.url}: link lost: {_ending(error)}") from error
         self.trouble = self._scans.trouble
@@ -154,7 +154,7 @@ class XelaServerLink(Link):
         return scans
 
     def _watch(self, connection: ClientConnection) -> None:
-        """Ask a server that says nothing whether it is there: a connection can be dead without being closed."""
+        """Ping a server that sends no message: a connection can be dead without being closed."""
         now_ns = self._clock_ns()
         if self._pong is None:
             if now_ns - self._heard_ns >= SERVER_QUIET_S * NS_PER_S:
@@ -174,8 +174,8 @@ class XelaServerLink(Link):
         except (OSError, UnicodeError) as error:
             raise DeviceError(f"{url}: {_unreachable(host, error, opening_s)}") from error
         try:
-            # The server is on this machine or beside it: no proxy, and no compression that costs time on both sides.
-            # Pings of our own: websockets would give up a server that talks but does not answer them.
+            # The server is on this machine or near it: no proxy, and no compression, which costs time on both sides.
+            # No pings by websockets: it would drop a server that sends messages but answers no ping.
             connection = connect(
                 url,
                 sock=plain,
@@ -192,10 +192,10 @@ class XelaServerLink(Link):
 
 
 def server_address(url: str) -> ServerAddress:
-    """Host, port and URL of ws://HOST[:PORT]; port 5000 where none is named.
+    """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL.
 
     Raises:
-        SourceError: anything else.
+        SourceError: any other form.
     """
     expected = "expected ws://HOST or ws://HOST:PORT"
     try:
@@ -217,7 +217,7 @@ def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> 
         if host in ("localhost", "::1") or host.startswith("127."):
             remedy += "; some versions (1.7.6) listen on the machine's own address alone: see hostname -I"
         return f"connection refused: {remedy}"
-    if isinstance(error, (socket.gaierror, UnicodeError)):  # the latter of a name that has no place in the DNS
+    if isinstance(error, (socket.gaierror, UnicodeError)):  # UnicodeError: a name that is invalid in the DNS
         return "no such host: name it by its IP address, or see that it is in the DNS"
     if isinstance(error, TimeoutError):
         return f"no answer within {opening_s:g} s: is the machine on, on this network, and its firewall open?"

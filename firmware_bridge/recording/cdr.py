@@ -1,8 +1,8 @@
-"""ROS 2 messages as bytes, driven by the text of their own definition, so that the two cannot differ. No I/O.
+"""Encoding of ROS 2 messages by the text of their own definition, so that the two cannot differ. No I/O.
 
 The encoding is CDR version 1, little-endian, as every ROS 2 middleware writes it: four bytes of header, then each
-field at a multiple of its size; texts and sequences bear their length in front. Bytes are read as a stranger's: no
-length is believed that the bytes at hand do not bear out.
+field at a multiple of its size; texts and sequences begin with their length. Bytes are not trusted: every length is
+checked against the bytes that are there.
 """
 
 import re
@@ -15,7 +15,7 @@ import numpy as np
 from firmware_bridge.errors import CdrError
 
 LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000
-"""Where times of ROS 2 end, in 2038."""
+"""Latest time of ROS 2, in [ns] since 1970 (in 2038)."""
 HEADER: Final = b"\x00\x01\x00\x00"
 _NUMBERS: Final = dict(
     (
@@ -29,7 +29,7 @@ _RULE: Final = "=" * 80
 
 
 class _Field(NamedTuple):
-    """One field: a number, a text, or a message; `length` of an array of numbers, 0 if it is open, else None."""
+    """One field: a number, a text, or a message; `length` of an array of numbers, 0 if it is variable, else None."""
 
     name: str
     number: struct.Struct | None
@@ -39,23 +39,23 @@ class _Field(NamedTuple):
 
 
 class MessageType:
-    """A message: its definition, and its bytes.
+    """Type of a message: its definition, and its encoding as bytes.
 
     Attributes:
-        name: such as "std_msgs/msg/Header".
-        definition: its text, and behind it those of the messages in it, as MCAP wants it for the encoding "ros2msg".
+        name: name of the type, such as "std_msgs/msg/Header".
+        definition: its text, followed by those of the messages in it, the format of MCAP for the encoding "ros2msg".
     """
 
     def __init__(self, name: str, text: str, *parts: "MessageType") -> None:
         """Read a definition.
 
         Args:
-            name: with its package.
-            text: of the .msg file: numbers, texts, arrays of numbers, and other messages; no constants, no defaults.
+            name: name with its package.
+            text: text of the .msg file: numbers, texts, arrays of numbers, other messages; no constants, no defaults.
             parts: the messages in it.
 
         Raises:
-            ValueError: a line that is no such field.
+            ValueError: a line is no such field.
         """
         self.name = name
         self._text = text.strip()
@@ -70,7 +70,7 @@ class MessageType:
         return self._text + "".join(parts) + "\n"
 
     def encode(self, values: Mapping[str, Any]) -> bytes:
-        """The bytes of a message whose fields have these values; arrays of numbers may be of any shape.
+        """Encode a message from the values of its fields; arrays of numbers may be of any shape.
 
         Raises:
             KeyError: a field has no value.
@@ -80,10 +80,10 @@ class MessageType:
         return HEADER + out
 
     def decode(self, data: bytes | memoryview) -> dict[str, Any]:
-        """The fields of a message; arrays of numbers as flat read-only arrays.
+        """Decode the fields of a message; arrays of numbers as flat read-only arrays.
 
         Raises:
-            CdrError: the bytes are no such message.
+            CdrError: the bytes are no message of this type.
         """
         if bytes(data[: len(HEADER)]) != HEADER:
             raise CdrError(f"a {self.name} begins with {bytes(data[:4]).hex()}, expected {HEADER.hex()}")
@@ -110,7 +110,7 @@ class MessageType:
                     out += bytes(-len(out) % 4) + _LENGTH.pack(array.size)
                 elif array.size != count:
                     raise ValueError(f"{name} has {array.size} numbers, expected {count}")
-                if array.size:  # an empty sequence is followed by no filling of its own
+                if array.size:  # an empty sequence has no padding after its length
                     out += bytes(-len(out) % number.size) + array.tobytes()
 
     def _read(self, body: memoryview, at: int) -> tuple[dict[str, Any], int]:
@@ -137,7 +137,7 @@ class MessageType:
                 continue
             if length:
                 at += -at % number.size
-            # Which refuses to read beyond the end.
+            # frombuffer refuses to read beyond the end.
             values[name] = np.frombuffer(body, dtype, length, at) if length else np.empty(0, dtype)
             at += length * number.size
         return values, at
@@ -164,6 +164,6 @@ STD_HEADER: Final = MessageType("std_msgs/msg/Header", "builtin_interfaces/Time 
 
 
 def stamp(unix_ns: int) -> dict[str, int]:
-    """A time in [ns] since 1970 as the fields of TIME."""
+    """Convert a time in [ns] since 1970 to the fields of TIME."""
     sec, nanosec = divmod(unix_ns, 1_000_000_000)
     return {"sec": sec, "nanosec": nanosec}

@@ -1,4 +1,4 @@
-"""Recordings of scans, read from disk: CSV rows, or what the sinks npz: and mcap: wrote."""
+"""Recordings of scans, read from disk: CSV rows, or files of the sinks npz: and mcap:."""
 
 import csv
 import itertools
@@ -27,17 +27,17 @@ NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
 _NPZ_REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
 _NPZ_ORIGINS: Final = ("origin", "source")
-"""The latter of files that were written before there was the former."""
+"""Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""
 _NPZ_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
 
 MOST_CSV_BYTES: Final = 1 << 30
-"""Some eight hours of one sensor at 100 Hz."""
+"""Most bytes of a CSV: some eight hours of one sensor at 100 Hz."""
 LONGEST_CSV_LINE_BYTES: Final = 1 << 14
-"""Fifty times a row of counts."""
+"""Most bytes of a line: fifty times a row of counts."""
 MOST_NPZ_BYTES: Final = 1 << 31
-"""Of the arrays that are read: a day of one sensor at 100 Hz."""
+"""Most bytes of the arrays that are read: a day of one sensor at 100 Hz."""
 RATES_HZ: Final = (1e-3, 1e5)
-"""Beyond them periods in ns overflow, or are none."""
+"""Lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0."""
 
 
 def csv_header(taxel_count: int) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ def csv_header(taxel_count: int) -> tuple[str, ...]:
 
 CSV_HEADER: Final = csv_header(USPA44.taxel_count)
 _CSV_PADS: Final = {len(AXES) * pad.taxel_count: pad for pad in PADS}
-"""A CSV names no pad: the number of its columns does."""
+"""Pads by the number of columns of a CSV, which does not name its pad."""
 _META_NAME: Final = "meta_data.csv"
 _META_RATE: Final = "frequency_hz"
 _A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
@@ -55,7 +55,7 @@ _WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; its name's ending, .csv, .npz or .mcap, says which form.
+    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format.
 
     Raises:
         RecordingError: the file cannot be read, or is not a recording.
@@ -80,7 +80,7 @@ def _load_csv(path: Path) -> Recording:
     if header is None:
         _refuse(path, 1, "an empty file", "a header and rows of counts")
     pad = _pad_of_header(path, header)
-    values = array("i")  # a list of rows would take ten times the file
+    values = array("i")  # a list of rows would take ten times the memory of the file
     for line, row in enumerate(rows, 2):
         values.extend(_count_row(path, line, row, len(header)))
     if not values:
@@ -91,7 +91,7 @@ def _load_csv(path: Path) -> Recording:
 
 
 def _csv_rows(path: Path) -> Iterator[list[str]]:
-    """Row by row, each of one line."""
+    """Yield the rows, each from one line."""
     read_bytes = 0
     with path.open("rb") as file:
         for number in itertools.count(1):
@@ -111,7 +111,7 @@ def _csv_row(path: Path, number: int, line: bytes) -> list[str]:
         text = line.decode("utf-8-sig" if number == 1 else "utf-8")
     except UnicodeDecodeError as error:
         _refuse(path, number, f"byte {line[error.start]:#04x}", "UTF-8 text")
-    # A number cut short is still a number: only the line end shows that the last row is whole.
+    # A truncated number is still a number: only the line end shows that the last row is whole.
     if not text.endswith("\n"):
         _refuse(path, number, "a last line without its end", "a whole file: copy it again")
     try:
@@ -204,18 +204,18 @@ def _load_npz(path: Path) -> Recording:
 
 
 def _load_mcap(path: Path) -> Recording:
-    from firmware_bridge.recording.mcap_reader import load_mcap  # which loads the mcap package
+    from firmware_bridge.recording.mcap_reader import load_mcap  # imported here, since it loads the mcap package
 
     return load_mcap(path)
 
 
 def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
-    """What was subtracted from the first scan of each sensor of an npz, taken by the clock of the scans.
+    """Return the baselines of the first scan of each sensor of an npz, dated by the clock of the scans.
 
     Raises:
-        RecordingError: what stands there cannot be a baseline.
+        RecordingError: the values there cannot be a baseline.
     """
-    from firmware_bridge.zeroing.baseline import (  # which most who read a recording have no need of
+    from firmware_bridge.zeroing.baseline import (  # imported here, since most readers of a recording do not need it
         LAST_UNIX_S,
         Baseline,
     )

@@ -1,7 +1,7 @@
-"""Recordings in MCAP files, as the sink mcap: writes them; also of one that was killed while it wrote.
+"""Recordings in MCAP files, as the sink mcap: writes them; also if the sink was killed while it wrote.
 
-A file is a stranger's: records are taken one by one, none longer than a limit, and nothing is unpacked beyond its own.
-Only scans are kept; patterns are passed over, since they are made anew.
+A file is not trusted: records are read one by one, each up to a limit, and a chunk is unpacked up to its stated size.
+Only scans and baselines are kept; patterns are skipped, since they are computed again.
 """
 
 import json
@@ -41,11 +41,11 @@ from firmware_bridge.scans.scan import VendorReading, is_sensor_name
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_RECORD_BYTES: Final = 1 << 25
-"""Of one record, and of what a chunk unpacks to: writers make chunks of one to a few megabytes."""
+"""Most bytes of one record, and of a chunk when unpacked: writers make chunks of one to a few megabytes."""
 MOST_WINDOW_BYTES: Final = 1 << 25
-"""That zstd may look back."""
+"""Largest window of zstd, in bytes."""
 MOST_KEPT_BYTES: Final = 1 << 31
-"""Of the scans: a day of one sensor at 100 Hz."""
+"""Most bytes of the scans in memory: a day of one sensor at 100 Hz."""
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
 MOST_SHOWN_TOPICS: Final = 10
@@ -59,7 +59,7 @@ _BROKEN: Final = (
 
 
 class _DamageError(Exception):
-    """A record cannot be read, and what follows it in the file is not."""
+    """A record cannot be read, so the rest of the file is not read either."""
 
 
 class _CutOffError(_DamageError):
@@ -73,7 +73,7 @@ class _Topic(NamedTuple):
 
 @dataclass
 class _Lane:
-    """The scans of one sensor as they come, in columns: objects would take ten times as much."""
+    """Scans of one sensor in their order, in columns: objects would take ten times the memory."""
 
     counts: bytearray = field(default_factory=bytearray)
     numbers: "array[int]" = field(default_factory=lambda: array("q"))
@@ -84,10 +84,10 @@ class _Lane:
 
 
 def load_mcap(path: Path) -> Recording:
-    """Read an MCAP file; one without an end up to where it breaks off, which `notes` tell.
+    """Read an MCAP file; one without an end up to its last whole record, which `notes` then report.
 
     Raises:
-        RecordingError: it is none, or holds no scans that edge-sr recorded.
+        RecordingError: it is no MCAP file, or holds no scans that edge-sr recorded.
         OSError: the file cannot be read.
     """
     reading = _Reading(path)
@@ -113,14 +113,14 @@ class _Reading:
         self._baselines: dict[str, Baseline] = {}
         self._latest: dict[str, Baseline] = {}
         self._mountings: dict[str, Mounting] = {}
-        self._geometry = USPA44  # of files that name none
+        self._geometry = USPA44  # for files that name no geometry
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._notes: list[str] = []
         self._origin: Literal["device", "emulated"] | None = None
 
     def take(self, opcode: int, data: memoryview) -> None:
-        """One record, from a chunk or beside chunks."""
+        """Process one record, from a chunk or between chunks."""
         if opcode == Opcode.MESSAGE:
             self._take_message(data)
             return
@@ -206,7 +206,7 @@ class _Reading:
         if self._offset_ns is None:
             self._offset_ns = log_ns - scan.time_ns
         unix_ns = scan.time_ns + self._offset_ns
-        if not 0 <= unix_ns < LAST_STAMP_NS:  # which could be played, but not be recorded again
+        if not 0 <= unix_ns < LAST_STAMP_NS:  # such a scan could be played, but not recorded again
             raise RecordingError(
                 f"{self._path}: a scan of sensor {scan.sensor!r} at {unix_ns:,} ns since 1970, expected "
                 f"0..{LAST_STAMP_NS:,}"
@@ -239,11 +239,11 @@ class _Reading:
         self._latest[sensor] = baseline
 
     def broken_off(self, why: str) -> None:
-        """Keep what there is."""
+        """Keep the records so far and note that the file ends early."""
         self._notes.insert(0, f"{self._path} breaks off ({why}): its recording was killed, or the disk was full")
 
     def damaged(self, why: str, left_bytes: int) -> None:
-        """Keep what was before it."""
+        """Keep the records before the damage and note it."""
         self._notes.insert(0, f"{self._path} is damaged ({why}): {left_bytes:,} bytes behind that are not read")
 
     def recording(self) -> Recording:
@@ -267,7 +267,7 @@ class _Reading:
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
-    """Each record up to the end of the data, those in chunks one by one; lengths are held against the file's own."""
+    """Yield each record up to the end of the data, those in chunks one by one; lengths are checked by its size."""
     size_bytes = os.fstat(file.fileno()).st_size
     while True:
         at = file.tell()
@@ -347,7 +347,7 @@ def _track(sensor: str, lane: _Lane, geometry: SensorGeometry) -> Track:
 
 
 def _own(vendor: VendorReading) -> VendorReading:
-    """A copy: what came from a chunk would keep all of it."""
+    """Return a copy, since a view would keep the whole chunk in memory."""
     arrays = (vendor.newtons, vendor.temperature_k, vendor.ups_hz)
     return VendorReading(*(None if array is None else array.copy() for array in arrays))
 

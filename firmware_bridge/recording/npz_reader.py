@@ -1,4 +1,4 @@
-"""Arrays from users' npz files: nothing is unpickled, and nothing is allocated on a header's word alone."""
+"""Arrays from users' npz files: no pickle is loaded, and no memory is allocated by an unchecked header."""
 
 import io
 import struct
@@ -18,27 +18,27 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import NpzError
 
 LONGEST_READ_BYTES: Final = 1 << 20
-"""zipfile takes a table of contents in one piece, and of millions of empty members makes gigabytes. numpy reads arrays
-in pieces of 256 kB, or of one element: no text in an array can be longer than this either."""
+"""Most bytes of one read. zipfile reads a table of contents in one piece, and millions of empty members take gigabytes.
+numpy reads arrays in pieces of 256 kB, or of one element: so no text in an array can be longer than this either."""
 HIGHEST_CODE_POINT: Final = 0x10FFFF
 _SURROGATES: Final = (0xD800, 0xDFFF)
 _BROKEN: Final = (
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, TypeError, LookupError, OverflowError),
-    RuntimeError,  # encrypted, of an unknown compression, or nested too deep
-    *(SyntaxError, TokenError, MemoryError, Warning),  # what numpy's reader of the header lets through
+    RuntimeError,  # encrypted, with an unsupported compression, or nested too deep
+    *(SyntaxError, TokenError, MemoryError, Warning),  # errors that numpy's reader of the header passes on
 )
 _HEADERS: Final = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _COMPRESSIONS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""What numpy writes. zipfile unpacks others without a limit on what comes out of one piece."""
+"""Compressions that numpy writes. zipfile unpacks others without a limit on the output of one piece."""
 
 
 def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray[Any]]:
-    """The arrays of these names that are in the file; no others are looked at.
+    """Read the arrays of these names that are in the file; others are not read.
 
     Args:
-        path: of the file.
-        names: of the arrays.
-        most_bytes: that they may take together.
+        path: path of the file.
+        names: names of the arrays.
+        most_bytes: largest allowed size of them together, in bytes.
 
     Raises:
         NpzError: not an archive of plain arrays of numbers and text, damaged, or larger.
@@ -46,7 +46,7 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
     """
     try:
         with warnings.catch_warnings(), _ShortReads(io.FileIO(path)) as file, zipfile.ZipFile(file) as archive:
-            warnings.simplefilter("error")  # numpy mends headers of Python 2 and says so; a broken one looks like that
+            warnings.simplefilter("error")  # numpy repairs headers of Python 2 with a warning, also for broken ones
             members = {info.filename: info for info in archive.infolist()}
             wanted = {name: members[f"{name}.npy"] for name in names if f"{name}.npy" in members}
             total_bytes = sum(info.file_size for info in wanted.values())
@@ -61,7 +61,7 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
 
 
 class _ShortReads(io.BufferedReader):
-    """A file that refuses to give much in one piece."""
+    """File that refuses to read more than LONGEST_READ_BYTES in one piece."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > LONGEST_READ_BYTES:
@@ -84,7 +84,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
             raise NpzError(f"{info.filename} tells of {told_bytes} bytes and holds {held_bytes}: it is damaged")
     with archive.open(info) as entry:
         array = npy.read_array(entry, allow_pickle=False)
-        if entry.read(1):  # which at the end also checks the sum over it
+        if entry.read(1):  # reading to the end also verifies the checksum
             raise NpzError(f"{info.filename} holds more than its array: it is damaged")
     if dtype.kind == "U" and array.size and dtype.itemsize:
         points = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(dtype.byteorder))

@@ -1,4 +1,4 @@
-"""A scan and a baseline as messages: all that is needed to play a recording again, bit for bit. No I/O."""
+"""Messages of scans and baselines: all the data needed to play a recording again, bit for bit. No I/O."""
 
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -61,7 +61,7 @@ BASELINE: Final = baseline_type(USPA44.taxel_count)
 
 
 class RecordedScan(NamedTuple):
-    """What a message says of a scan, checked; numbers as `scan_type` has them."""
+    """Content of a scan message, checked; numbers as in `scan_type`."""
 
     sensor: str
     number: int
@@ -74,7 +74,7 @@ class RecordedScan(NamedTuple):
 
 
 def encode_scan(scan: Scan, unix_ns: int, fresh: int, renewed: int) -> bytes:
-    """A scan that came at `unix_ns` [ns] since 1970; `fresh` and `renewed` are its masks as numbers."""
+    """Encode a scan that came at `unix_ns` [ns] since 1970; `fresh` and `renewed` are its masks as numbers."""
     vendor = VendorReading() if scan.vendor is None else scan.vendor
     return scan_type(scan.fresh.size).encode(
         {
@@ -94,10 +94,10 @@ def encode_scan(scan: Scan, unix_ns: int, fresh: int, renewed: int) -> bytes:
 
 
 def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> RecordedScan:
-    """The scan in a message.
+    """Decode the scan in a message.
 
     Raises:
-        CdrError: it is none, or says what no scan says.
+        CdrError: it is no scan message, or a value is impossible.
     """
     said = scan_type(geometry.taxel_count).decode(data)
     sensor, number, fresh, renewed = said["sensor"], said["number"], said["fresh"], said["renewed"]
@@ -128,14 +128,14 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
 
 
 def encode_baseline(baseline: Baseline, age_s: float | None, unix_ns: int) -> bytes:
-    """A baseline that comes into use at `unix_ns` [ns] since 1970."""
+    """Encode a baseline that is used from `unix_ns` on, in [ns] since 1970."""
     return baseline_type(baseline.counts[0].size).encode(
         {
             "header": {"stamp": stamp(unix_ns), "frame_id": baseline.sensor},
             "sensor": baseline.sensor,
             "id": baseline.id,
             "origin": baseline.origin,
-            # A recording whose clock began later does not know: its age does.
+            # Without a valid date (the clock of a recording may begin later) the age dates it.
             "created_unix_s": baseline.created_unix_s if baseline.created_unix_s > 0 else np.nan,
             "scans": baseline.scans,
             "age_s": np.nan if age_s is None else age_s,
@@ -145,10 +145,10 @@ def encode_baseline(baseline: Baseline, age_s: float | None, unix_ns: int) -> by
 
 
 def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> Baseline:
-    """The baseline in a message, as of a file.
+    """Decode the baseline in a message, with the origin "file".
 
     Raises:
-        CdrError: it is none, or says what no baseline says.
+        CdrError: it is no baseline message, or a value is impossible.
     """
     said = baseline_type(geometry.taxel_count).decode(data)
     sensor, created_unix_s, scans = said["sensor"], said["created_unix_s"], said["scans"]
@@ -169,13 +169,13 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
 
 
 def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:
-    """A number as a (rows, cols) mask: bit i is taxel i, row-major from the top left."""
+    """Convert a number to a (rows, cols) mask: bit i is taxel i, row-major from the top left."""
     taxels = np.unpackbits(np.frombuffer(bits.to_bytes(8, "little"), np.uint8), bitorder="little")
     return taxels[: geometry.taxel_count].astype(bool).reshape(geometry.rows, geometry.cols)
 
 
 def _check_vendor(said: dict[str, Any]) -> None:
-    """Hold it to what is taken of the server itself; where there is no thermometer there is no temperature."""
+    """Check the vendor's values against the ranges for the server itself; NaN is a taxel without a thermometer."""
     newtons, kelvin, ups_hz = (said[name] for name in ("vendor_newtons", "vendor_temperature_k", "vendor_ups_hz"))
     right = bool((np.abs(newtons) <= HIGHEST_NEWTONS).all())
     _check(right, "vendor_newtons", "others", f"-{HIGHEST_NEWTONS:g}..{HIGHEST_NEWTONS:g}")

@@ -1,4 +1,4 @@
-"""A recording in memory: tracks of scans, one per sensor."""
+"""Recordings in memory: tracks of scans, one per sensor."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
     from firmware_bridge.zeroing.baseline import Baseline
 
 GEOMETRY_METADATA: Final = "geometry"
-"""Of an MCAP file: the pad of all its sensors."""
+"""Name of the MCAP metadata that holds the pad of all sensors."""
 MOUNTING_METADATA: Final = "mounting"
-"""The same: one a sensor."""
+"""Name of the MCAP metadata that hold the mounting of a sensor each."""
 SOURCE_METADATA: Final = "source"
-"""The same: what kind of source it was."""
+"""Name of the MCAP metadata that holds the kind of source."""
 HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64
-"""On one wire there can be sixteen."""
+"""Most sensors of a recording; one wire can have sixteen."""
 LAST_TIME_NS: Final = 1 << 60
-"""36 years: sums of two times stay below 2^63."""
+"""Latest time, in [ns] (36 years): sums of two times stay below 2^63."""
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """The scans of one sensor in a recording.
+    """Scans of one sensor in a recording.
 
     Attributes:
         sensor: name of the sensor.
         counts: (n, 3, rows, cols) int32, ABSENT where a taxel gave no reading.
         time_ns: (n,) int64 monotonic time of each scan in [ns], never falling; None if not recorded.
-        numbers: (n,) int64, as the scans were numbered; None if not recorded, as what follows.
-        device_time_ns: (n,) int64, on the same clock as `time_ns`; -1 where the device gave none.
-        renewed: (n, rows, cols) bool, which readings were new.
-        vendor: (n,) of what the vendor's software said.
-        pad: as the file names it; None if it does not.
+        numbers: (n,) int64 numbers of the scans; None if not recorded, as for the following ones.
+        device_time_ns: (n,) int64 device times on the clock of `time_ns`, in [ns]; -1 where the device had none.
+        renewed: (n, rows, cols) bool, True where a reading was new.
+        vendor: (n,) values of the vendor's software.
+        pad: pad that the file names; None if it does not.
     """
 
     sensor: str
@@ -55,12 +55,12 @@ class Track:
 
     @property
     def geometry(self) -> SensorGeometry:
-        """The pad, by its grid where the file does not name it."""
+        """Pad of the sensor, by its grid where the file does not name it."""
         return self.pad or pad_of(*self.counts.shape[2:])
 
     @property
     def mean_rate_hz(self) -> float | None:
-        """Scans a second by the recorded times, or None."""
+        """Mean rate by the recorded times, in [Hz]; None without times."""
         if self.time_ns is None or self.time_ns[-1] <= self.time_ns[0]:
             return None
         return (len(self.time_ns) - 1) * NS_PER_S / float(self.time_ns[-1] - self.time_ns[0])
@@ -68,18 +68,18 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One file's tracks, at least one, each with at least one scan.
+    """Tracks of one file, at least one, each with at least one scan.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         tracks: one per sensor, in the order in which they first occur.
-        rate_hz: scans a second of each sensor; None if the file does not say.
-        baselines: what was subtracted from the first scan of each sensor; without those that were not zeroed yet.
-        mountings: of the sensors, by name. The taxels are in place; what is to be done still is to turn the axes.
-        unix_offset_ns: added to `time_ns` gives [ns] since 1970; None if the file does not say.
-        notes: what whoever plays it should know.
-        origin: "device" or "emulated", what its scans come from, however often they were played and recorded again;
-            None if the file does not say.
+        rate_hz: rate of each sensor's scans, in [Hz]; None if the file does not state it.
+        baselines: baselines at the first scan of each sensor; without sensors that were not zeroed yet.
+        mountings: mountings of the sensors, by name. The taxels are in place; only the axes are still to be turned.
+        unix_offset_ns: offset from `time_ns` to [ns] since 1970; None if the file does not state it.
+        notes: remarks for the user who plays it.
+        origin: "device" or "emulated", the origin of its scans, however often they were played and recorded again;
+            None if the file does not state it.
     """
 
     path: Path
@@ -93,7 +93,7 @@ class Recording:
 
 
 def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:
-    """What scans come from whose file names these kinds of sources."""
+    """Return the origin of scans whose file names these kinds of sources, None if it is uncertain."""
     found = set(kinds)
     if "emulated" in found:
         return "emulated"

@@ -1,1 +1,1 @@
-"""Frames to taxel readings, readings to scans. No I/O, no clock."""
+"""Stages from frames to taxel readings, and from readings to scans. No I/O, no clock."""

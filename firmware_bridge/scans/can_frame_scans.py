@@ -1,4 +1,4 @@
-"""CAN frames to scans, for links that hand out frames. No I/O, no clock."""
+"""Stages from CAN frames to scans, for links that receive frames. No I/O, no clock."""
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, decode
@@ -8,10 +8,10 @@ from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 
 class FrameScans:
-    """CAN frames to scans, for links that hand out frames.
+    """Stages from CAN frames to scans, for links that receive frames.
 
     Attributes:
-        can_ids: the standard CAN ids that came so far, of whatever device.
+        can_ids: the standard CAN ids received so far, of any device.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
@@ -21,8 +21,8 @@ class FrameScans:
         self.can_ids: set[int] = set()
 
     def feed(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-        """Scans that a frame closes which arrived at `time_ns` [ns], and was on the bus at `device` if known."""
-        if not frame.extended:  # of these there are 2048 at most
+        """Return the scans closed by a frame that arrived at `time_ns` [ns]; `device` is its time stamp, if any."""
+        if not frame.extended:  # bounded: there are at most 2048 of these
             self.can_ids.add(frame.can_id)
         reading = decode(frame, self._model)
         if reading is None:
@@ -31,9 +31,9 @@ class FrameScans:
         return self._assembler.feed(reading, time_ns, device)
 
     def begin_anew(self) -> None:
-        """Give up what is half read, since the link was broken."""
+        """Discard open scans, since the link was broken."""
         self._assembler.begin_anew()
 
     def counters(self) -> dict[str, int]:
-        """Counters of the assembler; foreign: frames that are none of this model's taxels."""
+        """Return the counters of the assembler; foreign: frames of no taxel of this model."""
         return {"foreign": self._foreign} | self._assembler.counters()

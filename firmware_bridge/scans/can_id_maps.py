@@ -1,13 +1,13 @@
-"""CAN frames to taxel readings of XELA uSkin sensors. No I/O.
+"""Maps from CAN frames to taxel readings of XELA uSkin sensors. No I/O.
 
 One taxel per frame, eight bytes: byte 0 unused, X, Y, Z as unsigned big-endian 16 bit, byte 7
-unused. The unused bytes are not zero. Which id is which taxel depends on the controller's age:
+unused. The unused bytes are not zero. The id of a taxel depends on the controller's age:
 
     layout C (current)     id = SDA << 8 | taxel << 4 | controller
     layout A (2018-2019)   id = 0x700 | board << 4 | taxel         speaks only after a trigger
     layout B (early 2020)  id = board << 8 | n, n = 0..31          two sensors a board; trigger
 
-A sensor's label does not say which map is its own; with the wrong one, half of the taxels stay silent.
+A sensor's label does not show its map; with the wrong one, half of the taxels stay silent.
 """
 
 import struct
@@ -26,7 +26,7 @@ from firmware_bridge.geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
 PAYLOAD_BYTES: Final = 8
 CONTROLLERS: Final = range(16)
 SDAS: Final = 8
-"""Data lines that an id of layout C can name, and on each TAXELS_OF_SDA taxels."""
+"""Number of data lines that an id of layout C can name, with TAXELS_OF_SDA taxels on each."""
 TAXELS_OF_SDA: Final = 16
 BOARDS: Final = range(1, 8)
 _unpack_xyz = struct.Struct(">HHH").unpack_from
@@ -34,7 +34,7 @@ _unpack_packed = struct.Struct(">HxHHHx").unpack_from
 
 
 class Reading(NamedTuple):
-    """One taxel's raw counts; `taxel` counts row-major from the top left."""
+    """Raw counts of one taxel; `taxel` is its index, row-major from the top left."""
 
     sensor: str
     taxel: int
@@ -44,7 +44,7 @@ class Reading(NamedTuple):
 
 
 class Cycle(NamedTuple):
-    """A scan on the wire: of which sensor, its taxels in the order in which they come, and how to put them in place."""
+    """A scan on the wire: its sensor, its taxels in their order of arrival, and functions that put them in place."""
 
     sensor: str
     taxels: tuple[int, ...]
@@ -54,22 +54,22 @@ class Cycle(NamedTuple):
     pack: Callable[..., bytes]
 
     def counts(self, packed: bytes) -> NDArray[np.int32]:
-        """Of frames that `SlcanDecoder.cut` packed, stamped or not: (3, taxels), axes x, y, z; read-only."""
+        """Return the counts in frames that `SlcanDecoder.cut` packed, stamped or not: (3, taxels), read-only."""
         unpack = self.unpack if len(packed) == PACKED_BYTES * len(self.taxels) else self.unpack_stamped
-        # Integers one by one, and no array of numpy's before the last: on so few it is a third of the time, and where
-        # a processor slept since the scan before, what counts is how much code there is to fetch.
+        # Plain integers up to the last step: for so few it takes a third of numpy's time, and less code has to be
+        # fetched where the processor slept since the scan before.
         return np.frombuffer(self.pack(*self.in_place(unpack(packed))), dtype=np.int32).reshape(3, -1)
 
 
 @dataclass(frozen=True, slots=True)
 class ModelMap:
-    """Which CAN id is which taxel of which sensor.
+    """Map from CAN ids to the taxels of sensors.
 
     Attributes:
-        name: of the sensor model or layout.
-        geometry: of each sensor.
+        name: name of the sensor model or layout.
+        geometry: geometry of each sensor.
         taxels: CAN id -> (sensor, taxel).
-        triggered: the controller stays silent until it gets its `trigger_frame`.
+        triggered: True where the controller stays silent until it gets its `trigger_frame`.
     """
 
     name: str
@@ -82,11 +82,11 @@ class ModelMap:
             raise ValueError(f"{self.name} has {self.geometry.taxel_count} taxels, expected 1 to {MOST_TAXELS}")
 
     def wire_order(self, sensor: str) -> list[tuple[int, int]]:
-        """(CAN id, taxel) of one sensor in ascending id, which is the order of SDA, then taxel."""
+        """Return (CAN id, taxel) of one sensor by ascending id, which is the order of SDA, then taxel."""
         return sorted((can_id, taxel) for can_id, (name, taxel) in self.taxels.items() if name == sensor)
 
     def cycle(self, can_ids: Sequence[int]) -> Cycle | None:
-        """The sensor of which these ids are every taxel once, or None if they are anything else."""
+        """Return the cycle in which these ids are every taxel of a sensor once, None if they are not."""
         places = [self.taxels.get(can_id) for can_id in can_ids]
         names = {place[0] if place is not None else None for place in places}
         taxels = tuple(place[1] for place in places if place is not None)
@@ -105,7 +105,7 @@ class ModelMap:
 
 
 def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
-    """The reading in a frame, or None if the frame is not one of this model's."""
+    """Decode the reading in a frame, None if the frame is not one of this model's."""
     place = model.taxels.get(frame.can_id)
     if place is None or frame.extended or frame.remote or len(frame.data) != PAYLOAD_BYTES:
         return None
@@ -113,19 +113,19 @@ def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
 
 
 def decode_packed(packed: bytes, offset: int, model: ModelMap) -> Reading | None:
-    """The same of one frame that `SlcanDecoder.cut` packed, at `offset`."""
+    """Decode the reading in one frame at `offset` of frames that `SlcanDecoder.cut` packed."""
     id_and_length, x, y, z = _unpack_packed(packed, offset)
     place = model.taxels.get(id_and_length >> 4)
     return None if place is None else Reading(*place, x, y, z)
 
 
 def trigger_frames(model: ModelMap) -> list[CanFrame]:
-    """What wakes every board that a model's ids can name; each hears its own frame alone."""
+    """Return the trigger frames of all boards that a model's ids can name; each board obeys only its own."""
     return [trigger_frame(board) for board in BOARDS] if model.triggered else []
 
 
 def trigger_frame(board: int) -> CanFrame:
-    """The frame that starts a controller of layout A or B; `board` is 1..7."""
+    """Return the frame that starts a controller of layout A or B; `board` is 1..7."""
     if board not in BOARDS:
         raise ValueError(f"board is {board}, expected 1..7")
     return CanFrame(0x200 | board, bytes((0x07, 0x00)))
@@ -151,7 +151,7 @@ def layout_c(geometry: SensorGeometry) -> ModelMap:
 
 def _layout_c_xr1944() -> dict[int, tuple[str, int]]:
     # Two SDAs of two rows each. That its columns run from right to left too is inferred from
-    # uSPa44, the same board; nothing we know says so.
+    # uSPa44, the same board; no document confirms it.
     return {
         sda << 8 | taxel << 4 | controller: (str(controller), (sda * 2 + taxel // 4) * 4 + (3 - taxel % 4))
         for controller in CONTROLLERS
@@ -172,7 +172,7 @@ def _layout_b() -> dict[int, tuple[str, int]]:
 
 USPA44_MAP: Final = layout_c(USPA44)
 USPA46_MAP: Final = layout_c(USPA46)
-"""Its ids are the manual's; that its columns run from right to left too is inferred from uSPa44."""
+"""Map of uSPa46: ids from the manual; columns from right to left, as inferred from uSPa44."""
 XR1944_MAP: Final = ModelMap("XR1944", USPA44, MappingProxyType(_layout_c_xr1944()))
 LAYOUT_A_MAP: Final = ModelMap("layout A", USPA44, MappingProxyType(_layout_a()), triggered=True)
 LAYOUT_B_MAP: Final = ModelMap("layout B", USPA44, MappingProxyType(_layout_b()), triggered=True)
@@ -184,4 +184,4 @@ ID_MAPS: Final = {
     "A": LAYOUT_A_MAP,
     "B": LAYOUT_B_MAP,
 }
-"""The maps by the name a user gives."""
+"""Maps by the name that a user enters."""

@@ -1,28 +1,30 @@
-"""A device's time stamps on the host's clock. No I/O, no clock of its own.
+"""Conversion of a device's time stamps to the host's clock. No I/O, no clock of its own.
 
-A stamp tells when a frame was on the bus, an arrival when it was read: later by what adapter, bus and kernel took,
-which is never less than nothing. So the smallest difference of late is the best guess of how the two clocks lie to
-each other, and what goes beyond it is delay. Of late, since two quartzes part by milliseconds in a minute.
+A stamp is the time at which a frame was on the bus, an arrival the time at which it was read: later by the delay in
+adapter, bus and kernel, which is never negative. So the smallest recent difference is the best estimate of the offset
+between the two clocks, and the rest of a difference is delay. Only recent differences count, since two quartzes drift
+apart by milliseconds in a minute.
 """
 
 from typing import Final, NamedTuple
 
 WINDOW_NS: Final = 10_000_000_000
-"""The smallest difference is that of this window and the one before: clocks 100 ppm apart are 2 ms off after both."""
+"""Window of the smallest difference, with the one before: clocks 100 ppm apart are 2 ms off after both."""
 BACK_NS: Final = 4_000_000
-"""A stamp that falls back further is of a clock that was set or began anew; frames that change places, in a driver's
-queues, do by less than a millisecond. A wall clock that is set back between two frames by less than this and the
-pause between them goes unseen until the windows have passed: at 100 scans a second by 14 ms, and one scan then seems
-missing."""
+"""Largest step back of the stamps before the clock counts as set or restarted, in [ns].
+
+Frames that change places in a driver's queues step back by less than a millisecond. A wall clock set back between two
+frames by less than this plus the pause between them goes unnoticed until the windows have passed: at 100 scans a second
+by 14 ms, and one scan then seems missing."""
 
 
 class DeviceTime(NamedTuple):
-    """When something was on the bus.
+    """Time at which a frame was on the bus.
 
     Attributes:
-        host_ns: by the host's monotonic clock, in [ns], as well as is known by then.
-        own_ns: by the device's own, from any beginning, in [ns]: what pauses are measured by, since the guess how the
-            two clocks lie to each other may change between two stamps.
+        host_ns: time on the host's monotonic clock, in [ns], by the estimated offset at that moment.
+        own_ns: time on the device's clock, from any origin, in [ns]: pauses are measured by it, since the estimated
+            offset between the two clocks may change between two stamps.
     """
 
     host_ns: int
@@ -30,20 +32,20 @@ class DeviceTime(NamedTuple):
 
 
 class DeviceClock:
-    """Maps stamps of one device, which may wrap round, to the host's monotonic time.
+    """Map from stamps of one device, which may wrap round, to the host's monotonic time.
 
     Attributes:
-        restarts: how often the device's clock began anew.
-        begun_ns: monotonic time of the arrival by which the two clocks were first compared, since the last restart, in
-            [ns]; None before there is one. Had it lain unread, it would seem new nevertheless.
+        restarts: number of restarts of the device's clock.
+        begun_ns: monotonic time of the first arrival since the last restart, which set the offset, in [ns]; None before
+            it. That frame seems new even if it waited long to be read.
     """
 
     def __init__(self, tick_ns: int, wrap_ticks: int | None) -> None:
-        """Know nothing yet.
+        """Start without a stamp.
 
         Args:
-            tick_ns: of a stamp, in [ns].
-            wrap_ticks: stamps go from 0 to one less than this, then begin again; None if they never do.
+            tick_ns: duration of one tick of a stamp, in [ns].
+            wrap_ticks: number of ticks after which stamps begin at 0 again; None if they never do.
         """
         self.restarts = 0
         self.begun_ns: int | None = None
@@ -57,20 +59,20 @@ class DeviceClock:
         self._smallest_before_ns: int | None = None
 
     def host_ns(self, stamp: int, arrival_ns: int) -> int:
-        """The same as `at`, by the host's clock alone."""
+        """Return `at` on the host's clock alone, in [ns]."""
         return self.at(stamp, arrival_ns).host_ns
 
     def at(self, stamp: int, arrival_ns: int) -> DeviceTime:
-        """When a frame was on the bus; never later than it arrived.
+        """Return the time at which a frame was on the bus, never later than its arrival.
 
         Args:
-            stamp: the device's, in ticks.
+            stamp: time stamp of the device, in ticks.
             arrival_ns: monotonic time at which the frame was read, in [ns], never before that of the frame before.
         """
         stamp_ns = stamp * self._tick_ns
         step_ns = stamp_ns - self._stamp_ns
         if self._wrap_ns is not None:
-            # As many turns as bring it nearest to the time that went by here: a link may have been silent for hours.
+            # The number of wraps nearest to the time that passed on the host: a link may have been silent for hours.
             turns = round((arrival_ns - self._arrival_ns - step_ns) / self._wrap_ns)
             step_ns += turns * self._wrap_ns
         if self._smallest_ns is not None and step_ns < -BACK_NS:

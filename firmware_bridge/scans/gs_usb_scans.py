@@ -1,4 +1,4 @@
-"""What a gs_usb adapter sends to scans: the pure stages in a row. No I/O, no clock."""
+"""Stages from the bytes of a gs_usb adapter to scans. No I/O, no clock."""
 
 from typing import Final
 
@@ -11,11 +11,11 @@ from firmware_bridge.scans.scan import Scan
 
 TICK_NS: Final = 1_000
 WRAP_TICKS: Final = 1 << 32
-"""Microseconds in 32 bits: 71.6 minutes."""
+"""Ticks after which the 32-bit stamps wrap: 71.6 minutes of microseconds."""
 
 
 class GsUsbScans:
-    """Bytes to scans, over any number of starts of the adapter."""
+    """Stages from bytes to scans, over any number of starts of the adapter."""
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         self._scans = FrameScans(model)
@@ -24,17 +24,17 @@ class GsUsbScans:
         self._start_decoder(GsUsbDecoder(stamped=False))
 
     def begin_anew(self) -> None:
-        """Give up what is half read, since the link was broken."""
+        """Discard open scans, since the link was broken."""
         self._scans.begin_anew()
 
     def start(self, *, stamped: bool, channels: int) -> None:
-        """The adapter was started: what it had half sent is gone, and its clock may be another."""
+        """Begin with a new decoder and clock after a start of the adapter, which may have reset its clock."""
         self._decoder_counts = self._sum_decoder_counts()
         self._start_decoder(GsUsbDecoder(stamped=stamped, channels=channels))
         self._errors.restarted()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
-        """Scans that close within `data`, which arrived at `time_ns` [ns] of monotonic time."""
+        """Return the scans that close within `data`, which arrived at `time_ns` [ns] of monotonic time."""
         scans: list[Scan] = []
         for host_frame in self._decoder.feed(data):
             if host_frame.overflow:
@@ -54,20 +54,20 @@ class GsUsbScans:
         return self._clock.begun_ns
 
     def end_transfer(self) -> None:
-        """Give up a frame that is not whole: the next transfer begins with another."""
+        """Discard an incomplete frame: the next transfer begins with another one."""
         self._decoder.end_transfer()
 
     def trouble(self, time_ns: int) -> str | None:
-        """What the adapter reports at `time_ns` [ns] of monotonic time that the user must know of."""
+        """Return the trouble to report to the user at `time_ns` [ns] of monotonic time, None if there is none."""
         return self._errors.trouble(time_ns)
 
     @property
     def can_ids(self) -> set[int]:
-        """The standard CAN ids that came so far."""
+        """Standard CAN ids received so far."""
         return self._scans.can_ids
 
     def counters(self) -> dict[str, int]:
-        """Counters of all stages."""
+        """Return the counters of all stages."""
         return self._sum_decoder_counts() | self._errors.counters() | self._scans.counters()
 
     def _start_decoder(self, decoder: GsUsbDecoder) -> None:

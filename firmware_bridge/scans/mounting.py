@@ -1,8 +1,8 @@
-"""How a sensor sits where it is used: which of its taxels lies where, and which way its axes point.
+"""Mounting of a sensor where it is used: the places of its taxels, and the directions of its axes.
 
-Raw counts are put in their place where a scan is made, and stay raw; axes are turned, and gains evened out, where
-counts become deformation. So a record tells what the chips said, at the place where they lie. Forces that the vendor's
-software tells are never zeroed: their axes are turned at once.
+Raw counts are put in their place when a scan is made, and stay raw; axes are turned, and gains evened out, when
+counts become deformation. So a recording holds the raw counts of the chips, each at the place of its taxel. Forces
+from the vendor's software are never zeroed: their axes are turned at once.
 """
 
 from collections.abc import Mapping
@@ -19,24 +19,24 @@ from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.scan import Scan, VendorReading
 
 AS_MAPPED: Final = tuple(range(USPA44.taxel_count))
-"""The default order, of the default pad."""
+"""Default order of the default pad's taxels."""
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """How one sensor sits; by default as its id map says.
+    """Mounting of one sensor; by default that of its id map.
 
-    An order or gains that are left out, or empty, are those of the id map for so many taxels.
+    An order that is left out or empty is that of the id map; gains that are left out or empty are 1.
 
     Attributes:
-        order: of each place on the pad, row-major from the top left, the taxel of the id map that lies there.
-        swap_xy: the wire's x is the pad's y, and the other way round.
-        signs: 1 or -1 of x (to the right), y (down) and z (into the pad), after the swap.
-        gains: by which x, y and z of every place are multiplied, axis by axis, after the swap; 3 * taxels numbers.
-        taxel_count: of the sensor.
+        order: for each place on the pad, row-major from the top left, the taxel of the id map that lies there.
+        swap_xy: True where the wire's x is the pad's y, and the other way round.
+        signs: 1 or -1 for x (to the right), y (down) and z (into the pad), after the swap.
+        gains: factors on x, y and z of every place, axis by axis, after the swap; 3 * taxels numbers.
+        taxel_count: number of taxels of the sensor.
 
     Raises:
-        ValueError: one of these cannot be.
+        ValueError: one of these is invalid.
     """
 
     order: tuple[int, ...] = ()
@@ -58,34 +58,34 @@ class Mounting:
 
     @property
     def moves_taxels(self) -> bool:
-        """Some taxel lies elsewhere than its id map says."""
+        """True if some taxel lies elsewhere than in the id map."""
         return self.order != tuple(range(self.taxel_count))
 
     @property
     def evens_gains(self) -> bool:
-        """Some reading is multiplied by another number than 1."""
+        """True if some reading is multiplied by another number than 1."""
         return any(gain != 1 for gain in self.gains)
 
     @property
     def reverses_axes(self) -> bool:
-        """The pad's axes are others than the wire's, or point the other way."""
+        """True if the pad's axes differ from the wire's, or point the other way."""
         return self.swap_xy or self.signs != (1, 1, 1)
 
     @property
     def turns_axes(self) -> bool:
-        """Counts become deformation in another way than by the baseline alone."""
+        """True if counts become deformation by more than the baseline: turned axes or gains."""
         return self.reverses_axes or self.evens_gains
 
     def correct(self, deformation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Deformation (3, rows, cols), in place but along the wire's axes, as the pad's axes have it, in counts."""
+        """Turn deformation (3, rows, cols), in place but along the wire's axes, to the pad's axes, in [counts]."""
         turned = deformation[[1, 0, 2]] if self.swap_xy else deformation.copy()
         turned *= self._factors.reshape(turned.shape)
         return turned
 
     def place(self, scan: Scan) -> Scan:
-        """A scan of taxels in the order of the id map, as they lie on the pad; what the vendor says of it as well.
+        """Reorder a scan from the order of the id map to the places on the pad, the vendor's readings included.
 
-        Counts stay along the wire's axes; the vendor's newtons are given along the pad's, by its own calibration still.
+        Counts stay along the wire's axes; the vendor's newtons are turned to the pad's, still by its own calibration.
         """
         shape = scan.fresh.shape
         order = list(self.order)
@@ -97,7 +97,7 @@ class Mounting:
         return replace(scan, counts=counts, fresh=fresh, renewed=renewed, vendor=vendor)
 
     def then(self, found: "Mounting") -> "Mounting":
-        """This mounting, corrected by what was found of a sensor that had it already."""
+        """Return this mounting with a correction that was measured on a sensor already mounted by it."""
         order = np.asarray(self.order)[list(found.order)]
         swap = [1, 0, 2] if found.swap_xy else [0, 1, 2]
         signs = [self.signs[axis] * sign for axis, sign in zip(swap, found.signs, strict=True)]
@@ -131,11 +131,11 @@ class Mounting:
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting]) -> ModelMap:
-    """The same ids, for taxels where they lie: what costs little, since a scan is sorted by the map in any case.
+    """Return the id map with taxels at their places on the pad, at no cost: the map sorts every scan anyway.
 
     Args:
-        model: of the sensors as they are wired.
-        mountings: by sensor name; a sensor without one lies as the map says.
+        model: id map of the sensors as they are wired.
+        mountings: mountings by sensor name; a sensor without one keeps the order of the map.
     """
     place_of = {
         sensor: {taxel: place for place, taxel in enumerate(mounting.order)}

@@ -1,7 +1,7 @@
-"""What is known of the pad on a sensor: what it is made of, how thick it lies, how strongly its taxels read.
+"""Properties of the pad on a sensor: its material, its thickness, the gains of its taxels.
 
-Networks may ask for it, since one reading stands for another press on a thicker or harder pad. It turns no axis and
-corrects no record: that is the mounting's part.
+A network may take them as input, since the same reading means another press on a thicker or harder pad. They turn no
+axis and correct no recording: the mounting does.
 """
 
 from collections.abc import Mapping
@@ -24,29 +24,29 @@ PAD_RANGES: Final = MappingProxyType(
         "counts_per_newton": (1e-3, 1e6),
     }
 )
-"""The constants of a pad, in this order, and what each may be: wider than any pad, so that only slips are refused."""
+"""Constants of a pad, in this order, and their ranges: wider than for any pad, so that only slips are refused."""
 GAIN_RANGE: Final = (0.01, 100.0)
 GAINS: Final = len(AXES) * USPA44.taxel_count
-"""Numbers of the default pad's gains."""
+"""Number of gains of the default pad."""
 
 
 @dataclass(frozen=True)
 class Pad:
-    """The constants of one sensor's pad, each None where it is not known.
+    """Constants of one sensor's pad, each None where it is not available.
 
     Attributes:
-        thickness_mm: of the soft layer, in [mm].
-        shear_modulus_mpa: of its material, in [MPa].
+        thickness_mm: thickness of the soft layer, in [mm].
+        shear_modulus_mpa: shear modulus of its material, in [MPa].
         poisson: Poisson's ratio.
         in_plane_share: factor on the in-plane movement of the magnets.
-        magnet_height_mm: of the magnets' centres over the chips, in [mm].
+        magnet_height_mm: height of the magnets' centres over the chips, in [mm].
         counts_per_newton: summed z per [N].
-        intervals: lowest and highest of a constant, as whoever found it gives them; nothing is computed from them.
-        gains: how strongly each place reads on each axis, 1 where it reads as the others: x of all places row by row,
-            then y, then z, along the pad's axes. Networks that know gains get readings divided by them.
+        intervals: lowest and highest value of a constant by its measurement; nothing is computed from them.
+        gains: relative gain of each place on each axis, 1 where it reads as the others: x of all places row by row,
+            then y, then z, along the pad's axes. Networks that use gains get readings divided by them.
 
     Raises:
-        ValueError: one of these cannot be.
+        ValueError: one of these is invalid.
     """
 
     thickness_mm: float | None = None
@@ -79,12 +79,12 @@ class Pad:
 
     @property
     def constants(self) -> dict[str, float]:
-        """Those that are known, by name."""
+        """Available constants by name."""
         values = {name: getattr(self, name) for name in PAD_RANGES}
         return {name: value for name, value in values.items() if value is not None}
 
     def turned(self, found: Mounting) -> "Pad":
-        """The same pad under a mounting that was corrected by `found`: its gains go with the places and axes."""
+        """Return the same pad under a mounting that was corrected by `found`: its gains follow the places and axes."""
         if self.gains is None:
             return self
         gains = np.asarray(self.gains).reshape(len(AXES), -1)[[1, 0, 2] if found.swap_xy else [0, 1, 2]]

@@ -1,4 +1,4 @@
-"""A scan: one reading of all taxels of one sensor, and which of them are new."""
+"""A scan: one reading of all taxels of one sensor, with masks of the new ones."""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -9,25 +9,25 @@ from numpy.typing import NDArray
 from firmware_bridge.geometry import SensorGeometry
 
 ABSENT: Final = -1
-"""Stands where a taxel gave no reading in this scan; raw counts are unsigned, so no reading is -1."""
+"""Marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1."""
 
 
 LONGEST_SENSOR_NAME: Final = 64
 
 
 def is_sensor_name(name: str) -> bool:
-    """Whether a sensor may be called so: what a file says is shown, logged and written into others."""
+    """Return True if a name is valid for a sensor: names from files are shown, logged and written into others."""
     return name.isprintable() and 0 < len(name) <= LONGEST_SENSOR_NAME
 
 
 @dataclass(frozen=True, slots=True)
 class VendorReading:
-    """What the vendor's own software says beside the counts; None where it does not.
+    """Values that the vendor's software reports in addition to the counts; None where it does not.
 
     Attributes:
         newtons: (3, rows, cols) float32, axes x, y, z, in [N].
         temperature_k: (rows, cols) float32, in [K]; NaN where a taxel has no thermometer.
-        ups_hz: (rows, cols) float32, how often a second each taxel is renewed.
+        ups_hz: (rows, cols) float32, rate at which each taxel is renewed, in [Hz].
     """
 
     newtons: NDArray[np.float32] | None = None
@@ -41,26 +41,25 @@ class Scan:
 
     Attributes:
         sensor: name of the sensor on its link, such as the controller id "4".
-        number: counts the scans of this sensor from 0.
+        number: index of the scan, from 0 for each sensor.
         time_ns: monotonic time at which its newest reading arrived, in [ns].
         counts: (3, rows, cols) int32 raw counts, axes x, y, z; ABSENT where not fresh.
-        fresh: (rows, cols) bool, the taxel's reading arrived in this scan.
-        renewed: (rows, cols) bool, fresh and different from that taxel's reading before. Noise
+        fresh: (rows, cols) bool, True where the taxel's reading arrived in this scan.
+        renewed: (rows, cols) bool, True where it is fresh and differs from the taxel's reading before. Noise
             renews a live taxel almost surely, so a fresh taxel that is not renewed is most
             likely an old reading sent again.
-        device_ns: when its newest reading was on the bus or in the sensor's own hands, by the device's time stamps
-            mapped to monotonic time, in [ns]; None where it gives none. What `time_ns` is later is delay.
-        vendor: what the vendor's software says of the same moment; None of a link that reads the sensor itself.
-        unread_ns: it may have lain there for so long before it was read, in [ns], since nobody looked meanwhile; 0
-            where somebody did.
-        complete: every taxel's reading arrived.
-        whole: every taxel's reading arrived and is new: nothing is torn or repeated.
+        device_ns: time at which its newest reading was on the bus or in the sensor, by the device's time stamps mapped
+            to monotonic time, in [ns]; None without time stamps. The difference to `time_ns` is delay.
+        vendor: values of the vendor's software at the same moment; None for a link that reads the sensor itself.
+        unread_ns: longest time that it may have waited to be read, in [ns], since the link was not read meanwhile;
+            0 if the link was read.
+        complete: True if every taxel's reading arrived.
+        whole: True if every taxel's reading arrived and is new: nothing is torn or repeated.
         on_bus_ns: `device_ns`, or without one `time_ns`.
-        not_before_ns: monotonic time before which none of its readings was taken, as far as is known, in [ns]. By the
-            device's time stamps, or by when the link was last found empty: the first reading after an opening sets the
-            device's clock, and seems new where nobody read it for long.
-        vendor_force_n: force x, y, z on the pad in [N], by the vendor; None where it is not told, or holds for old
-            readings.
+        not_before_ns: estimated monotonic time before which no reading of it was taken, in [ns]. It follows from the
+            device's time stamps, and from the last time at which the link was empty: the first reading after an
+            opening sets the device's clock, and seems new even if it waited long to be read.
+        vendor_force_n: force x, y, z on the pad in [N], by the vendor; None if it is missing, or includes old readings.
     """
 
     sensor: str
@@ -79,8 +78,8 @@ class Scan:
     vendor_force_n: tuple[float, float, float] | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        # Found once: reader, perception and statistics all ask. On sixteen taxels numpy's all() costs ten times what
-        # looking for a byte does.
+        # Computed once, since reader, perception and statistics use them. For sixteen taxels numpy's all() takes ten
+        # times as long as a search for a byte.
         find, since_ns = object.__setattr__, self.time_ns - self.unread_ns
         find(self, "complete", False not in self.fresh.tobytes())
         find(self, "whole", False not in self.renewed.tobytes())
@@ -92,18 +91,18 @@ class Scan:
 
     @property
     def torn(self) -> bool:
-        """Some taxels are new and some are not, on the wire or at the source."""
+        """True if some taxels are new and some are not, on the wire or at the source."""
         renewed = self.renewed.tobytes()
         return (True in renewed and False in renewed) or not self.complete
 
     @property
     def repeated(self) -> bool:
-        """Every taxel arrived and none is new."""
+        """True if every taxel arrived and not one is new."""
         return self.complete and True not in self.renewed.tobytes()
 
 
 class ScanSeries:
-    """The scans of one sensor in their order: numbers them and tells new readings from old ones."""
+    """Sequence of the scans of one sensor: numbers them and separates new readings from old ones."""
 
     def __init__(self, sensor: str, geometry: SensorGeometry) -> None:
         self._sensor = sensor
@@ -120,14 +119,14 @@ class ScanSeries:
         *,
         whole: bool = False,
     ) -> Scan:
-        """The next scan.
+        """Return the next scan.
 
         Args:
             counts: (3, rows, cols), ABSENT where no reading came; kept and made read-only.
             time_ns: arrival of its newest reading, in [ns].
-            device_ns: of its newest reading, as in Scan.
-            vendor: what the vendor's software says of it.
-            whole: it is known to hold every taxel, which halves the cost.
+            device_ns: time of its newest reading, as in Scan.
+            vendor: values of the vendor's software.
+            whole: True if it certainly holds every taxel, which halves the cost.
         """
         if whole:
             fresh, renewed = self._all_fresh, np.logical_or.reduce(counts != self._last)

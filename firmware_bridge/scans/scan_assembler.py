@@ -1,13 +1,13 @@
-"""Taxel readings to scans. No I/O, no clock.
+"""Assembly of taxel readings to scans. No I/O, no clock.
 
 The wire has no end-of-scan marker. A scan closes when every taxel has come, or the last one of the sensor's cycle, or
-when what comes is of another cycle: after a pause, or where the order of the taxels has wrapped round (`wire_cycle`).
-Then it is torn. What cannot be put into a cycle is left out and counted (`resynchronised`): the rest of the cycle into
-which the link was opened, and fragments of fewer than half of the taxels that no pause set apart.
+when the next reading belongs to another cycle: after a pause, or where the order of the taxels has wrapped round
+(`wire_cycle`). Then it is torn. Readings of no certain cycle are left out and counted (`resynchronised`): the rest of
+the cycle into which the link was opened, and fragments of fewer than half of the taxels that no pause separates.
 
-What this cannot see: of a sensor that is read in bursts without time stamps no pause is seen. There the order alone
-tells, and where sixteen frames were lost in a row, or a multiple, one scan may join two cycles. And nothing closes
-while no reading comes: half a scan at the end of a stream is never given out.
+Limits: a sensor that is read in bursts without time stamps shows no pauses. There the order alone separates cycles, and
+where sixteen frames were lost in a row, or a multiple, one scan may join two cycles. And nothing closes while no
+reading comes: half a scan at the end of a stream is never returned.
 """
 
 from typing import Final
@@ -36,10 +36,10 @@ _COUNTED: Final[tuple[str, ...]] = (
 
 
 class ScanAssembler:
-    """Sorts readings into the scans of their sensors.
+    """Assembler of readings into the scans of their sensors.
 
     A sensor exists from its first whole scan on, or from its second in a row with half of the taxels or more: bits that
-    flip in ids must not invent a finger. (Half, because that is what the wrong model map shows.)
+    flip in ids must not create a sensor. (Half, because the wrong id map shows half of the taxels.)
 
     Memory: one open scan per sensor name; a ModelMap has at most 16 names.
     """
@@ -53,12 +53,12 @@ class ScanAssembler:
         self._sensors: dict[str, _Sensor] = {}
 
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-        """Scans that this reading closes.
+        """Return the scans that this reading closes.
 
         Args:
-            reading: of one taxel.
+            reading: reading of one taxel.
             time_ns: monotonic time of its arrival, in [ns].
-            device: when it was on the bus, by the device's time stamps.
+            device: time at which it was on the bus, by the device's time stamps.
         """
         self._readings += 1
         self._newest_ns = time_ns
@@ -69,34 +69,34 @@ class ScanAssembler:
         return sensor.feed(reading, time_ns, device)
 
     def longest_cycle_ns(self, cycle: Cycle) -> int:
-        """From first reading to last, in [ns], a cycle may be fed as one; 0: not at all, but reading by reading."""
+        """Return the longest time, in [ns], that a cycle fed as one may span; 0: feed its readings one by one."""
         sensor = self._sensors.get(cycle.sensor)
         if sensor is None or not sensor.awaits(cycle):
             return 0
         return sensor.wire.pause_ns if sensor.wire.gaps_ns is None else SHORTEST_PAUSE_NS
 
     def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None = None) -> Scan:
-        """The scan of a cycle that came as one, which `longest_cycle_ns` has said may be.
+        """Return the scan of a cycle that came as one, where `longest_cycle_ns` allows it.
 
         Args:
             cycle: its sensor, and the order of its taxels.
             packed: its frames, as `SlcanDecoder.cut` packs them.
             time_ns: monotonic time of its arrival, in [ns].
-            device: when its last frame was on the bus, by the device's time stamps.
+            device: time at which its last frame was on the bus, by the device's time stamps.
         """
         self._readings += len(cycle.taxels)
         self._newest_ns = time_ns
         return self._sensors[cycle.sensor].feed_cycle(cycle, packed, time_ns, device)
 
     def begin_anew(self) -> None:
-        """Give up open scans: the link broke, and what comes next does not belong to them."""
+        """Discard open scans: the link broke, and the next readings do not belong to them."""
         for sensor in self._sensors.values():
             sensor.begin_anew()
 
     def fewest_missing(self) -> int:
-        """Readings that must come at least before a scan can close whole.
+        """Return the number of readings that must come at least before a scan can close whole.
 
-        A sensor that a flipped bit invented, or that fell silent in mid-scan, closes none.
+        A sensor that a flipped bit created, or that fell silent in mid-scan, is left out: it closes no scan.
         """
         fewest = self._taxels + 1
         for sensor in self._sensors.values():
@@ -105,30 +105,30 @@ class ScanAssembler:
                 fewest = missing
         if fewest <= self._taxels:
             return fewest
-        # While the order of the only sensor is still to be learnt, too: its pauses are not to be slept through.
+        # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
         return 1 if any(not sensor.wire.order for sensor in self._sensors.values()) else self._taxels
 
     def counters(self) -> dict[str, int]:
-        """Sums over all sensors.
+        """Return the counters, summed over all sensors.
 
         readings; duplicates: the same frame twice in a row; unconfirmed: readings of sensors that do not exist (yet);
-        abandoned: of scans that a broken link left open; resynchronised: left out, since where their cycle begins or
-        ends was not known; scans; torn_wire: taxels missing; torn_source: complete, but only partly renewed; repeated:
+        abandoned: of scans that a broken link left open; resynchronised: left out, since the beginning or end of their
+        cycle was uncertain; scans; torn_wire: taxels missing; torn_source: complete, but only partly renewed; repeated:
         nothing renewed; missing_taxels.
         """
         totals = dict.fromkeys(_COUNTED, 0)
-        for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and find a sensor
+        for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and add a sensor
             for name, count in sensor.counts.items():
                 totals[name] += count
         return {"readings": self._readings} | totals
 
     def sensor_counters(self) -> dict[str, dict[str, int]]:
-        """The same counters apart for each sensor that exists."""
+        """Return the same counters for each sensor that exists, by name."""
         return {name: sensor.counts.copy() for name, sensor in list(self._sensors.items()) if sensor.confirmed}
 
 
 class _Sensor:
-    """The open scan of one sensor and its counters."""
+    """Open scan of one sensor, and its counters."""
 
     def __init__(self, name: str, geometry: SensorGeometry, order: list[int]) -> None:
         self.confirmed = False
@@ -154,7 +154,7 @@ class _Sensor:
         self.wire.begin_anew()
 
     def missing(self, now_ns: int) -> int | None:
-        """Return the readings until the open scan closes; one where that is not known: no pause is slept through.
+        """Return the number of readings until the open scan closes; 1 while the order is not learnt yet.
 
         None: the sensor does not exist, or has left its open scan unfinished.
         """
@@ -163,7 +163,7 @@ class _Sensor:
         return self._last_place - self._place if self.wire.order else 1
 
     def awaits(self, cycle: Cycle) -> bool:
-        """No scan is open, and the taxels of this one come in the sensor's order."""
+        """Return True if no scan is open, and the taxels of this cycle come in the sensor's order."""
         if self._taxels:
             return False
         if cycle is not self.wire.awaited:
@@ -188,8 +188,7 @@ class _Sensor:
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
         if self._last_cycle is not None:
             self._recall(*self._last_cycle)
-        # Twice the same frame in a row is the link's doing. Closing on it would tear a scan, and skipping it loses
-        # nothing.
+        # The link causes the same frame twice in a row. Closing on it would tear a scan, and skipping it loses nothing.
         if reading == self._last:
             self.counts["duplicates"] += 1
             return []
@@ -197,10 +196,10 @@ class _Sensor:
         wire, taxel = self.wire, reading.taxel
         if device is None or self._device is None:
             gap_ns = time_ns - self._newest_ns
-        else:  # by its own times our being late splits nothing
+        else:  # by the device's times, a late read splits no scan
             gap_ns = device.own_ns - self._device.own_ns
         paused = gap_ns > wire.pause_ns
-        # Our own being late would look like pauses; but while the order is to be learnt there is nothing else.
+        # Late reads would look like pauses, so arrivals count only while the order is to be learnt.
         if wire.gaps_ns is not None and (device is not None or not wire.order):
             wire.follow_gap(gap_ns)
         closed: list[Scan] = []
@@ -212,7 +211,7 @@ class _Sensor:
                 place = wire.places[taxel]
         if not self._taxels:
             self._opened_ns = time_ns
-            # At the first place of the order, behind another cycle's last, or, while there is no order, behind a pause.
+            # A cycle begins at the first place of the order, after another's last, or, without an order, after a pause.
             self._begins_known = self._begins_known or place == 0 if wire.order else paused
         self._taxels[taxel] = reading
         if place > self._place:
@@ -223,7 +222,7 @@ class _Sensor:
         return closed
 
     def _recall(self, cycle: Cycle, counts: NDArray[np.int32]) -> None:
-        """Make a reading of the last one of a cycle that was fed as one."""
+        """Restore the last reading of a cycle that was fed as one."""
         last = cycle.taxels[-1]
         self._last, self._last_cycle = Reading(cycle.sensor, last, *counts.reshape(3, -1)[:, last].tolist()), None
 

@@ -1,4 +1,4 @@
-"""slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
+"""Stages from slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
 
 from typing import Final
 
@@ -13,11 +13,11 @@ _MS_NS: Final = 1_000_000
 
 
 class SlcanScans:
-    """slcan text to scans: the three pure stages in a row.
+    """Stages from slcan text to scans: decoder, id map and assembler.
 
     Attributes:
-        decoder: the first of them, with what it has counted and what the adapter told of itself.
-        can_ids: the standard CAN ids that came so far, of whatever device.
+        decoder: the first stage, with its counters and the status that the adapter reported.
+        can_ids: the standard CAN ids received so far, of any device.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
@@ -33,11 +33,11 @@ class SlcanScans:
         self.can_ids: set[int] = set()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
-        """Scans that close within `data`, which arrived at `time_ns` [ns]."""
+        """Return the scans that close within `data`, which arrived at `time_ns` [ns]."""
         scans: list[Scan] = []
         for piece in self.decoder.cut(data):
             if isinstance(piece, CanFrame):
-                if not piece.extended:  # of these there are 2048 at most
+                if not piece.extended:  # bounded: there are at most 2048 of these
                     self.can_ids.add(piece.can_id)
                 self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
                 continue
@@ -58,7 +58,7 @@ class SlcanScans:
         return scans
 
     def begin_anew(self) -> None:
-        """Give up what is half read, since the link was broken; the adapter's clock may have begun anew, too."""
+        """Discard open scans, since the link was broken; the adapter's clock may have restarted as well."""
         self.decoder.begin_anew()
         self._assembler.begin_anew()
         self._clock, self._stamped = _millisecond_clock(), None
@@ -69,11 +69,11 @@ class SlcanScans:
         return self._clock.begun_ns
 
     def bytes_until_scan(self) -> int:
-        """How many bytes must come at least before a scan can close whole; from 1."""
+        """Return the number of bytes, from 1, that must come at least before a scan can close whole."""
         return max(1, self._assembler.fewest_missing() * self.decoder.usual_line_bytes - self.decoder.pending_bytes)
 
     def counters(self) -> dict[str, int]:
-        """Counters of all stages; foreign: frames that are none of this model's taxels."""
+        """Return the counters of all stages; foreign: frames of no taxel of this model."""
         return self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
 
     def _feed_reading(self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan]) -> None:
@@ -85,7 +85,7 @@ class SlcanScans:
             )
 
     def _feed_cycle(self, packed: bytes, frame_bytes: int, time_ns: int) -> Scan | None:
-        """The scan of a sensor's whole cycle; None where this is none, or one of readings before is still open."""
+        """Return the scan of a sensor's whole cycle; None if this is no whole cycle, or a scan is still open."""
         can_ids = packed[::frame_bytes] + packed[1::frame_bytes]
         if can_ids not in self._cycles:
             if len(self._cycles) >= _MOST_ORDERS:  # frames of two sensors mix in many orders
@@ -95,20 +95,20 @@ class SlcanScans:
             self.can_ids.update(order)
             self._cycles[can_ids] = self._model.cycle(order)
         cycle = self._cycles[can_ids]
-        # Before its last stamp is looked at: a clock that is told of the first ones after it seems to be set back.
+        # Checked before the last stamp is read: a clock that gets earlier stamps after it counts as set back.
         longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle)
         if cycle is None or not longest_ns:
             return None
         if frame_bytes == PACKED_BYTES:
             return self._assembler.feed_cycle(cycle, packed, time_ns)
         first_ms, last_ms = int.from_bytes(packed[frame_bytes - 2 : frame_bytes]), int.from_bytes(packed[-2:])
-        # Read late and in one piece, half a cycle from before a pause and half from behind look like a whole one.
+        # Read late and in one piece, half a cycle from before a pause and half from after it look like a whole one.
         if (last_ms - first_ms) % (LAST_TIMESTAMP_MS + 1) * _MS_NS > longest_ns:
             return None
         return self._assembler.feed_cycle(cycle, packed, time_ns, self._device_time(last_ms, time_ns))
 
     def _device_time(self, stamp_ms: int, time_ns: int) -> DeviceTime:
-        # Of sixteen frames that come together three have stamps of their own: a scan takes 2 ms on the bus.
+        # Sixteen frames that come together have about three different stamps: a scan takes 2 ms on the bus.
         if (stamp_ms, time_ns) != self._stamped:
             self._stamped = stamp_ms, time_ns
             self._device = self._clock.at(stamp_ms, time_ns)

@@ -1,17 +1,17 @@
-"""Messages of the vendor's server to readings. No I/O, no clock.
+"""Decoder from messages of the vendor's server to readings. No I/O, no clock.
 
 A message is a JSON object: `message`, a number that counts up, or "Welcome"; `time` of sending, in [s] of the server's
-clock; and under "1", "2", ... what the server last heard of each sensor, new or not: `data`, the counts x, y, z of one
-taxel after the other, row by row from the top left. Versions differ:
+clock; and under "1", "2", ... the last reading of each sensor, new or not: `data`, the counts x, y, z of one taxel
+after the other, row by row from the top left. Versions differ:
 
     1.7.6   data "8197,829A,..."       hexadecimal
-    1.7.7   data [33175, 33434, ...]   and "welcome" as `type` of every message, so that `type` tells nothing
+    1.7.7   data [33175, 33434, ...]   and "welcome" as `type` of every message, so that `type` has no use
     1.8.0   data hexadecimal, and the same as `integer`
 
-`ups`, how often a second a taxel is renewed, is the sign of life, and with it that `time` of a sensor moves on.
-`calibrated` (in newtons), `temp` (in kelvin) and `ups` are absent, null or zeros where the server does not know.
+`ups`, the updates a second of a taxel, is the sign of life, together with a `time` of the sensor that moves on.
+`calibrated` (in newtons), `temp` (in kelvin) and `ups` are absent, null or zeros where the server has no value.
 
-Nothing of what comes is trusted: a message that cannot be used is counted by what is wrong with it, never raised.
+No content is trusted: a message that cannot be used is counted by its error, and nothing is raised.
 """
 
 import json
@@ -27,16 +27,16 @@ from firmware_bridge.geometry import USPA44, SensorGeometry
 
 HIGHEST_COUNT: Final = 0xFFFF
 LONGEST_MESSAGE_BYTES: Final = 1 << 18
-"""Sixteen sensors say all they can in a third of it."""
+"""Most bytes of a message: sixteen sensors with every field take a third of it."""
 MOST_SENSORS: Final = 16
 HIGHEST_UPS_HZ: Final = 10_000.0
 HIGHEST_NEWTONS: Final = 1000.0
 KELVIN: Final = (200.0, 500.0)
 LATEST_S: Final = 1e11
-"""Of a time since 1970, in [s]: what is beyond is no time."""
+"""Latest valid time, in [s] since 1970."""
 WELCOME: Final = "Welcome"
 PRETENDED_VERSION: Final = "_emulated"
-"""Ends the version of a server of ours, so that nobody takes it for the vendor's."""
+"""Suffix of an emulated server's version, which separates it from the vendor's."""
 _HEX_WORDS: Final = re.compile("[0-9A-Fa-f]{1,4}(?:,[0-9A-Fa-f]{1,4})*,?").fullmatch
 _COUNTED: Final[tuple[str, ...]] = (
     "messages",
@@ -57,15 +57,15 @@ _COUNTED: Final[tuple[str, ...]] = (
 
 
 class ServerReading(NamedTuple):
-    """What the server last heard of one sensor.
+    """Last reading of one sensor in the server.
 
     Attributes:
-        sensor: the server's number for it, such as "1".
+        sensor: number of the sensor in the server, such as "1".
         counts: (3, taxels) int32, axes x, y, z.
-        ups_hz: how often a second each taxel is renewed; None where not told.
-        newtons: (3, rows, cols) float32, by the vendor's calibration; None where not told.
-        temperature_k: (rows, cols) float32, in [K], NaN where not told; None where of no taxel.
-        acquired_s: when it was read from the sensor, in [s] of the server's clock; None where not told.
+        ups_hz: rate at which each taxel is renewed, in [Hz]; None if not reported.
+        newtons: (3, rows, cols) float32, by the vendor's calibration, in [N]; None if not reported.
+        temperature_k: (rows, cols) float32, in [K], NaN where not reported; None if not reported for any taxel.
+        acquired_s: time at which it was read from the sensor, in [s] of the server's clock; None if not reported.
     """
 
     sensor: str
@@ -77,7 +77,7 @@ class ServerReading(NamedTuple):
 
 
 class ServerMessage(NamedTuple):
-    """One message. `sequence` is None only of a welcome and of what is bad; `sent_s` is of the server's clock."""
+    """One message. `sequence` is None only for a welcome and a bad message; `sent_s` is by the server's clock."""
 
     kind: Literal["welcome", "readings", "bad"]
     sequence: int | None = None
@@ -87,10 +87,10 @@ class ServerMessage(NamedTuple):
 
 
 class ServerDecoder:
-    """Understands messages one by one, whatever the server's version.
+    """Decoder of single messages, of any version of the server.
 
     Attributes:
-        foreign: sensors that are not of this geometry, by name: what the server says they are.
+        foreign: descriptions by the server of sensors that are not of this geometry, by name.
     """
 
     def __init__(self, geometry: SensorGeometry = USPA44) -> None:
@@ -99,7 +99,7 @@ class ServerDecoder:
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
     def decode(self, text: str | bytes) -> ServerMessage:
-        """What one message says.
+        """Decode one message.
 
         Args:
             text: the message, as text or in UTF-8.
@@ -125,11 +125,12 @@ class ServerDecoder:
         return ServerMessage("readings", sequence, self._time_s(told.get("time")), version, found)
 
     def counters(self) -> dict[str, int]:
-        """Messages and what was wrong with them.
+        """Return the counts of messages and of their errors.
 
-        messages; welcomes; without_readings: that name no sensor; too_long; bad_json; duplicate_keys; bad_sequence: no
-        number that tells the order; of sensors: bad_sensor: not its counts; foreign_sensor: of another geometry;
-        disagreeing: `integer` is not `data`, which wins; bad_ups, bad_calibrated, bad_temperature, bad_time: left out.
+        messages; welcomes; without_readings: no sensor named; too_long; bad_json; duplicate_keys; bad_sequence: no
+        valid sequence number. For sensors: bad_sensor: no valid counts; foreign_sensor: of another geometry;
+        disagreeing: `integer` differs from `data`, which wins; bad_ups, bad_calibrated, bad_temperature, bad_time:
+        left out.
         """
         return dict(self._counted)
 
@@ -177,7 +178,7 @@ class ServerDecoder:
         )
 
     def _counts(self, data: object, integer: object) -> list[int] | None:
-        """Of `data`, which every version has, and where that cannot be used of `integer`."""
+        """Decode the counts from `data`, which every version has, or from `integer` where `data` cannot be used."""
         size = 3 * self._geometry.taxel_count
         of_data = _from_hex(data, size) if isinstance(data, str) else _whole_numbers(data, size)
         if integer is None and of_data is not None:
@@ -223,7 +224,7 @@ class ServerDecoder:
 
 
 class _DuplicateError(ValueError):
-    """A key is there twice, and no one can say which of both is meant."""
+    """A key is there twice, so its value is ambiguous."""
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -258,7 +259,7 @@ def _whole_numbers(told: object, size: int) -> list[int] | None:
 
 
 def _numbers(told: object, size: int) -> Sequence[float] | None:
-    """So many finite numbers; True is none, although Python counts it as one."""
+    """Return a list of `size` finite numbers, None if it is not one; True is no number here, unlike in Python."""
     if not isinstance(told, list) or len(told) != size or not set(map(type, told)) <= {int, float}:
         return None
     try:

@@ -1,17 +1,18 @@
-"""Readings of the vendor's server to scans. No I/O, no clock.
+"""Stage from readings of the vendor's server to scans. No I/O, no clock.
 
-The server sends what it has at its own pace, old readings again, and readings of a taxel with older ones of its
-neighbours: 507 messages a second were seen of a sensor that renewed seven taxels meanwhile. So its pace says nothing. A
-taxel has come anew if its counts are others than before, or if it is due by `ups`: then it was renewed, to the same
-counts. A scan closes when all have come that are renewed about as often as most; then it holds the newest of each.
+The server sends its readings at its own pace, old ones again, and the reading of a taxel with older ones of its
+neighbours: 507 messages a second were observed for a sensor that renewed seven taxels meanwhile. So its pace has no
+meaning. A taxel has been renewed if its counts have changed, or if it is due by `ups`: then it has the same counts
+again. A scan closes once every taxel has been renewed that is renewed about as often as most; then it holds the newest
+reading of each.
 
-- A still pad gives scans as often as `ups` says, repeated ones if it has no noise. A loose cable gives none, as on the
-  wire, however long the server goes on telling of the last reading: a taxel is absent while its `ups` is 0, and all are
-  while the sensor's time stands still; a sensor of which nothing came for so long is in trouble. Where either is said
-  of all taxels and their counts go on changing, the server does not know, and the usual `ups` stands for what is 0.
-- Where a message brings most taxels, it is of one cycle, and the others in it are taken as repeated: noise does that
-  now and then, and waiting for them would cost a cycle.
-- Within a cycle nothing tells which readings belong together; those of slow servers are of two cycles, as on the wire.
+- A still pad gives scans at the rate of `ups`, repeated ones if it has no noise. A loose cable gives no scan, as on the
+  wire, however long the server repeats the last reading: a taxel is absent while its `ups` is 0, and all are while the
+  sensor's time stands still; a sensor without a reading for so long is in trouble. Where the server reports either for
+  all taxels and their counts go on changing, its report is wrong, and the usual `ups` replaces the zeros.
+- A message that renews most taxels belongs to one cycle, and the others in it count as repeated: noise does that now
+  and then, and waiting for them would cost a cycle.
+- Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles, as on the wire.
 """
 
 from collections import deque
@@ -28,23 +29,23 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.silence import SERVER_READING_OLD_NS
 
 USUAL_UPS_HZ: Final = 83.0
-"""By the vendor's data sheet; for a server that does not tell."""
+"""Rate of a taxel by the vendor's data sheet, for a server that does not report it."""
 DUE_PERIODS: Final = 1.5
-"""A taxel that comes taxel by taxel comes in less, where anything of it is new; and none is given up for one late."""
+"""Periods after which an unchanged taxel counts as renewed where taxels come one by one; changed ones come earlier."""
 DUE_IN_CYCLE_PERIODS: Final = 0.5
 SLOW_SHARE: Final = 0.5
-"""Of the median `ups`: a taxel renewed less often is not waited for."""
+"""Share of the median `ups` below which a scan does not wait for a taxel."""
 STALE_NS: Final = 150_000_000
-"""A reading older by this than usual of its server when it arrives is counted; more than what a clock may be set back
-unseen."""
+"""Age beyond the server's usual one at which an arriving reading counts as stale, in [ns]; more than a clock may be set
+back unnoticed."""
 USUAL_AGE_SCANS: Final = 50
-"""The least age of so many, when sent, is usual: a server was seen whose every reading is .3 s old by then."""
+"""Number of scans whose least age when sent is the usual age: one observed server sends every reading .3 s old."""
 MANY_STALE: Final = 50
-"""More stale scans than others by so many are told of, until the others have made up for it."""
+"""Surplus of stale scans over others at which the lag is reported, until the others have made up for it."""
 LONGEST_AGE_S: Final = 60.0
-"""Of a reading when it is sent; beyond, or below zero, the server's clock was set meanwhile."""
+"""Longest age of a reading when it is sent, in [s]; a longer or negative one means that the server's clock was set."""
 FARTHEST_BACK: Final = 32
-"""So many rising numbers in a row below the highest are no late ones but a new count."""
+"""Rising numbers in a row below the highest after which they are a new count and no late messages."""
 MOST_MISSED: Final = 100_000
 _TICK_NS: Final = 1000
 _COUNTED: Final[tuple[str, ...]] = (
@@ -58,7 +59,7 @@ _COUNTED_BY_SENSOR: Final[tuple[str, ...]] = ("scans", "torn_wire", "torn_source
 
 
 class ServerScans:
-    """Messages in, scans out, for all sensors of one server."""
+    """Stage from messages to scans, for all sensors of one server."""
 
     def __init__(self, geometry: SensorGeometry = USPA44) -> None:
         self.version = ""
@@ -73,12 +74,12 @@ class ServerScans:
 
     @property
     def foreign(self) -> dict[str, str]:
-        """Sensors that cannot be used, by name: what the server says they are."""
+        """Descriptions by the server of sensors that cannot be used, by name."""
         return self._decoder.foreign
 
     @property
     def trouble(self) -> str | None:
-        """What a user must know of the server and its sensors; None while all is well."""
+        """Trouble of the server and its sensors to report to the user, None if there is none."""
         wanted = f"expected {self._geometry.taxel_count}"
         told = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
         silent = [name for name, sensor in self._sensors.items() if sensor.silent]
@@ -90,11 +91,11 @@ class ServerScans:
 
     @property
     def any_sensor(self) -> bool:
-        """A sensor that can be used has been heard."""
+        """True if a sensor that can be used has sent a reading."""
         return bool(self._sensors)
 
     def begin(self) -> None:
-        """Meet the server anew, as after a connection: its count, its clock and its readings are others."""
+        """Begin again with the server, as after a connection: its count, its clock and its readings are new."""
         self._sequence: int | None = None
         self._may_begin = True
         self._late_ones: list[int] = []
@@ -103,7 +104,7 @@ class ServerScans:
             sensor.begin()
 
     def feed(self, text: str | bytes, arrival_ns: int) -> list[Scan]:
-        """Scans that this message closes.
+        """Return the scans that this message closes.
 
         Args:
             text: one message.
@@ -135,11 +136,11 @@ class ServerScans:
         return scans
 
     def counters(self) -> dict[str, int]:
-        """Those of the decoder and of what came of it.
+        """Return the counters of the decoder and of the scans.
 
         repeated_messages and reordered_messages were dropped; missed_messages: numbers that never came;
-        server_restarts: the count began anew; stale_scans: a reading was older by STALE_NS than usual when it arrived;
-        and as of every link scans, torn_wire, torn_source, repeated and missing_taxels.
+        server_restarts: the count restarted; stale_scans: a reading was older by STALE_NS than usual when it arrived;
+        and as for every link scans, torn_wire, torn_source, repeated and missing_taxels.
         """
         totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
         for sensor in list(self._sensors.values()):
@@ -156,7 +157,7 @@ class ServerScans:
         self._lags = self._more_stale > (0 if self._lags else MANY_STALE)
 
     def _in_order(self, sequence: int) -> bool:
-        """Whether the message is the next that counts; keeps where the count stands."""
+        """Return True if the message is the next in order, and update the count."""
         last = self._sequence
         if last is None:
             self._take(sequence)
@@ -186,7 +187,7 @@ class ServerScans:
 
 
 class _ServerSensor:
-    """What came of one sensor, and which of its taxels have come since its last scan."""
+    """Readings of one sensor, and the taxels renewed since its last scan."""
 
     def __init__(self, name: str, geometry: SensorGeometry) -> None:
         self.counted: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
@@ -202,18 +203,18 @@ class _ServerSensor:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what came: of a server that begins anew everything is new, but for a reading that it still has."""
+        """Forget the readings: after a restart of the server all are new, except one that it still holds."""
         self._counts: NDArray[np.int32] | None = None
         self._come = np.zeros(self._geometry.taxel_count, dtype=bool)
         self._come_ns = np.zeros(self._geometry.taxel_count, dtype=np.int64)
 
     def look(self, now_ns: int) -> None:
-        """Whether anything came of late."""
+        """Update `silent`: True if no taxel was renewed for too long."""
         self._heard_ns = now_ns if self._heard_ns is None else self._heard_ns
         self.silent = now_ns - self._heard_ns > SERVER_READING_OLD_NS
 
     def feed(self, reading: ServerReading, arrival_ns: int, device_ns: int | None, *, old: bool = False) -> Scan | None:
-        """The scan that a reading closes; `old` of one that was so already when it was sent."""
+        """Return the scan that a reading closes, None if it closes no scan; `old` marks one that was old when sent."""
         still = self._stands_still(reading, arrival_ns)
         device_ns = None if still else device_ns
         ups_hz = self._rates_hz(reading, arrival_ns, old=old or still)
@@ -238,13 +239,13 @@ class _ServerSensor:
         return self._close(np.where(self._come, reading.counts, ABSENT), arrival_ns, device_ns, self._vendor(reading))
 
     def _rates_hz(self, reading: ServerReading, arrival_ns: int, *, old: bool) -> NDArray[np.float64]:
-        """How often a second each taxel is renewed; 0 of all that are said to be dead, unless their counts change.
+        """Return the rate of each taxel, in [Hz]; 0 for all that the server reports dead, unless their counts change.
 
-        A server that does not know says 0 as well.
+        A server without the rates reports 0 as well.
         """
         told = reading.ups_hz is not None and any(reading.ups_hz)
         said_dead = old or (reading.ups_hz is not None and not told)
-        # From one such message to the next: the first one may bring a last reading.
+        # Compared between two such messages in a row: the first one may bring a last reading.
         if said_dead and self._said_dead and self._counts is not None and (reading.counts != self._counts).any():
             self._belied_ns = arrival_ns
         self._said_dead = said_dead
@@ -253,7 +254,7 @@ class _ServerSensor:
         return np.array(reading.ups_hz) if told else self._usual_hz
 
     def _stands_still(self, reading: ServerReading, arrival_ns: int) -> bool:
-        """The server tells of the same reading for so long, whatever its clock says of its age."""
+        """Return True if the server has repeated a reading for too long, whatever its age by the server's clock."""
         if reading.acquired_s is None:
             return False
         if reading.acquired_s != self._acquired_s:
@@ -281,9 +282,9 @@ class _ServerSensor:
 
 
 def _age_ns(reading: ServerReading, message: ServerMessage) -> int | None:
-    """How old a reading was when it was sent, by the server's clock alone; None where that cannot be.
+    """Return the age of a reading when sent, by the server's clock alone, in [ns]; None if it is missing or impossible.
 
-    So only the sending needs to be mapped to the clock here, and an old reading is seen even where every one is old.
+    So only the time of sending is mapped to the host's clock, and old readings are detected even if all are old.
     """
     if message.sent_s is None or reading.acquired_s is None:
         return None

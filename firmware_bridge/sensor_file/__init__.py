@@ -1,1 +1,1 @@
-"""The sensor file."""
+"""Sensor file: its model, its reader and its writer."""

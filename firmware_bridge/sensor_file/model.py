@@ -1,6 +1,6 @@
-"""The sensor file: what was found of a sensor when it was put to work, in TOML that a person can read and mend.
+"""Model of the sensor file: the properties of a sensor from its setup, in TOML that a person can read and edit.
 
-Here is what it tells, and the reading of it; `sensor_file_text` writes it.
+This module holds its content and its reading; `toml_writer` writes it.
 """
 
 import tomllib
@@ -39,24 +39,25 @@ from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, Baseline
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1
 MOST_BYTES: Final = 1 << 16
-"""A sensor takes 2 kB."""
+"""Most bytes of a sensor file; a sensor takes 2 kB."""
 LONGEST_LINE_BYTES: Final = 2048
-"""Twice a line of all gains. Python's reader takes time that grows with the square of a key's dots: 60 kB took 27 s."""
+"""Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
+took 27 s."""
 PARTS: Final = ("mounting", "force", "baseline")
-"""Of an entry: what can be assumed, or be of an emulated sensor."""
+"""Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
 
 
 @dataclass(frozen=True)
 class SensorEntry:
-    """What is known of one sensor.
+    """Properties of one sensor.
 
     Attributes:
-        mounting: how it sits.
+        mounting: mounting of the sensor.
         counts_per_newton: its summed z per [N].
-        baseline: what its free pad reads.
-        pad: the pad itself.
-        assumed: which of PARTS nobody has looked at.
-        emulated: which of PARTS were found of an emulated sensor.
+        baseline: counts of its free pad.
+        pad: constants of the pad.
+        assumed: those of PARTS that were never measured.
+        emulated: those of PARTS that were measured on an emulated sensor.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -69,13 +70,13 @@ class SensorEntry:
 
 @dataclass(frozen=True)
 class SensorFile:
-    """What one file tells.
+    """Content of one sensor file.
 
     Attributes:
-        model: name of the id map, one of ID_MAPS unless `own_map` is given.
-        adapter: serial number of the USB adapter, where it is known.
-        sensors: by sensor name.
-        own_map: an id map that is none of ID_MAPS, of a program's own pad; no file holds it.
+        model: name of the id map, one of ID_MAPS unless there is an `own_map`.
+        adapter: serial number of the USB adapter; None if it is not available.
+        sensors: entries by sensor name.
+        own_map: id map outside ID_MAPS, for a program's own pad; files cannot hold it.
     """
 
     model: str = USPA44_MAP.name
@@ -85,38 +86,38 @@ class SensorFile:
 
     @property
     def mountings(self) -> dict[str, Mounting]:
-        """How each sensor sits, by name."""
+        """Mountings by sensor name."""
         return {name: entry.mounting for name, entry in self.sensors.items()}
 
     @property
     def orders(self) -> dict[str, tuple[int, ...]]:
-        """In which order taxels lie, by name of the sensors whose were put elsewhere than the id map says."""
+        """Orders of the taxels by sensor name, for sensors that differ from the id map."""
         return {name: one.order for name, one in self.mountings.items() if one.moves_taxels}
 
     @property
     def model_map(self) -> ModelMap:
-        """The id map."""
+        """Id map of the sensors."""
         return ID_MAPS[self.model] if self.own_map is None else self.own_map
 
     @property
     def geometry(self) -> SensorGeometry:
-        """The pad of each sensor."""
+        """Geometry of each sensor's pad."""
         return self.model_map.geometry
 
     @property
     def baselines(self) -> dict[str, Baseline]:
-        """The baselines there are, by sensor name."""
+        """Available baselines by sensor name."""
         return {name: entry.baseline for name, entry in self.sensors.items() if entry.baseline is not None}
 
     @property
     def counts_per_newton(self) -> dict[str, float]:
-        """Summed z per [N] where it is known, by sensor name."""
+        """Summed z per [N] by sensor name, where it is available."""
         known = {name: entry.counts_per_newton for name, entry in self.sensors.items()}
         return {name: counts for name, counts in known.items() if counts is not None}
 
     @property
     def pads(self) -> dict[str, Pad]:
-        """The pads that are known, by sensor name."""
+        """Available pads by sensor name."""
         return {name: entry.pad for name, entry in self.sensors.items() if entry.pad is not None}
 
 
@@ -124,7 +125,7 @@ def load_sensor_file(path: str | Path) -> SensorFile:
     """Read a sensor file.
 
     Raises:
-        SensorFileError: the file cannot be read, or says something that cannot be; the key is named.
+        SensorFileError: the file cannot be read, or a value is invalid; the message names the key.
     """
     path = Path(path)
     try:

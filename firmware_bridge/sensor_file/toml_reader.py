@@ -1,4 +1,4 @@
-"""Tables of the sensor file, read strictly: a key that is misspelt must not be one that is not there."""
+"""Tables of the sensor file, read strictly: a misspelt key must not count as a missing one."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -8,12 +8,12 @@ from typing import Any, Final, NoReturn
 from firmware_bridge.errors import SensorFileError
 
 LARGEST: Final = 1e12
-"""Of any number here; a whole number can have more digits than any float."""
+"""Largest magnitude of a number in the file; a whole number can have more digits than any float."""
 REMEDY: Final = "mend it, or write it anew with edge-sr doctor --out"
 
 
 class Table:
-    """One table of the file, whose keys are taken one by one; at the end none may be left."""
+    """One table of the file, whose keys are taken one by one; `end` refuses any left over."""
 
     def __init__(self, path: Path, name: str, values: Mapping[str, Any]) -> None:
         self._path = path
@@ -22,7 +22,7 @@ class Table:
         self._known: list[str] = []
 
     def take(self, key: str, read: Callable[[Any], Any], *, required: bool = True) -> Any:
-        """The value of a key; `read` raises ValueError with what it expected. None where it may be left out."""
+        """Return the value of a key, None if an optional one is missing; errors of `read` state what it expected."""
         self._known.append(key)
         if key not in self._values:
             return self.refuse(key, "missing", "it to be there") if required else None
@@ -33,25 +33,25 @@ class Table:
             return self.refuse(key, _shown(value), str(error))
 
     def end(self) -> None:
-        """Refuse what was not taken."""
+        """Refuse keys that were not taken."""
         for key in self._values:
             self.refuse(key, "not known", f"one of {', '.join(self._known)}")
 
     def refuse(self, key: str, got: str, expected: str) -> NoReturn:
-        """Say of a key what was got, what was expected and what to do."""
+        """Raise the error of a key, with its value, the expected one and the remedy."""
         raise SensorFileError(f"{self._path}, '{self._name}{key}': {got}, expected {expected}: {REMEDY}")
 
 
 def _shown(value: Any) -> str:
     try:
         text = json.dumps(value, default=str)
-    except ValueError:  # of hexadecimal digits there may be more than decimal ones can be written
+    except ValueError:  # a hexadecimal number can have too many digits for decimal text
         return "a number of too many digits"
     return text[:60] + "..." * (len(text) > 60)
 
 
 def one_of(*values: str | int) -> Callable[[Any], Any]:
-    """One of these, of its type."""
+    """Return a reader that accepts one of these values, of its type."""
 
     def read(value: Any) -> Any:
         for one in values:
@@ -63,49 +63,49 @@ def one_of(*values: str | int) -> Callable[[Any], Any]:
 
 
 def text_value(value: Any) -> str:
-    """A text that can be shown."""
+    """Read a printable text."""
     if not isinstance(value, str) or not value or not value.isprintable():
         raise ValueError("a text of printable characters")
     return value
 
 
 def a_table(value: Any) -> dict[str, Any]:
-    """A table, whose keys are looked at by a Table of their own."""
+    """Read a table, whose keys a Table of its own checks."""
     if not isinstance(value, dict):
         raise ValueError("a table")
     return value
 
 
 def sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
-    """Tables of sensors."""
+    """Read the tables of the sensors."""
     if not isinstance(value, dict) or not value or not all(isinstance(one, dict) for one in value.values()):
         raise ValueError("a table for each sensor, such as [sensors.4]")
     return value
 
 
 def truth(value: Any) -> bool:
-    """True or false."""
+    """Read true or false."""
     if not isinstance(value, bool):
         raise ValueError("true or false")
     return value
 
 
 def whole(value: Any) -> int:
-    """A whole number from 1."""
+    """Read a whole number from 1."""
     if type(value) is not int or value < 1:
         raise ValueError("a whole number from 1")
     return value
 
 
 def positive(value: Any) -> float:
-    """A number above 0, as it is written."""
+    """Read a number above 0, in its written type."""
     if not is_number(value) or value <= 0:
         raise ValueError("a positive number")
-    return value  # not as a float: a baseline's id tells 1000 from 1000.0
+    return value  # not as a float: a baseline's id differs between 1000 and 1000.0
 
 
 def between(low: float, high: float) -> Callable[[Any], float]:
-    """A number of this range, both ends included, as it is written."""
+    """Return a reader that accepts a number in this range, both ends included, in its written type."""
 
     def read(value: Any) -> float:
         if not is_number(value) or not low <= value <= high:
@@ -116,7 +116,7 @@ def between(low: float, high: float) -> Callable[[Any], float]:
 
 
 def flat_cells(value: Any, shape: tuple[int, ...], expected: str) -> list[Any]:
-    """Lists in lists of this shape, flat."""
+    """Flatten nested lists of this shape."""
     if not isinstance(value, list) or len(value) != shape[0]:
         raise ValueError(expected)
     if len(shape) == 1:
@@ -125,5 +125,5 @@ def flat_cells(value: Any, shape: tuple[int, ...], expected: str) -> list[Any]:
 
 
 def is_number(value: Any) -> bool:
-    """A number that can be reckoned with."""
+    """Return True for a number of at most LARGEST in magnitude."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST

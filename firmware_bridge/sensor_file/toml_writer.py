@@ -1,6 +1,6 @@
-"""Writing the sensor file, as text of our own making.
+"""Writer of the sensor file, which formats the text itself.
 
-A pad's numbers then lie in the file as they lie on the pad, and the comments say what they are.
+So a pad's numbers have the same arrangement in the file as on the pad, and comments explain them.
 """
 
 import json
@@ -27,11 +27,11 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 
 def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
-    """Write a sensor file in place; one that is there stays as NAME.bak.
+    """Write a sensor file in place; an existing one stays as NAME.bak.
 
     Raises:
-        SensorFileError: the file cannot be written, or would hold no sensor, a baseline with a silent taxel, or a pad
-            of a program's own.
+        SensorFileError: the file cannot be written, or would hold no sensor, a baseline with a silent taxel, or a
+            program's own id map.
     """
     path = Path(path)
     if not sensor_file.sensors:
@@ -144,7 +144,7 @@ def _baseline_lines(baseline: Baseline) -> list[str]:
 
 
 def _grid_lines(start: str, values: Sequence[int | float], cols: int) -> list[str]:
-    """A grid row by row, without its last bracket."""
+    """Format a grid row by row, without its last bracket."""
     texts = [repr(value) for value in values]
     width = max(map(len, texts))
     indent = " " * (len(start) - len(start.lstrip()) + 4)

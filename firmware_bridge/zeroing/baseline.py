@@ -1,4 +1,4 @@
-"""Zeroing: what a free pad reads, and how far a scan is from it. Counts live on a circle of 2^16."""
+"""Zeroing: the baseline of a free pad, and the difference of a scan to it. Counts wrap round at 2^16."""
 
 import hashlib
 import json
@@ -35,9 +35,9 @@ Origin = Literal["start-up", "demand", "file"]
 FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
 MOST_FILE_BYTES: Final = 1 << 20
-"""A sensor takes about 2 kB."""
+"""Most bytes of a baseline file; a sensor takes about 2 kB."""
 LAST_UNIX_S: Final = 1e11
-"""The year 5138: a larger number is no time, and one of hundreds of digits no float."""
+"""Latest valid time, in [s] since 1970 (the year 5138)."""
 _FILE_REMEDY: Final = "zero again and save a new file"
 
 Orders = Mapping[str, Sequence[int]]
@@ -46,16 +46,16 @@ _AS_WIRED: Final[Orders] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """The counts of a sensor's free pad.
+    """Baseline of one sensor: the counts of its free pad.
 
     Attributes:
         sensor: name of the sensor.
-        counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent. What is subtracted: `id`
-            stands for them as they were taken, `moved` adds what has drifted since.
-        created_unix_s: when it was taken, in [s] since 1970.
-        scans: how many scans it is the median of.
+        counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent. These are subtracted:
+            `id` identifies them as they were taken, `moved` adds the drift since.
+        created_unix_s: time at which it was taken, in [s] since 1970.
+        scans: number of scans whose median it is.
         origin: taken at this start-up, or later on demand, or loaded from a file.
-        id: short text that stands for sensor, counts and time.
+        id: short text that identifies sensor, counts and time.
     """
 
     sensor: str
@@ -67,12 +67,12 @@ class Baseline:
 
     @classmethod
     def from_counts(cls, sensor: str, counts: NDArray[np.integer], created_unix_s: float) -> Self:
-        """The median of whole scans, with no question whether the pad was free and still.
+        """Return the median of whole scans, without a check that the pad was free and still.
 
         Args:
             sensor: name of the sensor.
             counts: (n, 3, rows, cols) raw counts of complete scans, n > 0.
-            created_unix_s: when they were taken, in [s] since 1970.
+            created_unix_s: time at which they were taken, in [s] since 1970.
 
         Raises:
             ValueError: no scan, or a taxel is absent.
@@ -91,18 +91,18 @@ class Baseline:
         scans: int,
         origin: Origin,
     ) -> Self:
-        """A baseline of known counts (3, rows, cols), with its id."""
+        """Return a baseline of counts (3, rows, cols), with its id."""
         own = np.array(counts, dtype=np.float32)
         own.setflags(write=False)
         digest = hashlib.sha256(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
         return cls(sensor, own, created_unix_s, scans, origin, digest.hexdigest()[:8])
 
     def age_s(self, now_unix_s: float) -> float:
-        """How old it is at `now_unix_s`, in [s]."""
+        """Return its age at `now_unix_s`, in [s]."""
         return now_unix_s - self.created_unix_s
 
     def moved(self, drift_counts: NDArray[np.floating]) -> Self:
-        """The same baseline, under its id, for a pad that has drifted by (3, rows, cols) in [counts] since."""
+        """Return the same baseline, with its id, for a pad that has drifted by (3, rows, cols) in [counts] since."""
         counts = ((self.counts + drift_counts.astype(np.float64)) % COUNTS_ON_CIRCLE).astype(np.float32)
         counts.setflags(write=False)
         return replace(self, counts=counts)
@@ -111,21 +111,21 @@ class Baseline:
 def deformation(
     scan_counts: NDArray[np.integer], baseline: Baseline, mounting: Mounting | None = None
 ) -> NDArray[np.float32]:
-    """How far a scan is from the free pad, the short way round the circle.
+    """Return the difference of a scan to the baseline, the short way round the circle of counts.
 
     Args:
         scan_counts: (3, rows, cols) raw counts.
-        baseline: of the same sensor.
-        mounting: which way its axes point, and its gains; None where they are as wired.
+        baseline: baseline of the same sensor.
+        mounting: directions of its axes, and its gains; None where they are as wired.
 
     Returns:
         (3, rows, cols) signed counts in -32768..32768; NaN where a taxel is absent.
     """
     half = COUNTS_ON_CIRCLE // 2
-    # float32 holds halves exactly up to 2^23, so nothing is rounded here.
+    # float32 holds halves exactly up to 2^23, so this does not round.
     signed = scan_counts.astype(np.float32)
     signed -= baseline.counts
-    if not (signed.min() >= -half and signed.max() < half):  # beyond half a turn, or a taxel not zeroed: hardly ever
+    if not (signed.min() >= -half and signed.max() < half):  # rare: beyond half a turn, or a taxel that is not zeroed
         signed += half
         signed %= COUNTS_ON_CIRCLE
         signed -= half
@@ -135,11 +135,11 @@ def deformation(
 
 
 class BaselineEstimator:
-    """Takes the baseline of one sensor from its scans, or says why it cannot.
+    """Estimator of the baseline of one sensor from its scans.
 
-    It refuses a pad that moves while zeroing, and one that is loaded if a reference tells how it
-    reads when free. A load that lies on the pad from the first scan to the last, with no reference, cannot
-    be told from a free pad: then it is zeroed away. A load that leaves every taxel within
+    It refuses a pad that moves while zeroing, and one that is loaded if a reference holds its counts
+    when free. A load that lies on the pad from the first scan to the last, with no reference, looks like
+    a free pad, and becomes part of the baseline. A load that leaves every taxel within
     LOAD_LIMIT_COUNTS of the reference passes as drift.
     """
 
@@ -152,9 +152,9 @@ class BaselineEstimator:
         """Start with no scan.
 
         Args:
-            min_scans: complete scans with something new in them that a baseline takes, at least 3.
+            min_scans: number of complete scans with a new reading that a baseline takes, at least 3.
             reference: an earlier baseline of this sensor.
-            clock: gives the time in [s] since 1970.
+            clock: returns the time in [s] since 1970.
         """
         if min_scans < 3:
             raise ValueError(f"min_scans is {min_scans}, expected at least 3")
@@ -166,16 +166,16 @@ class BaselineEstimator:
 
     @property
     def scans(self) -> int:
-        """How many scans it has so far."""
+        """Number of scans so far."""
         return len(self._taken)
 
     def push(self, scan: Scan, silent: NDArray[np.bool_] | None = None) -> Baseline | None:
-        """Take one more scan; the baseline once there are enough.
+        """Add one more scan, and return the baseline once there are enough.
 
         Args:
-            scan: of the sensor.
-            silent: taxels (rows, cols) that are given up: a scan is complete without them, the baseline NaN there. What
-                was given up once stays so until there is a baseline, or one that comes and goes would put it off for
+            scan: next scan of the sensor.
+            silent: taxels (rows, cols) that are left out: a scan is complete without them, the baseline NaN there. A
+                taxel left out once stays so until there is a baseline, since an intermittent one would delay it for
                 ever.
 
         Raises:
@@ -184,7 +184,7 @@ class BaselineEstimator:
         if silent is not None and silent.any():
             self._silent = silent.copy() if self._silent is None else self._silent | silent
         silent = self._silent
-        # A scan sent again is no second sample, and would hide a spread.
+        # A repeated scan is no second sample, and would hide a spread.
         complete = scan.complete if silent is None else bool((scan.fresh | silent).all())
         if not complete or not scan.renewed.any():
             return None
@@ -207,12 +207,12 @@ class BaselineEstimator:
 
 
 def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orders = _AS_WIRED) -> None:
-    """Write baselines, one per sensor, as one JSON file, in place; one that is there stays as NAME.bak.
+    """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
 
     Args:
-        path: of the file.
+        path: path of the file.
         baselines: one per sensor.
-        orders: of each sensor whose taxels were put elsewhere than its id map says, in which order they lie.
+        orders: order of the taxels of each sensor whose mounting differs from its id map.
 
     Raises:
         ValueError: two baselines of one sensor.
@@ -248,12 +248,12 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
     """Read baselines, by sensor.
 
     Args:
-        path: of the file.
-        orders: in which order taxels lie now, as `save_baselines` has it.
+        path: path of the file.
+        orders: present order of the taxels, as in `save_baselines`.
 
     Raises:
         RecordingError: the file cannot be read, or is no baseline file, was changed by hand, or its taxels lay in
-            another order, so that each would get another one's rest.
+            another order, so that each would get the baseline of another one.
     """
     path = Path(path)
     try:
@@ -292,7 +292,7 @@ def _unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
 
 def _refuse_motion(counts: NDArray[np.int32]) -> None:
     moved = _unwrapped(counts)
-    # Percentiles, not the range: a single reading far off is a known quirk of the sensor, not a motion.
+    # Percentiles, not the range: the sensor has single readings far off, which are no motion.
     spread = np.percentile(moved, 95, axis=0) - np.percentile(moved, 5, axis=0)
     limits = np.asarray(SPREAD_LIMIT_COUNTS)[:, None, None]
     worst = _worst(spread / limits)
@@ -308,7 +308,7 @@ def _refuse_motion(counts: NDArray[np.int32]) -> None:
 
 def _refuse_load(baseline: Baseline, reference: Baseline) -> None:
     z = len(AXES) - 1
-    # A taxel that either knows no rest of says nothing of a load.
+    # A taxel that is missing in either baseline is no evidence of a load.
     known = np.where(np.isnan(baseline.counts), 0, baseline.counts)
     load = deformation(np.rint(known).astype(np.int32) % COUNTS_ON_CIRCLE, reference)
     load[np.isnan(baseline.counts) | np.isnan(reference.counts)] = 0

@@ -1,17 +1,16 @@
-"""Drift of a free pad, followed while nothing touches it.
+"""Tracking of a free pad's drift while nothing touches it.
 
-A press is local, drift is common: of thousands of simulated taps none moves the median taxel without moving another
-by more than that again, on z, and by twice that on x and y; a warming pad moves all taxels alike but for a quarter, the
-earth's field all but for their gains. So what is common to all taxels is followed fast, what is a taxel's own only as
-far as a share of the common explains it, and beyond that at a creep. Whatever a taxel does beyond that is a touch, long
-before it is a tap, and stops it all.
+A press is local, drift is common: every one of thousands of simulated taps that moves the median taxel moves another
+taxel by more than that again on z, and by twice that on x and y; a warming pad moves all taxels alike within a quarter,
+the earth's field moves all taxels alike except for their gains. So the drift common to all taxels is followed fast, a
+taxel's own drift as far as a share of the common drift explains it, and beyond that very slowly. A larger change of a
+taxel is a touch, long before it is a tap, and stops the tracking.
 
-It is done in blocks of half a second: a scan costs next to nothing, and a median neither hears noise nor a reading far
-off. A block counts once the next one was free, too: what a contact begins with is not followed.
+The tracker works in blocks of half a second: a scan costs very little, and a median suppresses noise and single
+outliers. A block counts once the next one was free as well: the beginning of a contact is not followed.
 
-A press so slow and so even that it is drift by all of this cannot be told from drift, and is eaten. Simulated taps that
-grow to 1500 counts of summed z in 10 s lose .2 % where they are of middling evenness and 4 % where they are the most
-even of all; in 30 s 14 and 44 %.
+A press so slow and even that it meets all these criteria is followed as drift, and lost. Simulated taps that grow to
+1500 counts of summed z in 10 s lose .2 % at medium evenness and 4 % at the highest evenness; in 30 s 14 and 44 %.
 """
 
 from dataclasses import dataclass
@@ -26,42 +25,43 @@ from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 BLOCK_NS: Final = 500_000_000
 SAMPLE_NS: Final = 25_000_000
-"""Between scans of a block: twenty are enough for a median that is off by a third of the noise, and cost a fifth."""
+"""Time between the scans of a block, in [ns]: twenty give a median within a third of the noise, at a fifth the cost."""
 FEWEST_SCANS: Final = 8
-"""In a block, which lasts longer for it where scans are rare."""
+"""Least number of scans in a block, which lasts longer where scans are rare."""
 GAP_NS: Final = 5_000_000_000
-"""Without a scan, after which the pad may be another one, or the same elsewhere."""
+"""Time without a scan after which the pad may have been replaced or moved, in [ns]."""
 REST_BLOCKS: Final = 4
-"""Two seconds of stillness before anything is followed, and before a rest level is compared: the pad has recovered from
-all but the last hundredth of a press by then, and a robot that taps every few seconds still leaves so much."""
+"""Still blocks (two seconds) before drift is followed or a rest level compared: the pad has recovered from all but a
+hundredth of a press by then, and a robot that taps every few seconds still leaves that much time."""
 COMMON_PER_S: Final = 20.0
-"""Of what is common to all taxels, on each axis: 1000 counts in a minute, more than the field has shown, and more."""
+"""Highest rate of the common drift that is followed, per axis, in [counts/s]: 1000 counts a minute and more, above any
+drift on record."""
 COMMON_COUNTS: Final = 50.0
-"""The most by which all taxels may be ahead of what is followed: a pad turned over in the earth's field moves by twice
-its 18 counts; twice that margin is still half of what makes a contact. More at once is a touch."""
+"""Largest common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by
+twice its 18 counts; at this limit the summed z is still half of a contact's."""
 OWN_SHARE: Final = 0.65
-"""A taxel's own drift to the common one: a quarter of the mean taxel's is the spread of it, so that twice that may be
-six tenths of the median taxel's. A press has above one."""
+"""Largest own drift of a taxel as a share of the common drift: its spread is a quarter of the mean taxel's drift, so
+twice that can be six tenths of the median taxel's. A press has a share above one."""
 OWN_PER_S: Final = 0.05
-"""Of what is a taxel's own beyond that share: 3 counts a minute. There is no figure in the field that asks for more,
-and what it eats of a touch before that is seen is a count or so."""
+"""Highest rate of a taxel's own drift beyond that share, in [counts/s]: 3 counts a minute. No measured drift needs
+more, and a touch loses about a count before it is detected."""
 TOUCH_COUNTS: Final = 10.0
-"""By which a taxel may be ahead of the common drift: .01 N on it, nine times the noise of a block at its loudest."""
+"""Largest change of a taxel ahead of the common drift that is no touch: .01 N, nine times a block's highest noise."""
 RATE_S: Final = 2.0
-"""Over which the rate of the common drift is smoothed: a taxel's share of it must not be a share of noise."""
+"""Time over which the rate of the common drift is smoothed, in [s]: a taxel's share of it must not be one of noise."""
 NOISE_PER_S: Final = 0.2
-"""Rate that noise makes: four of its deviations."""
+"""Rate that noise causes, in [counts/s]: four of its standard deviations."""
 SLOW_PER_S: Final = 1.0
-"""Common drift by which a taxel that may be touched is not followed on its own."""
+"""Rate of the common drift, in [counts/s], up to which a taxel's own drift is not followed while one may be touched."""
 STILL_COUNTS: Final = 7.0
-"""By which blocks of a pad at rest differ: the loudest known noise is 4.7 counts, that of two blocks' change 1.6."""
+"""Largest difference of two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that difference."""
 STEP_COUNTS: Final = 15.0
-"""A change of rest level over a contact that the user is told of: above what noise and the last of a recovery make. A
-smaller one that is a taxel's own stays in the readings all the same, a common one is followed."""
+"""Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause. A
+smaller change of a single taxel stays in the readings as well, a common one is followed."""
 BACK_COUNTS: Final = 8.0
-"""Of a step, below which there is none: what is left is followed. Less than what is a touch."""
+"""Size of a step up to which it counts as none, and the rest is followed. Smaller than a touch."""
 VOTE_COUNTS: Final = 4.0
-"""Of a step, up to which a taxel tells what is common: what noise makes."""
+"""Largest own step of a taxel that contributes to the common drift: the size of noise."""
 FEWEST_VOTERS: Final = 4
 
 _ZEROED: Final = "since it was zeroed"
@@ -70,12 +70,12 @@ _BACK: Final = "rest level is back where it was"
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """What has become of a rest level since it was zeroed.
+    """Drift of a rest level since it was zeroed.
 
     Attributes:
-        common_counts: followed of all taxels, of x, y, z; subtracted from the readings.
-        own_counts: the largest that was followed beyond it, of any taxel and axis; subtracted as well.
-        step_counts: the largest step in rest level, signed; it stays in the readings. 0 without one.
+        common_counts: drift of all taxels on x, y, z; subtracted from the readings.
+        own_counts: the largest drift of a taxel beyond it, of any taxel and axis; subtracted as well.
+        step_counts: the largest step in rest level, signed; it stays in the readings. 0 without a step.
     """
 
     common_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -84,17 +84,17 @@ class Drift:
 
 
 class DriftTracker:
-    """Follows the rest level of one sensor.
+    """Tracker of the rest level of one sensor.
 
     Attributes:
         counts: (3, rows, cols) float32, to be added to the baseline; a new array whenever it changes.
         summary: the same in a few numbers, with the step that stays in the readings.
-        note: what the user should know as long as it lasts, with the figures that it began with.
-        doubted: there is a contact, and it looks like drift.
+        note: message to the user while a step or a doubtful contact lasts, with the figures from its beginning.
+        doubted: True where there is a contact that looks like drift.
     """
 
     def __init__(self, baseline: Baseline) -> None:
-        """Start with an unmoved baseline; nothing is followed before the pad has been at rest for a while."""
+        """Start with an unmoved baseline; drift is followed once the pad has been at rest for a while."""
         self.counts: NDArray[np.float32] = np.zeros_like(baseline.counts)
         self.summary = Drift()
         self.note: str | None = None
@@ -109,18 +109,18 @@ class DriftTracker:
         self._cause = _ZEROED
         self._event: str | None = None
         self._block: list[NDArray[np.int32]] = []
-        self._last_ns = 0  # the first scan interrupts, which sets what is not here
+        self._last_ns = 0  # the first scan interrupts, which sets the other attributes
 
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
-        """Follow one scan.
+        """Process one scan.
 
         Args:
-            scan: the sensor's next one.
-            contact: a tap is going on.
-            dead: taxels (rows, cols) that are not believed; another array only where they are others than before.
+            scan: next scan of the sensor.
+            contact: True during a tap.
+            dead: taxels (rows, cols) that are ignored; a new array only where they have changed.
 
         Returns:
-            Whether `counts`, `summary` or `note` have changed, or there is an event.
+            True if `counts`, `summary` or `note` have changed, or there is an event.
         """
         time_ns = scan.time_ns
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns
@@ -138,11 +138,11 @@ class DriftTracker:
         return self._follow(level, seconds) if self._resting else self._wait(level, seconds)
 
     def forget(self) -> None:
-        """Something happened that scans do not show, such as a link that was away: wait for rest, then compare."""
+        """Wait for rest and compare again, after an event that scans do not show, such as a lost link."""
         self._last_ns = -GAP_NS
 
     def take_event(self) -> str | None:
-        """What has just happened to the rest level, once."""
+        """Return the latest event of the rest level and clear it, None if there is none."""
         event, self._event = self._event, None
         return event
 
@@ -165,7 +165,7 @@ class DriftTracker:
     def _stop(self) -> None:
         self._resting, self._quiet_blocks = False, 0
         self._level: NDArray[np.float32] | None = None
-        self._followed = self.counts  # what the last block added may have been the touch
+        self._followed = self.counts  # the last block may have been part of the touch
         self._rate_per_s.fill(0)
 
     def _begin_block(self, time_ns: int) -> None:
@@ -173,9 +173,9 @@ class DriftTracker:
         self._start_ns = self._next_ns = time_ns
 
     def _middle_half(self) -> NDArray[np.float32]:
-        """How far the block's scans are from the baseline; anything where no taxel lives.
+        """Return the deviation of the block's scans from the baseline; undefined where a taxel is dead.
 
-        The mean of the middle half: a median of whole counts jumps by whole counts.
+        It is the mean of the middle half: a median of whole counts jumps by whole counts.
         """
         readings = deformation(np.stack(self._block), self._baseline)
         readings.sort(axis=0)
@@ -185,31 +185,31 @@ class DriftTracker:
     def _parts(
         self, counts: NDArray[np.float32], voters: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """What all living taxels have in common, (3, 1, 1), and what is a taxel's own, 0 where it does not live.
+        """Split counts into the part common to all live taxels, (3, 1, 1), and each taxel's own, 0 where it is dead.
 
         Args:
             counts: (3, rows, cols).
-            voters: taxels (rows, cols) that tell what is common; None for all that live.
+            voters: taxels (rows, cols) that define the common part; None for all live ones.
         """
         if voters is not None:
             common = self._middle(counts[:, voters])
             return common, np.where(self._live, counts - common, np.float32(0))
         if not self._all_live:
-            # Left out, a taxel lies in the middle of the others: their median stays.
+            # A dead taxel gets the median of the others, which keeps that median.
             counts = np.where(self._live, counts, self._middle(counts[:, self._live]) if self._live.any() else 0)
         common = self._middle(counts.reshape(len(AXES), -1))
         return common, counts - common
 
     @staticmethod
     def _middle(counts: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Median over taxels, (3, 1, 1); np.median takes ten times as long over so few."""
+        """Return the median over taxels, (3, 1, 1); np.median takes ten times as long for so few."""
         ordered = np.sort(counts, axis=1)
         count = ordered.shape[1]
         middle = np.float32(0.5) * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
         return middle[:, None, None]
 
     def _wait(self, level: NDArray[np.float32], seconds: float) -> bool:
-        """Wait until the pad has been still for a while, then see where it rests."""
+        """Wait until the pad has been still for a while, then determine its rest level."""
         before, self._level = self._level, level
         if before is None:
             return False
@@ -222,7 +222,7 @@ class DriftTracker:
         return self._doubt(level) if self._contact else self._settle(level)
 
     def _doubt(self, level: NDArray[np.float32]) -> bool:
-        """A still contact that every taxel feels alike is none that a surface makes."""
+        """Doubt a still contact that all taxels read alike: no surface causes it."""
         common, own = self._parts(level - self.counts)
         self.doubted = bool((np.abs(own) <= TOUCH_COUNTS + OWN_SHARE * np.abs(common)).all())
         before, self.note = self.note, None
@@ -237,12 +237,12 @@ class DriftTracker:
         common, own = self._parts(step)
         told = np.abs(step).max() > STEP_COUNTS
         if self._cause == _ZEROED and np.abs(common).max() <= COMMON_COUNTS and _alike(common, own):
-            # Nothing has touched since: what a pad does that is warmer, or held otherwise, than when it was zeroed.
+            # Not touched since zeroing: the change of a pad that has warmed up or is held in another attitude.
             step, told = np.zeros_like(step), False
         elif not told:
             step = own
         self._step = step if np.abs(step).max() > BACK_COUNTS else None
-        # Taxels that may be touched do not tell what the others drift by.
+        # Taxels that may be touched do not contribute to the common drift of the others.
         untouched: NDArray[np.bool_] = np.logical_and.reduce(np.abs(own) <= VOTE_COUNTS) & self._live
         self._voters = untouched if self._step is not None and untouched.sum() >= FEWEST_VOTERS else None
         before, self.note = self.note, self._step_note()
@@ -265,7 +265,7 @@ class DriftTracker:
         most = np.float32(COMMON_PER_S * seconds)
         moved = np.clip(common, -most, most)
         own_per_s = OWN_PER_S if step is None else 0.0
-        # The block before this one is now known to have been free.
+        # This block shows that the one before it was free.
         self.counts = self._followed
         self._rate_per_s += np.float32(min(seconds / RATE_S, 1.0)) * (moved / np.float32(seconds) - self._rate_per_s)
         slow_per_s = np.float32(NOISE_PER_S if step is None else SLOW_PER_S)
@@ -297,6 +297,6 @@ class DriftTracker:
 
 
 def _alike(common: NDArray[np.float32], own: NDArray[np.float32]) -> bool:
-    """Whether a change is that of a pad that drifts or turns, and not that of some taxels."""
+    """Return True if a change is that of a pad that drifts or turns, and not of some taxels alone."""
     large = bool(np.abs(common).max() > STEP_COUNTS / 2)
     return large and bool((np.abs(own) <= STILL_COUNTS + OWN_SHARE * np.abs(common)).all())

@@ -11,18 +11,18 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 INTACT: Final = "intact"
 READ: Final = (INTACT, "reordered", "repeated", "stuck", "foreign", "flipped")
-"""Fates of frames that reach the reader, the last three with something in them that no taxel read in that cycle."""
+"""Fates of frames that reach the reader; the last three hold a reading that no taxel had in that cycle."""
 FOREIGN_ID: Final = 0x740
 
 
 class BusFrame(NamedTuple):
-    """A frame on the bus and what became of it so far.
+    """Frame on the bus and its fate so far.
 
     Attributes:
-        time_s: on the bus, in [s] from the first scan.
-        frame: as it is now.
-        cycle: how often its id was sent before.
-        fate: one of READ, or what it was lost to.
+        time_s: time on the bus, in [s] from the first scan.
+        frame: the frame in its present state.
+        cycle: number of earlier frames of its id.
+        fate: one of READ, or the cause of its loss.
     """
 
     time_s: float
@@ -32,40 +32,40 @@ class BusFrame(NamedTuple):
 
     @property
     def lost(self) -> bool:
-        """The reader never gets it."""
+        """True if the reader never gets it."""
         return self.fate not in READ
 
 
 class FrameFault(ABC):
-    """Something that goes wrong on the bus for a while."""
+    """Fault on the bus during an interval."""
 
     def __init__(self, draw: random.Random, parameter: str) -> None:
-        """Begin.
+        """Begin the fault.
 
         Args:
-            draw: where all chance comes from.
-            parameter: as the user wrote it, empty for the usual one.
+            draw: source of all random numbers.
+            parameter: parameter as the user wrote it, empty for the usual one.
 
         Raises:
-            ValueError: no such parameter.
+            ValueError: the parameter is invalid.
         """
         self.draw = draw
 
     @abstractmethod
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """What there is instead of a frame that is not lost yet."""
+        """Yield the frames that replace a frame that is not lost yet."""
 
     def winds_down(self) -> bool:
-        """Begin nothing new; False while something is under way."""
+        """Start no further disturbance; return False while one is under way."""
         return True
 
     def end(self) -> Iterator[BusFrame]:
-        """What is still held back when it is over."""
+        """Return the frames still held back at the end of the fault."""
         return iter(())
 
 
 class Chance(FrameFault):
-    """Strikes a share of the frames, `usual_share` of them unless told otherwise."""
+    """Fault that strikes a share of the frames, by default `usual_share`."""
 
     usual_share = 0.02
 
@@ -74,23 +74,23 @@ class Chance(FrameFault):
         self._share = share(parameter, self.usual_share)
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Strike, or pass it on."""
+        """Strike the frame by chance, or pass it on."""
         return self.strike(sent) if self.draw.random() < self._share else self.spare(sent)
 
     def spare(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Pass it on."""
+        """Pass the frame on."""
         yield sent
 
     @abstractmethod
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """What there is instead of it."""
+        """Yield the frames that replace the struck one."""
 
 
 class Lost(Chance):
-    """Frames that no one receives, as where a queue in the adapter runs over."""
+    """Frames that are lost, as when a queue in the adapter overflows."""
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Lose it."""
+        """Mark the frame as lost."""
         yield sent._replace(fate="lost")
 
 
@@ -98,7 +98,7 @@ class Repeated(Chance):
     """Frames that come twice in a row."""
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Give it again."""
+        """Yield the frame twice."""
         yield sent
         yield sent._replace(fate="repeated")
 
@@ -111,35 +111,35 @@ class Reordered(Chance):
         self._held: list[BusFrame] = []
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Hold it back, unless another is."""
+        """Hold the frame back, unless another one is held back."""
         if self._held:
             yield from self.spare(sent)
         else:
             self._held.append(sent._replace(fate="reordered"))
 
     def spare(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Give it before what is held back."""
+        """Yield the frame before the one that is held back."""
         yield sent
         yield from self.end()
 
     def end(self) -> Iterator[BusFrame]:
-        """Give what is held back."""
+        """Yield the frame that is held back."""
         held, self._held = self._held, []
         yield from held
 
 
 class Foreign(Chance):
-    """Frames of somebody else on the bus."""
+    """Frames of another device on the bus."""
 
     def strike(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Put one before it."""
+        """Yield a foreign frame before the frame."""
         frame = CanFrame(FOREIGN_ID | self.draw.randrange(16), self.draw.randbytes(8))
         yield BusFrame(sent.time_s, frame, 0, "foreign")
         yield sent
 
 
 class OneTaxel(FrameFault):
-    """Strikes one taxel: SENSOR.TAXEL, or that of the first frame that a die lets through."""
+    """Fault of one taxel: SENSOR.TAXEL, or that of a frame drawn at random."""
 
     def __init__(self, draw: random.Random, parameter: str) -> None:
         super().__init__(draw, parameter)
@@ -152,33 +152,33 @@ class OneTaxel(FrameFault):
                 raise ValueError(f"taxel is {parameter!r}, expected SENSOR.TAXEL, such as 4.11")
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Strike it, or pass another's on."""
+        """Strike a frame of the taxel, or pass another one on."""
         if self._can_id is None and sent.fate != "foreign" and self.draw.random() < 1 / 16:
             self._can_id = sent.frame.can_id
         yield self.strike(sent) if sent.frame.can_id == self._can_id else sent
 
     @abstractmethod
     def strike(self, sent: BusFrame) -> BusFrame:
-        """What there is instead of it."""
+        """Return the frame that replaces the struck one."""
 
 
 class DeadTaxel(OneTaxel):
-    """A taxel that sends nothing."""
+    """Taxel that sends no frame."""
 
     def strike(self, sent: BusFrame) -> BusFrame:
-        """Lose it."""
+        """Mark the frame as lost."""
         return sent._replace(fate="dead")
 
 
 class StuckTaxel(OneTaxel):
-    """A taxel that sends the same reading for ever."""
+    """Taxel that sends the same reading for ever."""
 
     def __init__(self, draw: random.Random, parameter: str) -> None:
         super().__init__(draw, parameter)
         self._first: CanFrame | None = None
 
     def strike(self, sent: BusFrame) -> BusFrame:
-        """Put its first reading in the place of each one after."""
+        """Replace each later reading by the first."""
         if self._first is None:
             self._first = sent.frame
             return sent
@@ -186,7 +186,7 @@ class StuckTaxel(OneTaxel):
 
 
 class SilentSensor(FrameFault):
-    """A finger whose cable is broken; the one named, or that of the first frame."""
+    """Sensor with a broken cable: the named one, or that of the first frame."""
 
     def __init__(self, draw: random.Random, parameter: str) -> None:
         super().__init__(draw, parameter)
@@ -195,14 +195,14 @@ class SilentSensor(FrameFault):
             raise ValueError(f"sensor is {parameter!r}, expected a controller 0..15")
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Lose it if it is of that sensor."""
+        """Lose a frame of that sensor."""
         sensor = USPA44_MAP.taxels.get(sent.frame.can_id, ("", 0))[0]
         self._sensor = self._sensor or sensor
         yield sent._replace(fate="silent") if sensor == self._sensor else sent
 
 
 class Vanished(FrameFault):
-    """Whole scans that are not sent, a share of them: the wire numbers nothing, and so shows nothing but time."""
+    """Share of whole scans that are not sent: scans have no numbers on the wire, so only their times show the loss."""
 
     usual_share = 0.05
 
@@ -212,23 +212,23 @@ class Vanished(FrameFault):
         self._vanishes: dict[str, bool] = {}
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Lose it if its scan vanishes, which its first frame decides."""
+        """Lose the frame if its scan vanishes, which is drawn at the first frame of the scan."""
         sensor = USPA44_MAP.taxels.get(sent.frame.can_id, ("", 0))[0]
         if sent.frame.can_id >> 4 == 0:
             self._vanishes[sensor] = self.draw.random() < self._share
         yield sent._replace(fate="vanished") if self._vanishes.get(sensor) else sent
 
     def winds_down(self) -> bool:
-        """Let no other scan vanish, and those that do to their ends."""
+        """Let no further scan vanish; return True once the present ones have ended."""
         self._share = 0.0
         return not any(self._vanishes.values())
 
 
 class BusOff(FrameFault):
-    """The adapter has left the bus after too many errors; it comes back to it by itself."""
+    """Adapter that has left the bus after too many errors; it returns by itself."""
 
     def take(self, sent: BusFrame) -> Iterator[BusFrame]:
-        """Lose it."""
+        """Mark the frame as lost."""
         yield sent._replace(fate="bus-off")
 
 
@@ -248,10 +248,10 @@ FRAME_FAULTS: Final[Mapping[str, Callable[[random.Random, str], FrameFault]]] = 
 
 
 def share(parameter: str, usual_share: float) -> float:
-    """A share of all, as a user wrote it.
+    """Parse a share as a user wrote it.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is no share.
     """
     try:
         value = float(parameter) if parameter else usual_share
@@ -263,7 +263,7 @@ def share(parameter: str, usual_share: float) -> float:
 
 
 def through(faults: Sequence[FrameFault], sent: BusFrame) -> Iterator[BusFrame]:
-    """A frame through one fault after the other; what is lost, the next do not see."""
+    """Pass a frame through one fault after the other; later faults do not see lost ones."""
     if not faults or sent.lost:
         yield sent
         return

@@ -1,4 +1,4 @@
-"""Runs faults: frames from the bus in, pieces for the reader out."""
+"""Injector of faults: frames from the bus in, pieces for the reader out."""
 
 import random
 from collections import Counter
@@ -23,15 +23,15 @@ class _Active(NamedTuple):
 
 
 class Injector:
-    """Does to a stream what its stretches say, in time order.
+    """Injector of the faults of its stretches into a stream, in time order.
 
     Attributes:
-        stretches: what is injected when.
-        truth: what became of it all.
-        begun: stretches that have begun, by fault.
-        unplugged: the cable is out.
-        renamed: it comes back under another name.
-        resets: how often the adapter has begun anew.
+        stretches: the faults with their intervals.
+        truth: the fates of all frames.
+        begun: number of stretches that have begun, by fault.
+        unplugged: True while the cable is out.
+        renamed: True if it comes back under another name.
+        resets: number of resets of the adapter.
     """
 
     def __init__(
@@ -42,13 +42,13 @@ class Injector:
         *,
         tell: Callable[[str, Stretch], object] = lambda what, stretch: None,
     ) -> None:
-        """Be ready for the first frame.
+        """Prepare for the first frame.
 
         Args:
-            stretches: see `parse_stretches`.
-            truth: keeps the accounts.
-            seed: of all chance.
-            tell: told "begin" and "end" of each.
+            stretches: stretches of `parse_stretches`.
+            truth: records the fates of the frames.
+            seed: seed of all random numbers.
+            tell: called with "begin" and "end" of each stretch.
 
         Raises:
             ValueError: a fault has a parameter that it does not take.
@@ -65,15 +65,15 @@ class Injector:
         self._active: list[_Active] = []
         self._sent: Counter[int] = Counter()
         for number, stretch in self._waiting:
-            self._start(number, stretch)  # once for its errors, before anything runs
+            self._start(number, stretch)  # started once for its errors, before anything runs
 
     def latency_s(self, time_s: float, usual_s: float) -> float:
-        """For how long the adapter holds back what was on the bus at `time_s`."""
+        """Return the time for which the adapter holds back a frame that was on the bus at `time_s`, in [s]."""
         bursts = any(one.name == BURSTS and one.start_s <= time_s < one.end_s for one in self.stretches)
         return max(BURST_S, usual_s) if bursts else usual_s
 
     def advance(self, time_s: float) -> list[BusFrame]:
-        """Begin and end what is due; frames that an ended fault had held back."""
+        """Begin and end the faults that are due; return the frames that an ended fault had held back."""
         freed: list[BusFrame] = []
         due = [one for one in self._active if one.stretch.end_s <= time_s]
         for one in [one for one in due if one.frame is None or one.frame.winds_down()]:
@@ -90,21 +90,21 @@ class Injector:
             self.resets += stretch.name == RESET
             if stretch.end_s > time_s:
                 self._active.append(self._start(number, stretch))
-            else:  # shorter than from one frame to the next
+            else:  # shorter than the time between two frames
                 self._tell("end", stretch)
         names = {one.stretch.name for one in self._active}
         self.unplugged, self.renamed = bool(names & {UNPLUG, RENAME}), RENAME in names
         return freed
 
     def disturb(self, time_s: float, frame: CanFrame) -> Iterator[BusFrame]:
-        """What there is on the bus instead of a frame; lost ones are among it."""
+        """Yield the frames on the bus that replace a frame, lost ones included."""
         sent = BusFrame(time_s, frame, self._sent[frame.can_id])
         self._sent[frame.can_id] += 1
         yield from self.advance(time_s)
         yield from through_frame_faults([one.frame for one in self._active if one.frame is not None], sent)
 
     def corrupt(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """What the reader gets instead of the line of a frame that is not lost."""
+        """Yield the pieces that replace the line of a frame that is not lost."""
         faults = [one.line for one in self._active if one.line is not None]
         yield from through_line_faults(faults, Piece(line, sent))
 

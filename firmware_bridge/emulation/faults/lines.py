@@ -1,7 +1,7 @@
 """Faults of the bytes between adapter and reader.
 
-None makes a well-formed frame that was never sent but `flipped`, which says so. For that, noise holds no line end but
-its own, and a line is cut from its end and never down to a whole frame.
+Only `flipped` makes well-formed frames that were never sent, with that fate. To ensure this, noise holds no line end
+but its own, and a line is cut from its end and never down to a whole frame.
 """
 
 import random
@@ -14,22 +14,22 @@ from firmware_bridge.emulation.faults.frames import BusFrame, share
 
 LINE_ENDS: Final = b"\r\a"
 SHORTEST_NOISE: Final = 12
-"""Anything shorter might be an adapter's answer."""
+"""Least bytes of noise: shorter noise might look like an adapter's answer."""
 LONGEST_NOISE: Final = 200
 MOST_LEFT_BYTES: Final = 20
-"""Of a line that is cut: one less than a whole frame has without a time stamp."""
+"""Most bytes of a line that is cut: one less than a whole frame without a time stamp."""
 _NOISE_BYTES: Final = bytes(value for value in range(256) if value not in LINE_ENDS)
 _READING_DIGITS: Final = range(7, 19)
-"""Of a line: those of x, y and z."""
+"""Positions of the digits of x, y and z in a line."""
 
 
 class Piece(NamedTuple):
     """Bytes for the reader.
 
     Attributes:
-        data: what goes out.
-        sent: the frame of which `data` is the whole line or, where it is lost, was; None for what never was one.
-        answer: it is the adapter's answer to a command.
+        data: bytes that go out.
+        sent: the frame whose line `data` is, or a remainder of it if it is lost; None for bytes without a frame.
+        answer: True for the adapter's answer to a command.
     """
 
     data: bytes
@@ -38,12 +38,12 @@ class Piece(NamedTuple):
 
 
 class LineFault(ABC):
-    """Something that goes wrong on the line for a while, with a share of what goes over it."""
+    """Fault on the line during an interval, which strikes a share of the lines."""
 
     usual_share = 0.02
 
     def __init__(self, draw: random.Random, parameter: str) -> None:
-        """Begin; `parameter` is the share as the user wrote it, empty for the usual one.
+        """Begin the fault; `parameter` is the share as the user wrote it, empty for the usual one.
 
         Raises:
             ValueError: it is no share.
@@ -52,7 +52,7 @@ class LineFault(ABC):
         self._share = share(parameter, self.usual_share)
 
     def take(self, piece: Piece) -> Iterator[Piece]:
-        """What there is instead of a line whose frame is not lost yet."""
+        """Yield the pieces that replace a line whose frame is not lost yet."""
         sent = piece.sent
         if sent is None or sent.lost or self.draw.random() >= self._share:
             yield piece
@@ -61,14 +61,14 @@ class LineFault(ABC):
 
     @abstractmethod
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """What there is instead of it."""
+        """Yield the pieces that replace the struck line."""
 
 
 class Garbage(LineFault):
     """Bursts of any bytes before a line, every other one with a line end."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Put one before it."""
+        """Yield a burst before the line."""
         length = self.draw.randint(SHORTEST_NOISE, LONGEST_NOISE)
         yield Piece(bytes(self.draw.choices(_NOISE_BYTES, k=length)) + self.draw.choice((b"", b"\r")), None)
         yield Piece(line, sent)
@@ -78,20 +78,20 @@ class Truncated(LineFault):
     """Lines that end too soon."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Cut it."""
+        """Cut the line."""
         yield Piece(line[: self.draw.randint(1, MOST_LEFT_BYTES)] + b"\r", sent._replace(fate="truncated"))
 
 
 class Merged(LineFault):
-    """Lines whose end is missing, or more of it, so that the next one follows at once."""
+    """Lines cut before their end, so that the next one follows at once."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
-        """Leave its end away."""
+        """Remove the end of the line."""
         yield Piece(line[: self.draw.randint(1, len(line) - 1)], sent._replace(fate="merged"))
 
 
 class NonAscii(LineFault):
-    """Lines with a byte in them that is no character."""
+    """Lines with a byte that is no ASCII character."""
 
     def strike(self, line: bytes, sent: BusFrame) -> Iterator[Piece]:
         """Set the highest bit of a byte."""
@@ -101,7 +101,7 @@ class NonAscii(LineFault):
 
 
 class Flipped(LineFault):
-    """Readings with another digit than was sent. The wire has no checksum: nobody can tell."""
+    """Readings with a changed digit. The serial line has no checksum, so no reader can detect it."""
 
     usual_share = 0.002
 
@@ -129,7 +129,7 @@ LINE_FAULTS: Final[Mapping[str, Callable[[random.Random, str], LineFault]]] = Ma
 
 
 def through(faults: Sequence[LineFault], piece: Piece) -> Iterator[Piece]:
-    """A piece through one fault after the other."""
+    """Pass a piece through one fault after the other."""
     if not faults:
         yield piece
         return

@@ -1,4 +1,4 @@
-"""When which fault is on: what a user writes, and a mixture of all.
+"""Fault intervals: the format that a user writes, and a mixture of all faults.
 
 lost@2+3                from the second second on, for three seconds
 lost=.05@2+3            one frame in twenty
@@ -17,24 +17,24 @@ from firmware_bridge.emulation.faults.frames import FRAME_FAULTS
 from firmware_bridge.emulation.faults.lines import LINE_FAULTS
 
 BURSTS: Final = "bursts"
-"""The adapter holds bytes back for 16 ms, as an FTDI chip does that nobody asked not to."""
+"""Fault of an adapter that holds bytes back for 16 ms, the default of an FTDI chip."""
 UNPLUG: Final = "unplug"
-"""The cable is out, and back under the name that the kernel gives it."""
+"""Fault in which the cable is pulled, and comes back under a name from the kernel."""
 RENAME: Final = "rename"
-"""The same, but certainly under another name."""
+"""Fault in which the cable is pulled, and comes back under another name."""
 RESET: Final = "reset"
-"""The adapter begins anew, its cable in: channel closed, at a bitrate that is not the sensor's."""
+"""Fault in which the adapter restarts, its cable in: channel closed, at another bitrate than the sensor's."""
 LINK_FAULTS: Final = (UNPLUG, RENAME, RESET)
 NAMES: Final = (*FRAME_FAULTS, *LINE_FAULTS, BURSTS, *LINK_FAULTS)
 MIXED: Final = "mixed"
 
 LONGEST_OUTAGE_S: Final = 1.5
 CALM_S: Final = 3.0
-"""Of a mixture's end, so that all accounts are settled; and from one break of the link to the next."""
+"""Time without faults at the end of a mixture, to settle all accounts, and between two breaks of the link, in [s]."""
 
 
 class Stretch(NamedTuple):
-    """A fault and when it is on, in [s] since the channel was first opened; `parameter` is empty for the usual one."""
+    """Fault and its interval, in [s] since the channel was first opened; `parameter` is empty for the usual one."""
 
     name: str
     parameter: str
@@ -47,11 +47,11 @@ class Stretch(NamedTuple):
 
 
 def parse_stretches(text: str, seed: int = 0) -> list[Stretch]:
-    """What a user wrote.
+    """Parse the fault intervals that a user wrote.
 
     Args:
-        text: as above; stretches are separated by commas.
-        seed: draws a mixture.
+        text: stretches in the format above, separated by commas.
+        seed: seed of a mixture.
 
     Raises:
         ValueError: no such fault, or no such time.
@@ -71,12 +71,12 @@ def parse_stretches(text: str, seed: int = 0) -> list[Stretch]:
 
 
 def mixture(start_s: float, long_s: float, seed: int) -> list[Stretch]:
-    """All faults in turns, each turn in another order, several at once; breaks of the link well apart.
+    """Draw all faults in turns, each turn in another order, several at once; breaks of the link well apart.
 
     Args:
-        start_s: when the first begins.
-        long_s: from then on; the last CALM_S of it are without faults.
-        seed: draws order, times and lengths.
+        start_s: earliest begin of the first fault, in [s].
+        long_s: duration from then on, in [s]; its last CALM_S are without faults.
+        seed: seed of order, times and lengths.
     """
     draw = random.Random(f"mixture {seed}")
     end_s = start_s + long_s - CALM_S

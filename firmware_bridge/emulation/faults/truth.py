@@ -1,7 +1,7 @@
-"""What became of every frame, and what its reader must have counted.
+"""Fate of every frame, and the counts that its reader must have reached.
 
-It reads no line: it knows by its own bookkeeping where in the stream whole frames end, and calls everything else what
-it is. So it cannot share a mistake with the decoder.
+The truth parses no line: its own bookkeeping holds the ends of whole frames in the stream, and the kind of all other
+bytes. So it cannot share a mistake with the decoder.
 """
 
 import math
@@ -23,8 +23,8 @@ FATES: Final = (
     *("truncated", "merged", "non-ascii"),
     *("overflow", "unread", "unheard"),
 )
-"""Of frames. Those that the faults do not name: no room, since the reader was too slow; not fetched when the channel
-was closed; and sent while nobody listened."""
+"""Fates of frames. The last three are no faults: no room, since the reader was too slow; not fetched when the channel
+was closed; sent while no channel was open."""
 ROW: Final = np.dtype(
     [
         ("handed_ns", "<i8"),
@@ -37,29 +37,29 @@ ROW: Final = np.dtype(
     ],
     align=False,
 )
-"""A frame in a log: when it was handed on, monotonic, in [ns]; when it was on the bus, in [us] since the first scan;
-cycle and id; the reading that the reader gets; how often the channel had been opened; and the number of its fate."""
+"""Row of a frame in a log: monotonic time at which it was handed on, in [ns]; time on the bus, in [us] since the first
+scan; cycle and id; the reading that the reader gets; openings of the channel so far; and the number of its fate."""
 _pack = struct.Struct("<qqIH3HHB").pack
 _xyz = struct.Struct(">xHHHx").unpack
 _FATE_NUMBERS: Final = {fate: number for number, fate in enumerate(FATES)}
 
 
 class Truth:
-    """Follows the bytes that go to the reader.
+    """Bookkeeping of the bytes that go to the reader.
 
     Attributes:
-        fates: how many frames met which.
-        frames: that the reader must have seen whole.
-        foreign: of these, frames of somebody else.
-        bad_lines: lines that are no frame, with or without bytes that are no characters.
-        skipped_bytes: bytes that belong to no frame.
-        duplicates: frames like that sensor's frame before.
-        openings: how often the channel was opened.
-        noise: bursts that never were a frame.
+        fates: number of frames by fate.
+        frames: number of frames that the reader must have received whole.
+        foreign: number of these that are frames of another device.
+        bad_lines: number of lines that are no frame, with or without bytes that are no characters.
+        skipped_bytes: number of bytes that belong to no frame.
+        duplicates: number of frames equal to that sensor's frame before.
+        openings: number of openings of the channel.
+        noise: number of bursts without a frame.
     """
 
     def __init__(self, log: Callable[[bytes], object] = lambda row: None) -> None:
-        """Know of nothing yet; `log` is told of every frame once its fate is certain, a ROW each."""
+        """Start without a frame; `log` receives a ROW for every frame once its fate is certain."""
         self.fates: Counter[str] = Counter()
         self.frames = 0
         self.foreign = 0
@@ -75,12 +75,12 @@ class Truth:
         self._last: dict[str, tuple[int, tuple[int, ...]]] = {}
 
     def counters(self) -> dict[str, int]:
-        """What a reader must have counted, by its names; `bad_lines` holds `non_ascii_lines`."""
+        """Return the counts that a reader must have, by its names; `bad_lines` includes `non_ascii_lines`."""
         names = ("frames", "foreign", "bad_lines", "skipped_bytes", "duplicates")
         return {name: getattr(self, name) for name in names}
 
     def hand_on(self, piece: Piece, written_bytes: int, time_ns: int) -> None:
-        """Keep what went out, as far as there was room for it."""
+        """Record a piece that went out, as far as there was room for it."""
         if written_bytes < len(piece.data) and piece.sent is not None and not piece.sent.lost:
             piece = piece._replace(sent=piece.sent._replace(fate="overflow"))
         self.noise += piece.sent is None and not piece.answer
@@ -88,11 +88,11 @@ class Truth:
         self._on_the_way_bytes += written_bytes
 
     def settle(self, unread_bytes: int, counted_ns: float = math.inf) -> None:
-        """The reader has fetched all but so many bytes, and but for what of the newest was not counted yet.
+        """Settle the pieces that the reader has fetched: all but the unread bytes and the newest ones.
 
         Args:
-            unread_bytes: as they were counted.
-            counted_ns: monotonic, in [ns]; of what was handed on later, the kernel may not have counted all.
+            unread_bytes: number of unread bytes as counted by the kernel.
+            counted_ns: monotonic time in [ns]; the kernel may not have counted all bytes handed on later.
         """
         young = takewhile(lambda one: one[2] > counted_ns, reversed(self._on_the_way))
         unread_bytes += sum(written_bytes for _, written_bytes, _ in young)
@@ -102,18 +102,18 @@ class Truth:
             self._read(piece, written_bytes, time_ns)
 
     def open_channel(self) -> None:
-        """The reader begins anew: what it had of a line belongs to nothing."""
+        """Note that the reader begins again: its unfinished line belongs to no frame."""
         self.openings += 1
         self.skipped_bytes += self._pending
         self._pending = 0
         self._last.clear()
 
     def close_channel(self, unread_bytes: int) -> None:
-        """The reader has gone and left so many bytes."""
+        """Note that the reader has gone and left `unread_bytes`."""
         self.settle(unread_bytes)
         for piece, written_bytes, time_ns in self._on_the_way:
             fetched = max(0, self._on_the_way_bytes - unread_bytes)
-            self._pending += fetched  # the head of a line at most: settled are all that were fetched whole
+            self._pending += fetched  # at most the head of a line, since whole pieces are settled
             self._on_the_way_bytes -= written_bytes
             unread_bytes -= written_bytes - fetched
             if piece.sent is not None:
@@ -123,7 +123,7 @@ class Truth:
         self._on_the_way_bytes = 0
 
     def lose(self, sent: BusFrame, time_ns: int) -> None:
-        """A frame of which no byte is read; its fate says why."""
+        """Record a frame without a byte that is read, with the fate of its loss."""
         self._keep(sent, time_ns)
 
     def _read(self, piece: Piece, written_bytes: int, time_ns: int) -> None:
