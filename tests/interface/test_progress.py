@@ -63,6 +63,7 @@ def test_a_replay_at_full_speed_shows_one_instead_of_the_live_line(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream, delay_s=0))
     monkeypatch.setattr(status, "StatusSink", partial(status.StatusSink, terminal.stream))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_model(tmp_path / "tiny.onnx")
     path = write_recording(tmp_path / "finger.csv", make_counts(7), rate_hz=1000)
     assert (
