@@ -9,7 +9,7 @@ import can
 import pytest
 from bridge_samples import make_recording, read_scans
 from can.interfaces.slcan import slcanBus
-from test_links_serial import SilentDevice
+from serial_samples import SilentDevice
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import Emulator

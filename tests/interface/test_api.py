@@ -14,8 +14,8 @@ from typing import get_type_hints
 
 import numpy as np
 import pytest
+from cli_samples import records, run, write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
-from test_cli import records, run, write_recording
 
 from edge import api
 from edge.api import (

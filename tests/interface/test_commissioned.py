@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from cli_samples import assert_refused, records, run, write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
-from test_cli import assert_refused, records, run, write_recording
 
 from edge.api import Stream, open_recording, open_runtime, open_source
 from edge.doctor.options import doctor_parser

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import pytest
 import trimesh
+from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_model
-from test_cli import write_recording
 
 from edge.api import Result
 from edge.pipeline.scan_reader import Source

@@ -7,8 +7,8 @@ import subprocess
 import sys
 
 import pytest
+from cli_samples import TIMEOUT_S, base_options, files
 from edge_samples import ROOT
-from test_cli import TIMEOUT_S, base_options, files
 
 __all__ = ["files"]
 

@@ -7,7 +7,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from train.report import bootstrap_interval
 
 from edge.evaluation.classical_methods import fitted_methods
 from edge.evaluation.evaluate import by_surface, judge, judge_model, mean_error
@@ -16,6 +15,7 @@ from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, bundled_models, fi
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.geometry import USPA44
 from train.data.frozen_presses import load_frozen_presses
+from train.report import bootstrap_interval
 
 IN_FLOAT = ("stsr", "stsr-small", "mtsr2", "mtsr4")
 NAMES = (*IN_FLOAT, *(f"{name}-int8" for name in IN_FLOAT))

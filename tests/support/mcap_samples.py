@@ -10,9 +10,12 @@ from mcap.reader import make_reader
 
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
 
 OFFSET_NS = 1_700_000_000_000_000_000
+SURE = make_contract(interval_factor=1.6)
+TURNED = Mounting(order=tuple(reversed(range(16))), swap_xy=True, signs=(1, -1, 1))
 
 
 def odd_scans(count: int = 12) -> list[Scan]:

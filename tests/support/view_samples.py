@@ -1,12 +1,15 @@
 """What the live page's tests share: a run to look at, and viewers over loopback."""
 
+import http.client
 import socket
 import threading
 import time
 from contextlib import contextmanager, suppress
 from functools import partial
 
+import pytest
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from edge.perception.options import RuntimeOptions
@@ -187,3 +190,29 @@ def wait_for(condition):
     while not condition():
         assert time.monotonic() < end_s, "it did not come"
         time.sleep(0.005)
+
+
+@pytest.fixture
+def page(tmp_path):
+    with live_page(tmp_path) as page:
+        yield page
+
+
+def get(page, path="/", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=TIMEOUT_S)
+    try:
+        connection.request("GET", path, headers=headers)
+        response = connection.getresponse()
+        return response.status, dict(response.getheaders()), response.read()
+    finally:
+        connection.close()
+
+
+def refused_with(page, *arguments, **settings):
+    with pytest.raises(InvalidStatus) as caught, page.viewer(*arguments, **settings):
+        pass
+    return caught.value.response.status_code
+
+
+def viewers(page):
+    return page.view._server.viewers

@@ -64,11 +64,13 @@ class Subject:
 
 
 SUBJECTS = {
-    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
+    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py", "tests/bridge/test_slcan_damage.py")),
     "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
     "assembler": Subject("firmware_bridge.scans.scan_assembler", ("tests/bridge/test_scan_assembler.py",)),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
-    "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
+    "baseline": Subject(
+        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py", "tests/bridge/test_baseline_files.py")
+    ),
     "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
     "contract": Subject("edge.inference.contract", ("tests/runtime/test_session.py", "tests/bridge/test_pad.py")),
 }
