@@ -20,7 +20,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 LINE_BYTES: Final = 4095
-"""What a pseudo-terminal holds for a reader that does not read."""
+"""Bytes that a pseudo-terminal holds for a reader that does not read."""
 ADAPTER_S: Final = 0.001
 FTDI_S: Final = 0.016
 _HOST_FRAME: Final = struct.Struct("<IIBBBB8sI")
@@ -30,10 +30,10 @@ Fault = Callable[[list[Timed]], list[Timed]]
 
 
 class Reader(NamedTuple):
-    """How a stream is read.
+    """Way in which a stream is read.
 
     Attributes:
-        name: of the way.
+        name: name of the way.
         stamped: the adapter stamps frames.
         usb: gs_usb, a frame a transfer; else slcan.
         latency_s: the adapter hands on what it has once in this time, in [s].
@@ -70,7 +70,7 @@ def bus(
     frame_s: float = FRAME_S,
     first_frame: int = 0,
 ) -> list[Timed]:
-    """What sensors "4", "6", ... send, each at its rate."""
+    """Return the stream of sensors "4", "6", ..., each at its rate."""
     track = numbered(cycles, first=1000).tracks[0]
     controllers = [Controller(track, 4 + 2 * n, rate_hz) for n, rate_hz in enumerate(rates_hz)]
     timeline = bus_timeline(
@@ -162,7 +162,7 @@ def _stalled(
 
 @dataclass
 class Worth:
-    """What the scans of a stream are worth.
+    """Scans of a stream, evaluated against the cycles that were sent.
 
     Attributes:
         scans: given.

@@ -41,7 +41,7 @@ class Forged:
         return Seen(time_ns + 1_000_000, head | {"counters": counters} | changes, counts.astype(np.int32), True)
 
     def change(self, number: int, **changes) -> None:
-        """Say something else in the head of a record."""
+        """Change entries in the head of a record."""
         one = self.seen[number]
         self.seen[number] = one._replace(head=one.head | changes)
 

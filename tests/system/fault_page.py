@@ -1,4 +1,4 @@
-"""What a run among faults showed, as a page."""
+"""Page about a run among faults: promises, accounts, losses and latencies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
 EXIT_SINK: Final = 5
 MEMORY_MB_PER_MINUTE: Final = 0.2
 FEWEST_SIZES: Final = 60
-"""A minute's: in less, what a start allocates is not told from growth."""
+"""Sizes of a minute: in less time, allocations of the start look like growth."""
 SINKS_GIVEN_UP: Final = 4
 _GIVEN_UP: Final = "the other sinks go on"
-"""As stderr says of each; a record of it may be left out where its reader is slow."""
+"""Words on stderr about each sink given up; a record of it may be left out where its reader is slow."""
 
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """What was promised and what was seen."""
+    """Promise of the program, and what the run showed of it."""
 
     text: str
     seen: str
@@ -179,7 +179,7 @@ def _faults(found: Found, told: Told) -> list[tuple[str, ...]]:
 
 
 def _book_line(book: Account) -> str:
-    return line((book.name, str(book.told), str(book.counted), book.tolerance, book.verdict))
+    return line((book.name, str(book.injected), str(book.counted), book.tolerance, book.verdict))
 
 
 def _agreement(books: Sequence[Account]) -> str:

@@ -54,7 +54,7 @@ def mutants(seeds: list[bytes], longest: int, seed: int) -> Iterator[bytes]:
 
 
 def run_blind(name: str, inputs: int, seed: int) -> dict[str, object]:
-    """So many mutants; raises what the first one raises that breaks a promise."""
+    """Run so many mutants; raise the error of the first one that breaks a promise."""
     from fuzz_targets import TARGETS
 
     warnings.simplefilter("error")
@@ -93,7 +93,7 @@ def run_guided(name: str, inputs: int, seed: int, folder: Path, most_s: int) -> 
 
 
 def child(name: str, options: list[str]) -> None:
-    """What atheris runs: the parsers' own code is instrumented, that of libraries is not."""
+    """Run atheris: the parsers' own code is instrumented, that of libraries is not."""
     import atheris
 
     with atheris.instrument_imports(include=PACKAGES):

@@ -124,7 +124,7 @@ def tiny_model(**metadata: object) -> bytes:
 
 
 def onnx_walk(data: bytes) -> None:
-    """What is checked before onnxruntime reads a byte."""
+    """Run the checks that come before onnxruntime reads a byte."""
     refused(lambda: check_plain(data), ModelError)
 
 
@@ -168,7 +168,7 @@ def frozen_seeds() -> list[bytes]:
 
 
 def sequences(data: bytes) -> None:
-    """Taps to train on, with the hash that the file tells made right."""
+    """Load taps to train on, after the hash in the file is made right."""
     for _ in range(2):
         try:
             load_sequences(as_file("taps.npz", data))

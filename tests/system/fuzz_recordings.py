@@ -69,7 +69,7 @@ def csv_seeds() -> list[bytes]:
 
 
 def csv_rows(data: bytes) -> None:
-    """The same behind a whole header, which chance would never find again."""
+    """Load rows after a whole header, which chance would never produce."""
     csv(HEADER + data)
 
 
@@ -81,7 +81,7 @@ def csv_rows_seeds() -> list[bytes]:
 
 
 def csv_rate(data: bytes) -> None:
-    """The file beside a recording that tells its rate."""
+    """Load a recording with the file next to it that holds its rate."""
     as_file("meta_data.csv", data)
     try:
         recording = refused(lambda: load_recording(as_file("rated.csv", CSV)), RecordingError)
@@ -165,7 +165,7 @@ def mcap_seeds() -> list[bytes]:
 
 
 def npy_in_npz(data: bytes) -> None:
-    """An npz file whose container is whole, so that what is fuzzed is an array in it: first a byte that says which."""
+    """Load an npz file with a whole container and one fuzzed array, which the first byte selects."""
     if data:
         npz(stored(MEMBERS | {sorted(MEMBERS)[data[0] % len(MEMBERS)]: data[1:]}))
 

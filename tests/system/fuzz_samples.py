@@ -18,7 +18,7 @@ REST = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape
 
 
 def refused(read: Callable[[], object], *errors: type[Exception]) -> object | None:
-    """What was read; None where it was refused in one line."""
+    """Return what was read; None where it was refused in one line."""
     try:
         return read()
     except errors as error:

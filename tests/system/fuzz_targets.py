@@ -1,4 +1,4 @@
-"""Every parser of what comes from outside: what it may be fed first, and what must be true of whatever it is fed.
+"""Targets of the fuzzer: every parser of outside input, with valid inputs to begin with.
 
 A target takes bytes and returns; only the errors that a parser documents are caught. `python tests/system/fuzz.py` runs
 them guided by coverage, tests/hostile/test_fuzz.py for some seconds without.

@@ -62,7 +62,7 @@ def gs_usb_seeds() -> list[bytes]:
 
 
 def gs_usb_limits(data: bytes) -> None:
-    """What an adapter says of itself."""
+    """Decode what an adapter reports about itself."""
     limits = refused(lambda: BitTimingLimits.from_bytes(data), ValueError)
     if isinstance(limits, BitTimingLimits):
         timing = refused(lambda: bit_timing(limits), ValueError)
@@ -106,7 +106,7 @@ def slcan_seeds() -> list[bytes]:
 
 
 def commands(data: bytes) -> None:
-    """Whatever comes on stdin: commands are known ones, and no more than the lines that hold one."""
+    """Read anything on stdin: commands are those that exist, and no more than the lines that hold one."""
     read_end, write_end = os.pipe()
     try:
         os.write(write_end, data)

@@ -85,7 +85,7 @@ EQUIVALENT: dict[str, dict[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What became of one module's mutants."""
+    """Outcome of one module's mutants."""
 
     subject: str
     possible: int
@@ -120,7 +120,7 @@ class _InPlaceOf(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def passes(subject: Subject, code: CodeType, limit_s: int) -> tuple[bool, float]:
-    """Whether the module's tests pass with this code in so much processor time, and how much they took in [s]."""
+    """Return if the module's tests pass with this code in so much processor time, and the time they took in [s]."""
     gc.freeze()
     child = os.fork()
     if child == 0:

@@ -26,7 +26,7 @@ from edge.terminal.argument_types import whole
 
 WARM_UP_S: Final = 20.0
 SETTLE_S: Final = 12.0
-"""As long as the server may take to tidy up."""
+"""Time that the server may take to tidy up."""
 TOGETHER: Final = 4
 TIMEOUT_S: Final = 60.0
 PLAY: Final = Play(pressed=500, moving=True)
@@ -46,7 +46,7 @@ _AT_ONCE: Final = 100
 
 
 def _connect(connection: socket.socket, left: int) -> int:
-    """Say nothing, and go when the server has seen that."""
+    """Send nothing, and go when the server has noticed it."""
     connection.shutdown(socket.SHUT_WR)
     connection.recv(1)
     return 1

@@ -1,9 +1,9 @@
-"""What the live page costs the loop: the whole program with nobody, one and three who look, in turn.
+"""Cost of the live page to the loop: the whole program without, with one and with three viewers, in turn.
 
     python tests/system/page_cost.py [--rounds 5] [--seconds 10]
 
 Every scan is in contact and new, so that every scan takes an inference. In each round one program runs without a page,
-and one with it, on which viewers come and go; ratios are to the first, of blocks measured beside each other.
+and one with it, on which viewers come and go; ratios are to the first, of blocks measured next to each other.
 """
 
 import argparse
@@ -37,7 +37,7 @@ _LOOK: Final = "--look"
 
 @dataclass
 class Blocks:
-    """What was measured with as many viewers.
+    """Measurements with one number of viewers.
 
     Attributes:
         p50_us: medians of latencies, from a scan's last byte to its pattern, one a block, in [us].

@@ -54,7 +54,7 @@ def test_the_command_refuses_what_cannot_be(capsys):
 
 
 def test_kill_9_leaves_whole_records(tmp_path):
-    """Of a file of records all but the last line, of an npz every row that was begun and ended."""
+    """All but the last line of a file of records are whole, and every row of an npz that was begun has ended."""
     recording = write_recording(tmp_path / "played.csv", make_recording(200).tracks[0].counts, rate_hz=400)
     command = [sys.executable, "-m", "edge.cli.main", "--source", f"replay:{recording}", "--rate-hz", "400"]
     command += ["--sink", f"jsonl:{tmp_path}/out.jsonl", "--sink", f"npz:{tmp_path}/out.npz", "--sink", "jsonl:-"]
@@ -122,7 +122,7 @@ def test_the_cable_comes_out_and_back(tmp_path, fault):
 
 
 def test_what_a_reset_cuts_off_is_no_bad_line(tmp_path):
-    """Whoever opens anew has left before the adapter refuses to close."""
+    """A client that opens again has left before the adapter refuses to close."""
     faults = spoilt("merged=1@0+.1,reset@.1+.1")
     with Emulator([make_recording(100)], loop=True, faults=faults) as emulator:
         link = SlcanSerialLink(emulator.port)

@@ -113,8 +113,13 @@ def test_of_records_that_were_left_out_missing_taxels_alone_are_not_known():
     consistent = [name for name, book in books.items() if book.verdict == CONSISTENT]
     assert consistent == ["taxels missing in records"] and differing(forged.judged(), forged) == []
     assert books[consistent[0]].tolerance == "-16 in records left out"
-    assert (books["readings in no record"].told, books["readings in no record"].counted) == (13, 13)
-    for missing in (2, 4, -1, 17):  # what is off by one is found in the readings, and what no record can hold at once
+    assert (books["readings in no record"].injected, books["readings in no record"].counted) == (13, 13)
+    for missing in (
+        2,
+        4,
+        -1,
+        17,
+    ):  # a count that is off by one is detected in the readings, and so is what no record can hold at once
         counters["missing_taxels"] = missing
         assert "readings in no record" in differing(forged.judged(), forged)
     assert "taxels missing in records" in differing(forged.judged(), forged)

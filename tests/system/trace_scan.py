@@ -4,7 +4,7 @@
 
 An emulated adapter, in a process of its own, plays a press that goes on; `edge-sr` runs in this one, with Python's
 profiling hook in every thread. A call is one that enters a function, a generator or a comprehension of the project; of
-scans that got a pattern, and of what the reader did between two of them, the median is told.
+scans that got a pattern, and of what the reader did between two of them, the median is printed.
 """
 
 import os

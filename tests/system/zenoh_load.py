@@ -49,7 +49,7 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 PERIOD_NS: Final = 10_000_000
 APART_SCANS: Final = 97
-"""By which each sensor is ahead of the one before it in the same stream."""
+"""Scans by which each sensor is ahead of the one before it in the same stream."""
 SETTLE_S: Final = 1.0
 PATIENCE_S: Final = 60.0
 KEY: Final = "bench"
@@ -112,12 +112,12 @@ class PacedLink(Link):
         return given
 
     def counters(self) -> dict[str, int]:
-        """How many were given."""
+        """Number of scans given."""
         return {"scans": self._tick * len(self._sensors)}
 
 
 def write(pipe: Connection, setup: str, endpoint: str, sensors: list[str], ticks: int) -> None:
-    """A process that writes; says when it is ready, waits for a word, and tells what it wrote."""
+    """Write in a process of its own: report when it is ready, wait for a word, and report what was written."""
     model = ModelSession(find_model(DEFAULT_MODEL))
     scans, _ = stream(load_frozen_set(FROZEN_FILE), 1)
     rest, now_s = REST.astype(np.float32), time.time()
@@ -159,7 +159,7 @@ def _paced(made: Sequence[Result], sensors: Sequence[str], ticks: int) -> Iterat
 
 
 def consume(pipe: Connection, endpoint: str) -> None:
-    """A process that reads everything; tells what came when it is asked."""
+    """Read everything in a process of its own, and report what came on demand."""
     import zenoh
 
     config = zenoh.Config()
@@ -227,7 +227,7 @@ def run(setup: str, sensors: int, processes: int, seconds: float) -> tuple[float
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """A process that begins now never hears Ctrl-C: it ends when it is told to, or killed."""
+    """Hold Ctrl-C back from processes that begin now; they end on a command, or when they are killed."""
     resource_tracker.ensure_running()  # where the first process starts it, it lets signals through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -284,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = " ".join(f"--{name} {asked[name]:g}" for name in ("sensors", "processes", "seconds", "runs"))
     try:
         zenoh_version = version("eclipse-zenoh")
-        if options.out is not None:  # found out before minutes are spent
+        if options.out is not None:  # detected before minutes are spent
             options.out.mkdir(parents=True, exist_ok=True)
         command = f"python tests/system/zenoh_load.py {command}"
         made = provenance(command, [__file__], [find_model(DEFAULT_MODEL), FROZEN_FILE])
