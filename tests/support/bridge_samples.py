@@ -1,4 +1,4 @@
-"""What the tests of the bridge share: recordings, and reading a link to its end."""
+"""Helpers of the bridge's tests: recordings, and reading a link to its end."""
 
 import csv
 import os
@@ -32,7 +32,7 @@ def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recordi
 
 
 def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None) -> Path:
-    """A recording as a CSV file, its rate beside it."""
+    """Write a recording as a CSV file, with its rate in a file next to it."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_HEADER)

@@ -24,7 +24,7 @@ from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import BaselineEstimator, save_baselines
 
 CHROMIUM = shutil.which("chromium")
-if os.environ.get("EDGE_BROWSER") != "1":  # whoever says 1 has both, and that one is missing is no reason to skip
+if os.environ.get("EDGE_BROWSER") != "1":  # a machine with 1 must have both, so that a missing one fails
     if CHROMIUM is None:
         pytest.skip("no chromium here: apt-get install chromium", allow_module_level=True)
     pytest.importorskip("playwright.sync_api")
@@ -34,7 +34,7 @@ TIMEOUT_MS = 60_000
 PERIOD_NS = 10_000_000
 TOKEN = "of-twelve-letters"
 NOISE_COUNTS = 3
-"""Of a pad that is pressed and held: a taxel that repeats itself would be taken for a stuck one."""
+"""Noise of a pad that is pressed and held, since a taxel that repeats itself is taken for a stuck one."""
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def browser():
 
 @pytest.fixture
 def open_page(browser):
-    """Opens pages; in none of them may a request leave the server, or an error come."""
+    """Function that opens pages; in none of them may a request leave the server, or an error come."""
     asked, wrong, contexts = [], [], []
 
     def open_page(url, **settings):
@@ -78,7 +78,7 @@ def open_page(browser):
 
 @contextlib.contextmanager
 def edge_sr(*arguments):
-    """`edge-sr --view 0`, and the address that it tells."""
+    """Run `edge-sr --view 0` and yield it with the address that it reports."""
     process = subprocess.Popen(
         [sys.executable, "-m", "edge.cli.main", "--view", "0", *map(str, arguments)],
         cwd=ROOT,
@@ -118,7 +118,7 @@ def demo():
 
 @pytest.fixture(scope="module")
 def folder(demo, tmp_path_factory):
-    """With stored baselines of the demo's sensor under two names."""
+    """Folder with stored baselines of the demo's sensor under two names."""
     folder = tmp_path_factory.mktemp("view")
     save_baselines(folder / "zero.json", [zeroed(demo, sensor) for sensor in ("4", "6")])
     return folder

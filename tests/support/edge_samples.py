@@ -1,4 +1,4 @@
-"""What the runtime's tests share: a tiny real model, a sensor at rest and under load, links that are scripts."""
+"""Samples for the runtime's tests: a tiny real model, a sensor at rest and under load, scripted links."""
 
 import subprocess
 import threading
@@ -65,13 +65,13 @@ def make_contract(**changes) -> Contract:
 
 
 def make_pad_contract(**changes) -> Contract:
-    """Of a model that takes a pad and gives traction."""
+    """Return the contract of a model that takes a pad and gives traction."""
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
     return make_contract(**({"pad_inputs": pad_inputs, "takes_gains": True, "traction_scale": 2} | changes))
 
 
 def make_wrench_result(number: int = 0, press_counts: float = 20_000, **settings):
-    """What a model with traction makes of a press on taxel 5: .44 N there, where nothing is known of the pad."""
+    """Return the result of a model with traction for a press on taxel 5: 0.44 N there, on a pad without data."""
     contract = make_pad_contract(interval_factor=1.6)
     runtime = Runtime(FakeModel(contract), **{"source": "device", "baselines": {"4": BASELINE}} | settings)
     return runtime.push(make_scan(number, press_counts=press_counts, time_ns=time.monotonic_ns()))
@@ -167,23 +167,23 @@ def write_model(
 
 
 def tiny_stiffness(pad_row: np.ndarray) -> float:
-    """How much stronger the tiny model's outputs are for a pad."""
+    """Return the factor by which the tiny model's outputs are stronger for a pad."""
     return 1 + float(pad_row @ np.arange(1, len(pad_row) + 1))
 
 
 def tiny_traction(window_units: np.ndarray, scale: int) -> np.ndarray:
-    """What the tiny model makes of a window (taps, 3, rows, cols), as traction (3, h, w)."""
+    """Return the tiny model's traction (3, h, w) for a window (taps, 3, rows, cols)."""
     return np.kron(window_units[0], np.ones((1, scale, scale)))
 
 
 def tiny_pattern(window_units: np.ndarray, scale: int = 10) -> np.ndarray:
-    """What the tiny model makes of a window (taps, 3, rows, cols) in network units."""
+    """Return the tiny model's pattern for a window (taps, 3, rows, cols) in network units."""
     z = sum(window_units[tap, 2] * 10.0**-tap for tap in range(len(window_units)))
     return np.kron(z, np.ones((scale, scale)))
 
 
 def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
-    """What the tiny model says of its pattern's deviation."""
+    """Return the tiny model's deviation for its pattern."""
     return TINY_DOUBT * (1 + np.abs(pattern))
 
 

@@ -1,7 +1,7 @@
-"""A pretended gs_usb adapter: what a candleLight does with requests, frames and a client that dies.
+"""Emulated gs_usb adapter that treats requests, frames and a client that dies as a candleLight does.
 
-It is no kinder than the device. Its queue holds 64 frames, and what finds no room is lost and told by a flag on the
-next frame. It hears nothing without the right bit timing. A client's death does not stop it. And if the USB device is
+It is no kinder than the device. Its queue holds 64 frames; a frame without room is lost, and a flag on the next frame
+reports it. It receives nothing without the right bit timing. A client's death does not stop it. And if the USB device is
 reset while a frame waits to be fetched, it is mute until it is unplugged (candleLight_fw issues 46, 165, up to 2026).
 """
 
@@ -37,14 +37,14 @@ class StalledError(Exception):
 
 
 class GsUsbAdapter:
-    """One adapter, from one plugging-in to the next. Its methods may be called from any thread.
+    """Adapter from one plugging-in to the next. Its methods may be called from any thread.
 
     Attributes:
-        started: its channel is on the bus.
-        right_bitrate: the timing it was given makes 1 Mbit/s.
+        started: true while its channel is on the bus.
+        right_bitrate: true where its timing makes 1 Mbit/s.
         sent: frames that it put on the bus for the client.
-        lost_frames: frames that found no room.
-        mute: it will send nothing any more.
+        lost_frames: frames that had no room.
+        mute: true once it sends no more.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class GsUsbAdapter:
 
     @property
     def plugged(self) -> bool:
-        """Its cable is in."""
+        """True while its cable is in."""
         return self._plugged
 
     @property
@@ -81,7 +81,7 @@ class GsUsbAdapter:
         return len(self._queue)
 
     def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
-        """Frames come over the bus, at `stamp_us` of its clock, by default now."""
+        """Receive frames from the bus, at `stamp_us` of its clock, by default now."""
         self._receive(frames, 0, stamp_us, channel)
 
     def report(self, classes: int, data: bytes = bytes(8)) -> None:
@@ -89,7 +89,7 @@ class GsUsbAdapter:
         self._receive((CanFrame(classes, data),), gs_usb.ERROR, None, 0)
 
     def unplug(self) -> None:
-        """Pull the cable out: whoever waits for it is told."""
+        """Pull the cable out, and wake all who wait for it."""
         with self._changed:
             self._plugged = False
             self._changed.notify_all()
@@ -188,5 +188,5 @@ class GsUsbAdapter:
             and 1 <= timing.sjw <= limits.sjw_max
             and limits.brp_min <= timing.brp <= limits.brp_max
         ):
-            return  # it takes no notice, and says nothing
+            return  # it ignores the request without an error
         self.right_bitrate = limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S

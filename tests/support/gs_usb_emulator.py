@@ -1,6 +1,6 @@
-"""USB with pretended gs_usb adapters, as a backend of pyusb: what libusb would answer, its errors included."""
+"""USB with emulated gs_usb adapters, as a backend of pyusb that answers as libusb, errors included."""
 
-# What each method is for, pyusb says; and since it is untyped, pyright takes its empty methods to return None.
+# The purpose of each method is in the documentation of pyusb; since pyusb is untyped, pyright takes its empty methods to return None.
 # pyright: reportIncompatibleMethodOverride=false
 
 import errno
@@ -60,7 +60,7 @@ class GsUsbPort:
         usb_id: tuple[int, int] = (0x1D50, 0x606F),
         packet_bytes: int = 32,
     ) -> None:
-        """Plug one in; `adapter` makes it, each time anew."""
+        """Plug an adapter in; `adapter` makes a new one each time."""
         self.serial_number = serial_number
         self.product = product
         self.kernel_driver = False
@@ -75,14 +75,14 @@ class GsUsbPort:
         self.adapter = adapter()
 
     def plug(self) -> None:
-        """Plug it in again: it begins anew, under another address."""
+        """Plug it in again: a new adapter under another address."""
         self.address += 1
         self.claimed = False
         self.adapter = self._make()
 
 
 class _Plugged:
-    """What libusb knows a device by: gone for good once it was unplugged."""
+    """Handle by which libusb identifies a device: gone for good once it was unplugged."""
 
     def __init__(self, port: GsUsbPort) -> None:
         self.port = port

@@ -1,4 +1,4 @@
-"""What the tests of MCAP recordings share: a recording, and reading one with the public package."""
+"""Helpers for tests of MCAP recordings: a recording, and reading one with the public package."""
 
 from collections import defaultdict
 from dataclasses import replace

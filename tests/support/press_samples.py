@@ -1,4 +1,4 @@
-"""Sets of presses with closed forms, for whoever learns from them."""
+"""Sets of presses with closed forms, for tests of learning."""
 
 import numpy as np
 

@@ -42,7 +42,7 @@ def fields(name):
 
 
 def dds_type(name):
-    """As rmw_cyclonedds names it."""
+    """Return the DDS type of a message, named as by rmw_cyclonedds."""
     package, _, message = name.split("/")
     members = {}
     for field, kind, many in fields(name):

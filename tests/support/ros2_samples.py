@@ -15,7 +15,7 @@ from edge.perception.result import Result
 from edge.sinks.ros2.sink import Ros2Sink
 
 TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
-"""Whoever else tests on this machine is not heard."""
+"""Tag that keeps other test runs on this machine apart."""
 ENVIRONMENT = {
     "ROS_DOMAIN_ID": str(1 + os.getpid() % 90),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",

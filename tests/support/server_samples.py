@@ -1,4 +1,4 @@
-"""Messages of a pretended server made by hand, and what the tests of its link share."""
+"""Messages of a server made by hand, and helpers for the tests of its link."""
 
 import json
 import time
@@ -14,7 +14,7 @@ MS = 1_000_000
 
 
 def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, **changes) -> dict:
-    """What a server of 1.8.0 says of one sensor; a change to None leaves the key out."""
+    """Return the entry of a server 1.8.0 about one sensor; a change to None leaves the key out."""
     values = np.asarray(counts).reshape(3, 16).T.ravel().tolist()
     entry = {
         "time": time_s,
@@ -49,7 +49,7 @@ def wait_for(condition, timeout_s=60.0):
 
 
 def lose(link):
-    """What the link says when it is lost."""
+    """Read until the link is lost, and return its error's text."""
     end_s = time.monotonic() + 60
     while time.monotonic() < end_s:
         try:

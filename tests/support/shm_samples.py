@@ -49,7 +49,7 @@ def make_result(number=0, *, contract=CONTRACT, press_counts=0, **of_the_scan):
 
 
 def latest(memory: memoryview, sensor: str) -> bytes | None:
-    """Of any source and age: made up as they are here."""
+    """Return the newest half, of any source and age, since the tests make both up."""
     return shm_read.latest(memory, sensor, oldest_s=math.inf, pretend=True)
 
 
@@ -58,7 +58,7 @@ def heartbeat_ns(memory: memoryview) -> int:
 
 
 def writing(memory: memoryview, within_s: float = 0.5) -> bool:
-    """Whether the writer lives."""
+    """Return True while the writer lives."""
     return time.monotonic_ns() - heartbeat_ns(memory) < within_s * 1e9
 
 

@@ -1,4 +1,4 @@
-"""What the live page's tests share: a run to look at, and viewers over loopback."""
+"""Samples for the live page's tests: a run to look at, and viewers over loopback."""
 
 import http.client
 import socket
@@ -63,7 +63,7 @@ class Page:
 
     def viewer(self, query="", *, host="127.0.0.1", origin=None, **settings):
         headers = {} if origin is None else {"Origin": origin}
-        # One that has not read everything cannot hear that the server closes.
+        # A viewer that has not read everything does not notice that the server closes.
         settings = {"compression": None, "additional_headers": headers, "close_timeout": 0.2} | settings
         return connect(f"ws://{host}:{self.port}/ws{query}", **settings)
 
@@ -79,7 +79,7 @@ class Page:
                 sink.write(result, {"dropped": 0})
 
     def wait(self):
-        """As the loop does while nothing comes."""
+        """Call the sinks as the loop does while nothing comes."""
         for sink in self.view.sinks:
             sink.wait()
 

@@ -125,5 +125,5 @@ def wait_for(condition, within_s=10):
 
 
 def hear_interrupts():
-    """As from a terminal: who started the tests may have SIGINT ignored."""
+    """Restore SIGINT as in a terminal, since the tests may have been started with it ignored."""
     signal.signal(signal.SIGINT, signal.default_int_handler)

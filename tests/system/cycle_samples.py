@@ -165,13 +165,13 @@ class Worth:
     """Scans of a stream, evaluated against the cycles that were sent.
 
     Attributes:
-        scans: given.
-        whole: of these, with sixteen new readings.
-        mixed: of these, of more than one cycle.
-        mixed_torn: of the others.
-        waits_ms: from the last frame of a cycle, as it was read, to its scan.
-        counters: of the reader.
-        numbers: of whole scans, by sensor, the cycle of each.
+        scans: number of scans.
+        whole: scans with sixteen new readings.
+        mixed: whole scans of more than one cycle.
+        mixed_torn: other scans of more than one cycle.
+        waits_ms: times from the last frame of a cycle, as it was read, to its scan.
+        counters: counters of the reader.
+        numbers: cycles of whole scans, by sensor.
     """
 
     scans: int = 0

@@ -1,7 +1,7 @@
 """Whole program for a minute, or EDGE_SOAK_MINUTES; `make test` runs it next to the other tests.
 
-Therefore nothing is asserted that these can do to it: no time, and of latency only that its quiet quarter has not grown beyond
-what they may take.
+Therefore nothing is asserted that these can do to it: no time, and of latency only that its quiet quarter has not
+grown beyond what they may take.
 """
 
 import json

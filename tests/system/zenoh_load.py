@@ -112,7 +112,7 @@ class PacedLink(Link):
         return given
 
     def counters(self) -> dict[str, int]:
-        """Number of scans given."""
+        """Return the number of scans."""
         return {"scans": self._tick * len(self._sensors)}
 
 
