@@ -1,6 +1,6 @@
 """USB with emulated gs_usb adapters, as a backend of pyusb that answers as libusb, errors included."""
 
-# The purpose of each method is in the documentation of pyusb; since pyusb is untyped, pyright takes its empty methods to return None.
+# The documentation of pyusb explains each method. It is untyped, so pyright takes its empty methods to return None.
 # pyright: reportIncompatibleMethodOverride=false
 
 import errno
