@@ -119,7 +119,7 @@ def test_a_load_is_seen_against_a_reference():
     pressed[:, 2, 2, 1] += 350
     with pytest.raises(BaselineRefusedError, match=rf"\(2, 1\) z is 35\d counts above the baseline {reference.id}"):
         push_all(BaselineEstimator(reference=reference), pressed)
-    # The known limit: without a reference such a load is zeroed away.
+    # A documented limit: without a reference such a load is zeroed away.
     assert push_all(BaselineEstimator(), pressed)[-1] is not None
 
 

@@ -14,7 +14,7 @@ from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, decode
 from firmware_bridge.scans.scan import ABSENT
 
-# What the controller says.
+# Frames of the controller.
 
 
 def test_a_scan_is_sixteen_frames_in_the_order_of_sda_and_taxel():
@@ -82,7 +82,7 @@ def test_looping_goes_on_in_time():
     assert decode(frames[32][1], USPA44_MAP) == decode(frames[0][1], USPA44_MAP)
 
 
-# What the adapter says.
+# Answers of the adapter.
 
 FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
 

@@ -1,4 +1,4 @@
-"""Emulated adapter behind a pseudo-terminal, in this process and as a command."""
+"""Emulated adapter on a pseudo-terminal, in this process and as a command."""
 
 import contextlib
 import os
@@ -93,7 +93,7 @@ def test_a_slow_reader_loses_frames_and_stops_nobody():
             time.sleep(0.001)
         decoder.feed(read_to_the_end(port), 0)
         told = decoder.counters()
-        # A frame of which a part found room is lost as well: its head is skipped before the next.
+        # A frame of which only a part had room is lost as well: its head is skipped before the next.
         assert told["frames"] == emulator.sent_frames
         assert told["frames"] + emulator.lost_frames == 400 * 16
 
@@ -121,7 +121,7 @@ def test_the_cable_out():
 
 
 def test_a_link_replaces_links_alone(tmp_path):
-    """Neither a user's file at its place nor one beside it is touched."""
+    """The user's files at its place and next to it are left alone."""
     link, beside = tmp_path / "skin", tmp_path / "skin.new"
     beside.write_text("mine")
     for make in (lambda: link.write_text("mine"), link.mkdir):

@@ -69,7 +69,7 @@ def test_a_scan_comes_with_its_last_frame(bus):
         assert [link.read(0.0) for _ in range(15)] == [[]] * 15 and link.read(0.01) == []
         bus.send(message_of(frames_of(1)[15]))
         (scan,) = link.read(100.0)
-        assert scan.complete and scan.device_ns is None  # it says no time
+        assert scan.complete and scan.device_ns is None  # it carries no time
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
@@ -220,7 +220,7 @@ def error_message(classes, *data):
 
 @pytest.fixture
 def lasting(bus, monkeypatch):
-    """A socketcan link that is opened anew when it is silent, over the virtual bus, on a clock of its own."""
+    """Link of socketcan that is opened again when it is silent, over the virtual bus, on a clock of its own."""
     now_ns = [10**12]
     monkeypatch.setattr(can_bus, "_check_network", lambda name: None)
     link = link_to(bus, clock_ns=lambda: now_ns[0])
@@ -230,7 +230,7 @@ def lasting(bus, monkeypatch):
     with LastingLink(link, clock_ns=lambda: now_ns[0]) as lasting:
 
         def read(*messages):
-            """What came, then a second of nothing, and what the next read does about that."""
+            """Read messages, then let a second pass without any, and read again."""
             for message in messages:
                 bus.send(message)
                 lasting.read(0.0)
@@ -244,7 +244,7 @@ def lasting(bus, monkeypatch):
 
 @pytest.mark.parametrize(("told", "words"), [(error_message(0x40), "bus-off"), (error_message(4, 0, 0x10), "passive")])
 def test_a_bus_that_is_off_stays_so_however_often_a_socket_is_opened(lasting, told, words):
-    """The kernel tells of it once, to the sockets that are open then."""
+    """The kernel reports it once, to the sockets that are open then."""
     for number in range(4):
         link = lasting(told) if number == 0 else lasting()
         assert words in (link.trouble or ""), number

@@ -90,7 +90,7 @@ def test_the_time_of_the_device_is_what_it_says():
     clock_ns = [10**12]
     port, link = opened(clock_ns=lambda: clock_ns[0])
     with link:
-        for start_us in (0xFFFFFF00, 0xFFFFFF00 + 10_000):  # the second behind the wrap
+        for start_us in (0xFFFFFF00, 0xFFFFFF00 + 10_000):  # the second after the wrap
             for number, frame in enumerate(frames_of(1)):
                 port.adapter.hear(frame, stamp_us=start_us + 130 * number)
                 clock_ns[0] += 130_000 + 2_000_000 * (number == 15)

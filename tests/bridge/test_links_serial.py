@@ -80,7 +80,7 @@ def test_opening_late_loses_nothing_of_a_recording():
 
 
 def counting_recording(scans: int, rate_hz: float) -> Recording:
-    """Every count tells which cycle it is of."""
+    """Return a recording whose counts encode their cycle."""
     counts = REST_COUNTS.astype(np.int32) + np.arange(scans, dtype=np.int32)[:, None, None, None]
     return Recording(Path("counting.csv"), (Track("4", counts, None),), rate_hz)
 
@@ -198,7 +198,7 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
 
 @pytest.mark.parametrize("piece_bytes", [1, 22, 62, 100, 352])
 def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes):
-    """Also behind one that was torn, which its own end cannot close."""
+    """The same holds after a torn scan, which its own end cannot close."""
     lines = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         for sent, complete in ((lines, [True]), (lines[:3] + lines[4:], []), (lines, [False, True]), (lines, [True])):
@@ -277,7 +277,7 @@ def test_triggers_wake_older_controllers():
 
 @pytest.mark.parametrize("old_canable", [True, False])
 def test_what_lay_there_because_nobody_read_is_marked_old(old_canable):
-    """Without stamps readings of seconds ago were as new as any."""
+    """Readings without stamps that are seconds old would look new."""
     playing = Emulator([make_recording(50)], loop=True, old_canable=old_canable)
     with playing as emulator, SlcanSerialLink(emulator.port) as link:
         read_scans(link, 20)

@@ -150,7 +150,7 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     assert code == 0, capsys.readouterr().err
     lines = [json.loads(line) for line in records.read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
-    # A machine that stands still for a moment tells of a silent server: an event, of no sensor.
+    # A machine that stands still for a moment reports a silent server: an event, of no sensor.
     assert {line["sensor"] for line in lines if line["state"] != "event"} == {"1"}
     idle = [line for line in lines if line["state"] == "idle"]
     assert idle and all(line["force_n"] == line["vendor_force_n"][2] for line in idle)
@@ -192,7 +192,7 @@ def test_ctrl_c_ends_the_emulator_quietly(monkeypatch, capsys):
 
 
 def test_simulation_mode_looks_like_a_sensor():
-    """Nothing in its messages says what it is; of ours, only the version does."""
+    """The vendor's messages do not state their kind; only the version of an emulated server does."""
     with ServerEmulator(VendorServer([sim_recording()], loop=True)) as server, XelaServerLink(server.url) as link:
         assert read_scans(link, 5)[-1].complete and link.trouble is None
 

@@ -54,7 +54,7 @@ def test_a_scan_has_the_time_of_its_newest_frame():
 
 @pytest.mark.parametrize("cut", [1, 26, 100, 416, 1000])
 def test_any_chunking_gives_the_same_times(cut):
-    """Also of two sensors whose frames mix, which no cycle holds whole. What came in time sets the clock, first."""
+    """The frames of two sensors mix, so that no cycle is whole; frames that came in time set the clock first."""
     lines = [line for n in range(9) for line in cycle_lines(n, 110 + 10 * n)]
     pairs = [zip(cycle_lines(n, 110 + 10 * n), other_cycle(n), strict=True) for n in range(9)]
     mixed = [line for cycles in pairs for pair in cycles for line in pair]
@@ -70,7 +70,7 @@ def test_any_chunking_gives_the_same_times(cut):
 
 
 def other_cycle(number: int) -> list[bytes]:
-    """Of controller 6, stamped alike."""
+    """Return the lines of a cycle of controller 6, with equal stamps."""
     return [line[:3] + b"6" + line[4:] for line in cycle_lines(number, 110 + 10 * number)]
 
 
@@ -139,7 +139,7 @@ def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatc
 
 
 def test_to_leave_stamps_out_waits_for_a_read_that_may_take_its_time(monkeypatch):
-    """Who reads several links in one thread must not wait for the quiet line of one of them."""
+    """A reader of several links in one thread must not wait for the quiet line of one of them."""
     monkeypatch.setattr(slcan_status, "SILENCE_NS", 10**12)
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         assert device.received(10) == b"C\rS8\rZ1\rO\r" and link.wait_on() is not None

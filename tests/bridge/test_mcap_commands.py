@@ -44,7 +44,7 @@ def environment():
 
 
 def scans_on_disk(path):
-    """As the public package reads a file that has no end yet, from front to back."""
+    """Return the scans that the public package reads, front to back, from a file that has no end yet."""
     seen = []
     with suppress(FileNotFoundError, EndOfFile), path.open("rb") as file:
         for record in StreamReader(file).records:
@@ -116,7 +116,7 @@ class TestOffline:
 
     @pytest.mark.parametrize("suffix", ["mcap", "npz"])
     def test_it_begins_with_the_baseline_of_its_first_scan_unless_told_otherwise(self, made, tmp_path, suffix):
-        """A recording that begins in contact: zeroed anew, the press would be gone."""
+        """The recording begins in contact: zeroed again, the press would be gone."""
         path = tmp_path / f"press.{suffix}"
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
         sink = open_sink(f"{suffix}:{path}", SURE, unix_offset_ns=1_012_400_000_000)
@@ -128,14 +128,14 @@ class TestOffline:
             assert {one["baseline"] for one in got} == {BASELINE.id}
             # Longer than that nobody believes a taxel that is pressed alone.
             assert {one["state"] for one in got[:18]} <= {"contact", "dropped"}
-            # Played at its pace it is of now, and so is its age, where the file tells when it was made.
+            # Played at its pace it is of now, and so is its age, where the file holds its date.
             assert got[0]["baseline_age_s"] > 1e9 if age_s is None else abs(got[0]["baseline_age_s"] - age_s) < 60
         got = replayed(made, tmp_path / "a.jsonl", "--zero", file=path)
         assert [one["state"] for one in got] == ["zeroing"] * 99 + ["idle"] * 31
 
     @pytest.mark.parametrize("age_s", [3000.0, None])
     def test_a_baseline_older_than_the_machine_is_so_in_every_generation(self, made, tmp_path, age_s):
-        """An npz says how old it was, and its times are those since the machine was started."""
+        """An npz holds its age, and its times are those since the machine was started."""
         path = tmp_path / "press.npz"
         sink = open_sink(f"npz:{path}", SURE)
         for result in make_results([make_scan(number, press_counts=3000, noise=1) for number in range(5)]):
@@ -194,7 +194,7 @@ class TestRecord:
         assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
     def test_a_killed_recorder_leaves_all_that_was_on_the_disk(self, made, tmp_path):
-        """How much that is depends on the machine: docs/recordings.md tells what was measured."""
+        """The amount depends on the machine; docs/recordings.md gives a measured one."""
         path = tmp_path / "killed.mcap"
         process = subprocess.Popen(
             [

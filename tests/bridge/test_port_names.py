@@ -1,4 +1,4 @@
-"""Serial port under another name: it is found by its serial number or path."""
+"""Serial port under another name, identified by its serial number or path."""
 
 import pytest
 from bridge_samples import make_recording, read_scans
@@ -64,7 +64,7 @@ def test_a_link_through_a_name_for_the_port(tmp_path):
 
 
 def test_the_cable_out_and_in_again_under_another_name(monkeypatch):
-    """Over real pseudo-terminals, which only the listing takes for USB."""
+    """The ports are real pseudo-terminals, which only the listing takes for USB."""
     plugged: list[ListPortInfo] = []
     monkeypatch.setattr(list_ports, "comports", lambda: list(plugged))
 

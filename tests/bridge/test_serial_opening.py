@@ -65,7 +65,7 @@ def test_commands_are_thrown_away_only_if_the_device_does_not_take_them(monkeypa
     with SilentDevice() as device:
         with SlcanSerialLink(device.port):
             monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.02)
-            # A pseudo-terminal never tells that something is unsent.
+            # A pseudo-terminal never reports unsent bytes.
             monkeypatch.setattr(serial.Serial, "out_waiting", unsent)
             monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda port: thrown.append(port))
         assert bool(thrown) == bool(unsent)

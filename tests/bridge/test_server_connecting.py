@@ -21,7 +21,7 @@ from firmware_bridge.links.xela_server import XelaServerLink, server_address
 
 @contextlib.contextmanager
 def listening(answer):
-    """A server that is none: gives `answer` (None: nothing) to whoever connects."""
+    """Yield the port of a socket that gives `answer` (None: nothing) to all who connect, and is no server."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         stop = threading.Event()
 

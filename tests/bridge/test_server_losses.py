@@ -18,7 +18,7 @@ from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 
 
 def test_a_server_killed_and_restarted():
-    """As often as it likes; scans go on being numbered, messages are counted from 0."""
+    """Restarts may come any number of times; scan numbers go on, messages are counted from 0."""
     with ServerEmulator(looping()) as server:
         link = XelaServerLink(server.url)
         numbers = []
@@ -104,7 +104,7 @@ def test_a_connection_that_closes_just_before_it_is_asked_is_a_lost_link(monkeyp
 
 
 def test_a_server_with_nothing_to_say_is_no_lost_link(monkeypatch):
-    """It answers when it is asked, and is not asked while it talks."""
+    """The server answers pings, and is not asked while it sends."""
     monkeypatch.setattr(xela_server, "ANSWER_S", 0.2)
     with ServerEmulator(looping(), message_hz=0.2) as server, XelaServerLink(server.url) as link:
         link.read(0.1)

@@ -115,7 +115,7 @@ def test_any_chunking_gives_the_same(stream, data):
         b"t0_48937E317E1593120F\r",  # what int() would take
         b"t+048937E317E1593120F\r",
         b"t0048937E317E15931g0F\r",
-        b"t0047937E317E1593120F\r",  # eight bytes that say seven
+        b"t0047937E317E1593120F\r",  # eight bytes with a length of seven
         b"r0048937E317E1593120F\r",  # a remote frame has no data
         b"t0048937E317E1593120F\n\r",
         b"x\r",
@@ -229,7 +229,7 @@ def test_flags():
 
 def test_a_bel_is_a_refusal_and_ends_a_line():
     assert decode(b"\a" + GOLDEN) == ([GOLDEN_FRAME], {"frames": 1, "refusals": 1})
-    # Not a frame: the adapter says that it went wrong.
+    # Not a frame: the adapter reports an error.
     wreck = GOLDEN[:-1] + b"\a"
     assert decode(wreck + OTHER) == ([OTHER_FRAME], {"frames": 1, "refusals": 1, "bad_lines": 1, "skipped_bytes": 21})
     assert decode(b"z\a")[1] == {"refusals": 1}

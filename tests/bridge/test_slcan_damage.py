@@ -30,7 +30,7 @@ def test_noise_without_frame_letters_before_a_frame_costs_nothing(noisy):
 
 
 def test_every_byte_at_every_place_of_a_line():
-    """What one corrupted byte can do: nothing, or lose the frame, or another digit in its place."""
+    """One corrupted byte has no effect, loses the frame, or puts another digit in its place."""
     digits = b"0123456789ABCDEFabcdef"
     for place in range(len(GOLDEN)):
         for byte in range(256):  # of a stream that has taught no form yet

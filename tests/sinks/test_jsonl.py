@@ -23,7 +23,7 @@ from firmware_bridge.scans.scan import ABSENT, VendorReading
 
 class TestJsonLines:
     def test_what_is_written_is_each_result_in_itself_however_patterns_are_given_again(self, tmp_path):
-        """A pattern given again is the same array, of one sensor; between them come others and none."""
+        """A repeated pattern is the same array, of one sensor; others, and scans without one, come between."""
         baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "6")}
         runtime = Runtime(FakeModel(make_contract(interval_factor=1.6)), source="device", baselines=baselines)
         presses = [(3000, "4"), (5000, "6"), (3000, "4"), (5000, "6"), (0, "4"), (3000, "4"), (7000, "4"), (7000, "4")]

@@ -79,7 +79,7 @@ class Listener:
             self.heard.append(self._lines.get())
 
     def until(self, satisfied, act=lambda: None):
-        """Go on acting until what was heard is enough."""
+        """Go on acting until the messages that were received suffice."""
         end_s = time.monotonic() + PATIENCE_S
         while not satisfied():
             assert time.monotonic() < end_s, f"heard only {[line['topic'] for line in self.heard]}"
@@ -141,7 +141,7 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
             force, torque = message["wrench"]["force"], message["wrench"]["torque"]
             assert force["z"] == 1.5 and all(map(math.isnan, (force["x"], force["y"], *torque.values())))
 
-        # The end of a contact is told once, and by zeros; that readings were lost by what is no number.
+        # The end of a contact is reported once, by zeros; lost readings by NaN.
         four = contact(1000)
         sink.write(without_pattern(four, state="dropped"), {})
         for _ in range(3):
@@ -270,7 +270,7 @@ def test_a_force_that_is_known_no_more_is_taken_back_once():
     sink.tell(lost, {})
     assert taken_back() == []
     sink.write(idle, {})
-    sink.write(replace(idle, state="dropped", force_n=None), {})  # of a newer scan it is known
+    sink.write(replace(idle, state="dropped", force_n=None), {})  # of a newer scan it is available
     assert taken_back() == [False]
     for _ in range(2):
         sink.write(replace(idle, state="incomplete", contact=None, force_n=None), {})

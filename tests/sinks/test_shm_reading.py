@@ -50,7 +50,7 @@ PATIENCE_S = 30
 
 class TestReading:
     def test_no_read_is_torn_and_none_goes_back(self, name, start_writer):
-        """As many reads as wanted, and on, however little the writer is given of the processor, until it wrote much."""
+        """Reads go on beyond their number until the writer wrote much, however little processor time it gets."""
         start_writer()
         memory, newest, torn, backwards = attach(name), {"left/4": -1, "right/4": -1}, 0, 0
         kinds = [(kind, shape, at) for kind, shape, at in Layout(4, 4, 40, 40).maps.values()][1:]
@@ -72,7 +72,7 @@ class TestReading:
         assert (torn, backwards) == (0, 0)
 
     def test_what_was_overwritten_while_it_was_copied_is_read_again(self, sink, name, monkeypatch):
-        """As a processor that orders nothing may show it: the newest sequence, and values from before."""
+        """A processor without ordering may show the newest sequence with values from before."""
         for number in range(3):
             sink.write(make_result(number, press_counts=3000 + 100 * number), {})
         memory, copies = attach(name), []

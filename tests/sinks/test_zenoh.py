@@ -43,7 +43,7 @@ __all__ = ["consume", "endpoint"]
 
 
 def plain(said):
-    """As JSON says it."""
+    """Return a record as it is after JSON."""
     return orjson.loads(orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
@@ -238,7 +238,7 @@ class TestWhoComesAndGoes:
             assert listener.stdout is not None and listener.stdout.readline() == "listens\n"
             if reader_goes:
                 listener.stdout.close()
-                ZenohSink(f"grip/left?connect={endpoint}").close()  # that it came is what would be told
+                ZenohSink(f"grip/left?connect={endpoint}").close()  # its arrival is what would be reported
             else:
                 listener.send_signal(signal.SIGINT)
             assert listener.stderr is not None
@@ -291,7 +291,7 @@ class TestOpening:
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
 class TestListening:
     def opened(self, target):
-        """What such a sink opens to more than this machine."""
+        """Return the sockets that such a sink opens to more than this machine."""
         before = reachable(os.getpid())
         sink = ZenohSink(target)
         after = reachable(os.getpid())
@@ -314,7 +314,7 @@ class TestListening:
 
 @pytest.mark.parametrize("by_file", [False, True])
 def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
-    """A peer tells of the others that it knows."""
+    """Zenoh peers report others that they are connected to."""
     endpoint, others = free_endpoint(), free_endpoint()
     config = tmp_path / "zenoh.json5"
     config.write_text(json.dumps({"connect": {"endpoints": [endpoint]}}))

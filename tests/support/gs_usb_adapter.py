@@ -1,8 +1,8 @@
 """Emulated gs_usb adapter that treats requests, frames and a client that dies as a candleLight does.
 
 It is no kinder than the device. Its queue holds 64 frames; a frame without room is lost, and a flag on the next frame
-reports it. It receives nothing without the right bit timing. A client's death does not stop it. And if the USB device
-is reset while a frame waits to be fetched, it is mute until it is unplugged (candleLight_fw issues 46, 165, up to 2026).
+reports it. It receives nothing without the right bit timing. A client's death does not stop it. If the USB device is
+reset while a frame waits to be fetched, it is mute until it is unplugged (candleLight_fw issues 46, 165, up to 2026).
 """
 
 import struct

@@ -56,7 +56,7 @@ class TestAccess:
         ],
     )
     def test_a_name_that_is_not_ours_is_refused(self, host, ours):
-        """What a stranger's name points to is up to the stranger."""
+        """A stranger decides what the stranger's name points to."""
         assert asks(grant("127.0.0.1", "robot", None), host=host) == (None if ours else 403)
 
     @pytest.mark.parametrize(

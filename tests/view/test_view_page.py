@@ -1,4 +1,4 @@
-"""The live page as a person sees it: headless Chromium before a real `edge-sr` that reads an emulated sensor."""
+"""The live page as a person sees it: headless Chromium with a real `edge-sr` that reads an emulated sensor."""
 
 import os
 import re
@@ -37,9 +37,9 @@ from firmware_bridge.recording.formats import load_recording
 __all__ = ["browser", "demo", "folder", "open_page"]
 RECONNECTS = 200
 FIRST_RECONNECTS = 30
-"""Until all that is made once is there."""
+"""Reconnects after which all that is made once exists."""
 
-# What the page's own program is not told of: its sockets are counted and none is held, and its waits are shortened.
+# Unknown to the page's own program, its sockets are counted but not kept, and its waits are shortened.
 WATCH_SOCKETS = """
   const Socket = window.WebSocket;
   window.sockets = [];
@@ -95,7 +95,7 @@ WATCH_REFUSAL = """() => {
 
 
 def frames_of(page):
-    """Headers of what the page's next sockets hear, while they do."""
+    """Return a growing list of the headers that the page's next sockets receive."""
     heard = []
     page.on("websocket", lambda socket: socket.on("framereceived", lambda data: heard.append(unpack(data)[0])))
     return heard
@@ -135,7 +135,7 @@ class TestHeld:
         part(page, "field").focus()
         page.keyboard.press("ArrowLeft")
         page.keyboard.press("Shift+ArrowDown")
-        playwright.expect(part(page, "readout")).to_contain_text(", y 2.6")  # said with the next frame
+        playwright.expect(part(page, "readout")).to_contain_text(", y 2.6")  # shown with the next frame
         text = part(page, "readout").inner_text()
         x, y, value, doubt = re.fullmatch(
             r"x (\S+), y (\S+)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm", text
@@ -159,7 +159,7 @@ class TestHeld:
         playwright.expect(part(other, "force-now")).not_to_have_text(before)
         page.wait_for_timeout(1200)
         self.reconnect(page, 1)
-        self.ask(page, "is it held?")  # answered behind the pause that the page asked for again
+        self.ask(page, "is it held?")  # answered after the pause that the page asked for again
         del heard[:]
         before = part(other, "force-now").inner_text()
         playwright.expect(part(other, "force-now")).not_to_have_text(before)
@@ -171,7 +171,7 @@ class TestHeld:
         page.locator("#pause").click()
         live(page)
         playwright.expect(part(page, "force-now")).not_to_have_text(frozen[-1])
-        # A pad that is held draws a line: what was missed meanwhile is no hole of .7 s in it, as none is for the other.
+        # A held pad draws a line: frames missed meanwhile leave no hole of 0.7 s in it, nor in the other page's.
         here, there = (max(np.diff(np.flatnonzero(part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
         assert here < there + 0.07 * part(page, "force-plot").evaluate("canvas => canvas.width")
 
@@ -208,7 +208,7 @@ class TestHeld:
         other.evaluate(WATCH_REFUSAL)
         self.reconnect(other, 1)
         page.keyboard.press("r")
-        logged(other, "earlier taps forgotten")  # behind all that is told to a newcomer
+        logged(other, "earlier taps forgotten")  # after all that a newcomer is sent
         assert other.evaluate(TOLD, ["zeroing refused", 2])
         assert other.evaluate("refusals") == 0
 
@@ -298,7 +298,7 @@ class TestHeld:
         logged(page, question)
 
     def kept(self, devtools):
-        """What Chromium counts, after collecting what nobody holds; frames come meanwhile, so the least of a few."""
+        """Return Chromium's counts after garbage collection: the least of a few, as frames come meanwhile."""
         counted = []
         for _ in range(4):
             devtools.send("HeapProfiler.collectGarbage")

@@ -26,7 +26,7 @@ SIDES = """all => all.map(one => one.getBoundingClientRect())
 
 
 def sent_by(page):
-    """What the page's next sockets are sent."""
+    """Return a growing list of the messages that the page's next sockets send."""
     sent = []
     page.on("websocket", lambda socket: socket.on("framesent", lambda text: sent.append(json.loads(text))))
     return sent

@@ -47,13 +47,13 @@ class TestRecorder:
         return recorder, told
 
     def begin(self, recorder):
-        """As who asks for it, and goes on until the file is open, or cannot be."""
+        """Ask for a recording, and go on until its file is open, or cannot be."""
         recorder.record(True)
         wait_for(lambda: recorder.wait() or recorder._opening is None)
         return recorder.path
 
     def end(self, recorder):
-        """As who asks for it, and goes on until it is written."""
+        """Ask for its end, and go on until it is written."""
         recorder.record(False)
         wait_for(lambda: recorder.wait() or recorder._closing is None)
 

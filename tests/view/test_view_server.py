@@ -237,12 +237,12 @@ class TestCommands:
                 page.play()
                 assert frame(other, "result")
                 run.close()
-            assert page.asked.refused < 250  # what waits is not heard to its end, either
+            assert page.asked.refused < 250  # what waits is not read to its end, either
 
     def test_pause_is_the_viewers_own(self, page):
         with page.viewer() as viewer, page.viewer() as other:
             viewer.send('{"cmd": "pause", "on": true}')
-            viewer.send("is it so?")  # answered behind it
+            viewer.send("is it so?")  # answered after it
             frame(viewer, "event")
             with page.playing():
                 frame(other, "result")

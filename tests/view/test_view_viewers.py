@@ -123,7 +123,7 @@ class TestMany:
     def test_who_says_nothing_makes_room_for_the_next(self, tmp_path, monkeypatch):
         """Idle connections lock nobody out; those of viewers are not theirs to take."""
         monkeypatch.setattr(connections, "MOST_CONNECTIONS", 4)
-        monkeypatch.setattr(server, "OPEN_S", 600.0)  # they make room, and not because they said nothing for so long
+        monkeypatch.setattr(server, "OPEN_S", 600.0)  # they make room, and not because they were silent for so long
         with live_page(tmp_path) as page:
             with page.viewer() as viewer, ExitStack() as strangers:
                 idle = [strangers.enter_context(page.stranger()) for _ in range(10)]
@@ -147,7 +147,7 @@ class TestMany:
         assert event.kind == "trouble" and "the live page has ended: NameError" in event.text
 
     def test_two_hundred_reconnects_leak_nothing(self, page, monkeypatch):
-        """Without garbage collection, as while the loop runs."""
+        """Garbage collection is off, as while the loop runs."""
 
         def come_and_go(number):
             with page.stranger(HANDSHAKE) as viewer:
@@ -193,7 +193,7 @@ class TestMany:
         ids=["connect", "get", "post", "garbage", "stranger", "version"],
     )
     def test_clients_leave_nothing_behind_where_nobody_watches(self, page, said, monkeypatch):
-        """Without garbage collection, as while the loop runs."""
+        """Garbage collection is off, as while the loop runs."""
         monkeypatch.setattr(server, "TIDY_S", 0.05)
 
         def come_and_go(count):
