@@ -132,7 +132,7 @@ def emulated():
 
 @pytest.fixture
 def world(emulated, tmp_path, monkeypatch):
-    """A folder with what the pages take for granted, and adapters where they say they are."""
+    """Folder with what the pages take for granted, and adapters at the places that they name."""
     left, right, server = emulated
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
@@ -215,7 +215,7 @@ def test_edge_sr_does_what_is_typed(command, world, monkeypatch, capfd):
 @pytest.mark.parametrize("command", [one for one in RUN if one.startswith("python ")])
 def test_programs_run(command, world, monkeypatch, capfd):
     words = world(command)
-    if words[1].startswith("docs/"):  # such a program writes beside itself
+    if words[1].startswith("docs/"):  # such a program writes next to itself
         Path("docs").mkdir()
         shutil.copy(ROOT / words[1], words[1])
         monkeypatch.setattr(sys, "argv", words[1:])

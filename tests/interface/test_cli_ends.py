@@ -28,14 +28,14 @@ class TestEnds:
             yield emulator
 
     def follow(self, emulator, files, *more):
-        """A run on the emulator that has given its first records."""
+        """Return a run on the emulator and its first records."""
         process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
         assert process.stdout is not None
         first = [process.stdout.readline() for _ in range(10)]
         return process, first
 
     def rest(self, process):
-        """What is left to read; not by communicate(), which knows nothing of what readline() has read ahead."""
+        """Return the unread rest; not by communicate(), which ignores the text that readline() has read ahead."""
         assert process.stdout is not None and process.stderr is not None
         rest, errors = process.stdout.read(), process.stderr.read()  # of errors there are too few to fill a pipe
         process.wait(TIMEOUT_S)
@@ -130,7 +130,7 @@ class TestEnds:
 
 class TestTerminal:
     def on_terminal(self, folder, *arguments, columns):
-        """What a terminal of that width gets on stderr, and what goes to stdout."""
+        """Return the text of stderr on a terminal of that width, and of stdout."""
         leader, follower = pty.openpty()
         fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
         environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
@@ -158,7 +158,7 @@ class TestTerminal:
 
     @pytest.mark.parametrize("words", ["--source replay:taps.npz", "replay taps.npz"])
     def test_asked_for_it_is_there_once(self, files, tmp_path, words):
-        """Also of a file at full speed, which has a bar else."""
+        """The same holds for a file at full speed, which otherwise has a bar."""
         replay = words.replace("taps.npz", f"{files}/taps.npz").split(" ")
         model = ["--model", str(files / "tiny.onnx")]
         shown, _ = self.on_terminal(tmp_path, *replay, *model, "--sink", "status", columns=80)

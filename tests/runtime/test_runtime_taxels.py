@@ -54,7 +54,7 @@ def test_the_held_reading_is_the_newest_not_the_first():
 
 @pytest.mark.parametrize("stamped", [True, False])
 def test_a_reading_that_came_late_is_held_since_it_was_taken(stamped):
-    """What a reader that was kept from running fetches at once comes together, and was not taken together."""
+    """Readings that a delayed reader fetches together were not taken together."""
     runtime = make_runtime()
     runtime.push(make_scan(0, press_counts=PRESS))
     came_ns, late_ns = 50 * PERIOD_NS, 35 * PERIOD_NS
@@ -97,7 +97,7 @@ def saturated(number, counts, taxel=5):
 
 @pytest.mark.parametrize("counts", RANGE_ENDS)
 def test_a_chip_at_the_end_of_its_range_has_no_reading(counts):
-    """It is held for a while, as a taxel that is not heard; then there is no pattern, and the taxel is named."""
+    """The last reading is held for a while, as of a silent taxel; then there is no pattern, and the taxel is named."""
     runtime = make_runtime()
     pattern = runtime.push(make_scan(0, press_counts=PRESS)).pattern
     for number in range(1, HOLD_SCANS + 1):
