@@ -1,4 +1,4 @@
-"""Public readers of gs_usb before the pretended adapter."""
+"""Public readers of gs_usb before the emulated adapter."""
 
 import pytest
 from gs_usb_emulator import GsUsbBackend

@@ -135,7 +135,7 @@ def zeroed(demo, sensor):
 
 @contextlib.contextmanager
 def emulated(folder, *tracks, options=()):
-    """A run on an emulated bus that plays counts (n, 3, 4, 4) of one or more sensors again and again."""
+    """Yield a run on an emulated bus that plays counts (n, 3, 4, 4) of one or more sensors again and again."""
     recordings = []
     for counts in tracks:
         path = folder / f"{len(list(folder.glob('*.npz')))}.npz"
@@ -155,7 +155,7 @@ def noise(count, seed=1):
 
 
 def pressed(demo):
-    """Counts of the demo's first tap at its deepest, and the true pattern."""
+    """Return counts of the demo's first tap at its deepest, and the true pattern."""
     taps = np.flatnonzero(demo["tap"] == 0)
     peak = taps[np.argmax(demo["indentation_mm"][taps])]
     return demo["counts"][peak], demo["unit_patterns"][0].astype(float) * float(demo["indentation_mm"][peak])
@@ -185,7 +185,7 @@ def logged(page, text):
 
 
 def shares(pixels):
-    """Shares of the scale that colours on a canvas stand for, by the terminal's own table of the same colours."""
+    """Return the shares of the scale of a canvas's colours, by the terminal's own table of the same colours."""
     height, width, *data = pixels
     rgba = np.array(data, dtype=float).reshape(height, width, 4)
     assert (rgba[..., 3] == 255).all()

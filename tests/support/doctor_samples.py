@@ -11,7 +11,7 @@ COUNTERS = {"received_bytes": 22 * 16 * 400, "frames": 16 * 400, "bad_lines": 0,
 
 
 def healthy_counts(scans: int = 400, seed: int = 0, sigma: float = 2.0) -> np.ndarray:
-    """A free, still pad, (scans, 3, 4, 4)."""
+    """Return counts of a free, still pad, (scans, 3, 4, 4)."""
     noise = np.random.default_rng(seed).normal(0, sigma, (scans, 3, 4, 4))
     return np.rint(REST + noise).astype(np.int32)
 
@@ -41,7 +41,7 @@ def watched(scans: list[Scan], duration_s: float = 4.0, **changes) -> Watched:
 
 
 def finger(place: int, force: float = 4000.0) -> np.ndarray:
-    """z of a finger on a corner as it is seen, (4, 4), in counts."""
+    """Return z of a finger on a corner as a person sees it, (4, 4), in counts."""
     rows, cols = np.indices((4, 4))
     at_row, at_col = divmod(place, 4)
     # A finger is wider than a taxel, and its middle lies a little inside.

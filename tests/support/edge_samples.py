@@ -94,7 +94,7 @@ def write_model(
     with_traction: bool | None = None,
     traction_shape: tuple[int, ...] | None = None,
 ) -> Path:
-    """A real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
+    """Write a real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
     The deviation, there if the contract has a factor for it unless asked otherwise, is `tiny_deviation`. A pad,
     likewise, makes all stronger by `tiny_stiffness`; a traction, likewise, is the newest tap's x, y, z in squares.
@@ -198,7 +198,7 @@ def make_scan(
     time_ns: int | None = None,
     noise: int = 0,
 ) -> Scan:
-    """A scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
+    """Return a scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
     counts = REST.copy()
     counts[2].flat[taxel] += int(press_counts)
     if noise:
@@ -214,7 +214,7 @@ def make_scan(
 
 @contextmanager
 def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subprocess.Popen]:
-    """Kills what is not over when the block is, or, so that nobody reads for ever, by then."""
+    """Yield a process, and kill it at the end of the block, or after a time so that no reader waits for ever."""
     alarm = threading.Timer(within_s, process.kill)
     alarm.start()
     with process:
@@ -226,7 +226,7 @@ def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subproces
 
 
 class FakeModel:
-    """The tiny model without onnxruntime; `on_run` is called before each run."""
+    """Tiny model without onnxruntime; `on_run` is called before each run."""
 
     def __init__(self, contract: Contract | None = None, on_run=lambda: None) -> None:
         self.name = "fake"
@@ -261,7 +261,7 @@ class FakeModel:
 
 
 class FakeLink(Link):
-    """Gives one batch of scans at each read, waiting where a batch is an event; then ends, or fails."""
+    """Link with one batch of scans a read, which waits where a batch is an event, and then ends or fails."""
 
     def __init__(self, batches, *, error: Exception | None = None, kind="device", endless: bool = False) -> None:
         self.name = "fake"
@@ -303,7 +303,7 @@ class FakeLink(Link):
 
 
 class ListSink(Sink):
-    """Keeps what it gets."""
+    """Sink that keeps the results it gets."""
 
     def __init__(self, on_write=lambda result: None) -> None:
         self.results = []

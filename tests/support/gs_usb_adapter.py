@@ -33,7 +33,7 @@ _FRAME: Final = struct.Struct("<IIBBBB8s")
 
 
 class StalledError(Exception):
-    """The adapter refuses a request."""
+    """Refusal of a request by the adapter."""
 
 
 class GsUsbAdapter:
@@ -138,7 +138,7 @@ class GsUsbAdapter:
             return True
 
     def fetch(self, timeout_s: float | None) -> bytes | None:
-        """The next host frame, after waiting for it; None when there is none in time, or the cable is out."""
+        """Wait for the next host frame and return it; None when there is none in time, or the cable is out."""
         with self._changed:
             self._changed.wait_for(lambda: not self._plugged or (self._hand_over() and not self.mute), timeout_s)
             if not self._plugged or self.mute:
@@ -148,7 +148,7 @@ class GsUsbAdapter:
             return data
 
     def reset_usb(self) -> None:
-        """The host resets the USB device, which is not what restarts it."""
+        """Reset the USB device as the host does, which does not restart it."""
         with self._changed:
             self.mute = self.mute or self._waiting_for_host is not None
 
@@ -175,7 +175,7 @@ class GsUsbAdapter:
         self._changed.notify_all()
 
     def _hand_over(self) -> bool:
-        """One frame leaves the queue for the endpoint, and stays there until the host fetches it."""
+        """Move one frame from the queue to the endpoint, and stays there until the host fetches it."""
         if self._waiting_for_host is None and self._queue:
             self._waiting_for_host = self._queue.popleft()
         return self._waiting_for_host is not None

@@ -39,7 +39,7 @@ _DIRECTION_IN: Final = 0x80
 
 
 class GsUsbPort:
-    """A place on the bus where an adapter may be plugged in.
+    """Place on the bus where an adapter may be plugged in.
 
     Attributes:
         adapter: the one that is there, or was there last.
@@ -96,7 +96,7 @@ class _Plugged:
 
 
 class GsUsbBackend(usb.backend.IBackend):
-    """A bus with ports."""
+    """Bus with ports."""
 
     def __init__(self, *ports: GsUsbPort) -> None:
         """Set up a bus, by default with one adapter on it."""

@@ -1,4 +1,4 @@
-"""Frames for a pretended gs_usb adapter, and a link to it."""
+"""Frames for an emulated gs_usb adapter, and a link to it."""
 
 import random
 
@@ -10,7 +10,7 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 
 
 def frames_of(scans, controller=4, seed=0):
-    """Frames of so many scans that all differ."""
+    """Return the frames of so many scans that all differ."""
     noise = random.Random(seed)
     return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
 

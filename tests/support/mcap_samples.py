@@ -19,7 +19,7 @@ TURNED = Mounting(order=tuple(reversed(range(16))), swap_xy=True, signs=(1, -1, 
 
 
 def odd_scans(count: int = 12) -> list[Scan]:
-    """Scans of two sensors with all that scans may have: gaps, old readings, device times, a vendor's words."""
+    """Return scans of two sensors with all that scans may have: gaps, old readings, device times, a vendor's words."""
     scans = []
     for number in range(count):
         press = 3000 + 40 * number if number % 4 > 1 else 0
@@ -48,7 +48,7 @@ def record_into(path: Path, results, contract=None, **settings) -> Path:
 
 
 def messages_of(path: Path) -> dict[str, list]:
-    """(log time, data) by topic, as the public package reads a whole file, its sums checked."""
+    """Return (log time, data) by topic, as the public package reads a whole file, its sums checked."""
     by_topic = defaultdict(list)
     with path.open("rb") as file:
         for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
@@ -57,7 +57,7 @@ def messages_of(path: Path) -> dict[str, list]:
 
 
 def same_scan(got: Scan, scan: Scan, moved_ns: int = 0) -> bool:
-    """Bit for bit."""
+    """Return True where both scans are equal bit for bit."""
     arrays = [(getattr(got, name), getattr(scan, name)) for name in ("counts", "fresh", "renewed")]
     for one in ("newtons", "temperature_k", "ups_hz"):
         arrays.append((getattr(got.vendor, one, None), getattr(scan.vendor, one, None)))

@@ -15,7 +15,7 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
 
 
 class SilentDevice:
-    """The far end of a pseudo-terminal that takes nothing: a dead adapter, its cable in."""
+    """Far end of a pseudo-terminal that takes nothing: a dead adapter, its cable in."""
 
     def __enter__(self):
         self.device_fd, self.client_fd = os.openpty()
@@ -24,7 +24,7 @@ class SilentDevice:
         return self
 
     def received(self, count: int) -> bytes:
-        """The first bytes that came, and any that came with them."""
+        """Return the first bytes that came, and any that came with them."""
         data = b""
         while len(data) < count and select.select([self.device_fd], [], [], 5)[0]:
             data += os.read(self.device_fd, 1000)

@@ -32,7 +32,7 @@ def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, 
 
 
 def message(sequence: object, *entries: dict, time_s: object = UNIX_S, **more) -> str:
-    """A message about sensors 1, 2, ..."""
+    """Return a message about sensors 1, 2, ..."""
     sensors = {str(number): entry for number, entry in enumerate(entries, 1)}
     return json.dumps({"message": sequence, "time": time_s, "version": "1.8.0b_208601", **sensors, **more})
 
@@ -60,7 +60,7 @@ def lose(link):
 
 
 def read_notices(link, count):
-    """The first notices, at least `count`."""
+    """Return the first notices, at least `count`."""
     notices = []
     end_s = time.monotonic() + 60
     while len(notices) < count:

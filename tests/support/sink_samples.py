@@ -11,7 +11,7 @@ RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
 
 
 def make_results(count=6, runtime=None, **settings):
-    """Idle and contact in turn, of two sensors, some torn; sensor 6 has no baseline and stays in zeroing."""
+    """Return idle and contact in turn, of two sensors, some torn; sensor 6 has no baseline and stays in zeroing."""
     settings = {"source": "emulated", "baselines": {"4": BASELINE}, "unix_time_s": lambda: 1012.34} | settings
     runtime = runtime or Runtime(FakeModel(), **settings)
     results = []
@@ -25,7 +25,7 @@ def make_results(count=6, runtime=None, **settings):
 
 
 def make_sure_results(count=6, **settings):
-    """The same of a model that gives deviations."""
+    """Return such results of a model that gives deviations."""
     settings = {"source": "emulated", "baselines": {"4": BASELINE}} | settings
     return make_results(count, Runtime(FakeModel(make_contract(interval_factor=1.6)), **settings))
 

@@ -16,7 +16,7 @@ STAMPED = [GOLDEN[:-1] + b"%04X\r" % stamp_ms for stamp_ms in (0, 1, 0x1234, 59_
 
 
 def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
-    """The frames, and the counters that are not zero."""
+    """Return the frames, and the counters that are not zero."""
     decoder = SlcanDecoder()
     frames = [frame for chunk in chunks for frame in decoder.feed(chunk)]
     return frames, {name: count for name, count in decoder.counters().items() if count}

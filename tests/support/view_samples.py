@@ -52,7 +52,7 @@ class Press:
 
 
 class Page:
-    """A live page over loopback, and who looks at it."""
+    """Live page over loopback, and its viewers."""
 
     def __init__(self, view, commands):
         self.view = view
@@ -68,7 +68,7 @@ class Page:
         return connect(f"ws://{host}:{self.port}/ws{query}", **settings)
 
     def stranger(self, data=b""):
-        """A plain connection, on which this much is sent."""
+        """Open a plain connection, and send this data on it."""
         connection = socket.create_connection(("127.0.0.1", self.port), TIMEOUT_S)
         connection.sendall(data)
         return connection
@@ -85,7 +85,7 @@ class Page:
 
     @contextmanager
     def playing(self, rate_hz=100.0):
-        """Results at a rate, from a thread of its own as the loop's."""
+        """Play results at a rate, from a thread of its own as the loop's."""
         stop = threading.Event()
 
         def loop():
@@ -103,17 +103,17 @@ class Page:
             thread.join()
 
     def polled(self, count=1):
-        """Commands, once so many have come."""
+        """Return the commands once so many have come."""
         commands = []
         wait_for(lambda: commands.extend(self.asked.poll()) or len(commands) >= count)
         return commands
 
 
 class Swallowing:
-    """A network between a viewer and the page, which may come to swallow all.
+    """Network between a viewer and the page, which can start to swallow everything.
 
     Attributes:
-        port: that leads to the page while it lasts.
+        port: port that leads to the page until then.
     """
 
     def __init__(self, port):
@@ -137,7 +137,7 @@ class Swallowing:
         self._listening.close()
 
     def swallow(self):
-        """Hand on nothing from now on, and let both ends believe that the other is there."""
+        """Hand on nothing from now on, while both ends stay connected."""
         self._swallows.set()
 
     def _lead(self):
@@ -178,7 +178,7 @@ def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT)
 
 
 def frame(viewer, kind=None, sensor=None):
-    """The next frame, or the next of a kind: header and maps."""
+    """Return header and maps of the next frame, or of the next of a kind."""
     while True:
         header, maps = unpack(viewer.recv(TIMEOUT_S))
         if kind in (None, header["kind"]) and sensor in (None, header.get("sensor")):

@@ -54,7 +54,7 @@ def endpoint():
 
 
 def listening(endpoint, *connect):
-    """A session of zenoh's own that listens there."""
+    """Open a session of zenoh's own that listens there."""
     config = zenoh.Config()
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
     config.insert_json5("connect/endpoints", json.dumps(connect))
@@ -79,7 +79,7 @@ class Consumer:
         return json.loads(self.lines.get(timeout=60))
 
     def until_gone(self):
-        """Messages, each as key, encoding, writer, payload, until the writer has gone; and who that was."""
+        """Return the messages until the writer has gone, as key, encoding, writer, payload; and who came and went."""
         told = [self.next()]
         while told[-1][0] != "went":
             told.append(self.next())
@@ -111,7 +111,7 @@ def consume():
 
 
 def make_results(count, **of_the_scans):
-    """Contact from the second on; every other of those as the one before it."""
+    """Return results in contact from the second on; every other of those as the one before it."""
     runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
     presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
     return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]

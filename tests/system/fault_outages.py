@@ -40,7 +40,7 @@ def seconds_to_use(found: Found, told: Told, names: Sequence[str]) -> list[float
 
 
 def _outages(told: Told) -> Iterator[tuple[str, int, int]]:
-    """Stretches in which nothing comes from any sensor: which, from when, until when, in [ns]; NEVER_NS if no end."""
+    """Yield stretches without data of any sensor: name, begin and end in [ns]; NEVER_NS without an end."""
     begun: dict[str, tuple[str, int]] = {}
     for event in told.events:
         if event["fault"] not in OUTAGES and not event["stretch"].startswith("vanished=1@"):

@@ -33,7 +33,7 @@ def telling_counts(sensor: int) -> NDArray[np.int32]:
 
 @contextmanager
 def playing_emulator(folder: Path, faults: str, seed: int) -> Iterator[str]:
-    """An emulator that plays them over and over; its port, and in folder/truth what it knows."""
+    """Yield the port of an emulator that plays them over and over, and logs the truth in folder/truth."""
     files: list[str] = []
     for sensor, name in enumerate(CONTROLLERS):
         counts = telling_counts(sensor)

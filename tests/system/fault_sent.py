@@ -25,7 +25,7 @@ class SentTaxel:
     """
 
     def __init__(self) -> None:
-        """Begin without any."""
+        """Begin without readings."""
         self.rows: list[tuple[int, int, int]] = []
         self._cycles: list[int] = []
         self._readings: list[tuple[int, int, int]] = []

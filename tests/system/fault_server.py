@@ -1,4 +1,4 @@
-"""`edge-sr` reads a server that is killed, frozen and talks nonsense; every record is held against what it played."""
+"""`edge-sr` reads a server that is killed, frozen and sends garbage; every record is compared with what it played."""
 
 import random
 import signal

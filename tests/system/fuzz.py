@@ -32,7 +32,7 @@ TOKENS = (
 
 
 def mutants(seeds: list[bytes], longest: int, seed: int) -> Iterator[bytes]:
-    """Seeds changed in one to eight places, without end."""
+    """Yield seeds changed in one to eight places, without end."""
     rng = np.random.default_rng(seed)
     while True:
         data = bytearray(seeds[rng.integers(len(seeds))])
@@ -70,7 +70,7 @@ def run_blind(name: str, inputs: int, seed: int) -> dict[str, object]:
 
 
 def run_guided(name: str, inputs: int, seed: int, folder: Path, most_s: int) -> dict[str, object]:
-    """The same in a process of its own, under atheris."""
+    """Run mutants in a process of its own, under atheris."""
     corpus = folder / name.replace(" ", "-")
     corpus.mkdir(parents=True, exist_ok=True)
     limits = {"timeout": INPUT_LIMIT_S, "rss_limit_mb": MEMORY_LIMIT_MB, "artifact_prefix": f"{corpus}-"}
@@ -109,7 +109,7 @@ def child(name: str, options: list[str]) -> None:
 
 
 def page(rows: list[dict[str, object]], seed: int) -> str:
-    """Figures as a page."""
+    """Return the figures as a page."""
     from edge.bench.provenance import provenance
 
     columns = list(rows[0])

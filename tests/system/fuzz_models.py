@@ -24,7 +24,7 @@ from train.physics.simulated_sensor import FRAMES
 
 
 def calibration(data: bytes) -> None:
-    """The cache of run times; its keys are made of this machine, so an entry of it stands for every key."""
+    """Read the cache of run times; its keys are of this machine, so one entry stands for every key."""
     cache = CalibrationCache(as_file("calibration.json", data), 100.0, unix_time_s=lambda: 2e9)
     entry = next(iter(cache._entries.values()), None)
     cache._entries[cache._key(MODEL_LIKE)] = entry
@@ -66,7 +66,7 @@ CONTRACT = {
 
 
 def contract(data: bytes) -> None:
-    """Metadata as lines of key and JSON; what is not there is as it should be."""
+    """Read metadata as lines of key and JSON; missing entries have valid values."""
     metadata = {KEY_PREFIX + key: json.dumps(value) for key, value in CONTRACT.items()}
     for line in data.decode("utf-8", "replace").split("\n"):
         key, _, value = line.partition(" ")
@@ -87,7 +87,7 @@ def contract_seeds() -> list[bytes]:
 
 
 def tiny_model(**metadata: object) -> bytes:
-    """A graph of one convolution, written without onnx: which the walk below must follow."""
+    """Return a graph of one convolution, written without onnx, which the walk below must follow."""
 
     def field(number: int, content: bytes | int) -> bytes:
         if isinstance(content, int):
@@ -134,7 +134,7 @@ def onnx_seeds() -> list[bytes]:
 
 
 def model(data: bytes) -> None:
-    """A whole file, into onnxruntime and once through."""
+    """Load a whole file into onnxruntime, and run it once."""
     session = refused(lambda: ModelSession(as_file("tiny.onnx", data)), ModelError)
     if session is not None:
         refused(lambda: session.run(np.ones((session.contract.taps, 3, 4, 4), np.float32)), EdgeError)
@@ -194,7 +194,7 @@ def sequences_seeds() -> list[bytes]:
 
 
 def bench(data: bytes) -> None:
-    """An earlier bench, read and held against a new one."""
+    """Read an earlier bench, and compare it with a new one."""
     told = refused(lambda: read_record(as_file("bench.json", data)), BenchError)
     if told is not None:
         refused(lambda: compared(BENCH_RECORD, told, Path("bench.json")), BenchError)

@@ -25,7 +25,7 @@ from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_base
 
 
 def sensor_toml(data: bytes) -> None:
-    """A sensor file, and the same with the id that its counts give; what was read is written as it was."""
+    """Read a sensor file, and the same with the id of its counts; what was read is written unchanged."""
     for _ in range(2):
         try:
             load_sensor_file(as_file("sensor.toml", data))
@@ -125,7 +125,7 @@ def npz_seeds() -> list[bytes]:
 
 
 def mcap(data: bytes) -> None:
-    """A file as it is, and the same bytes as records of one that begins well, so that they are reached."""
+    """Read a file as it is, and the same bytes as records of a valid file, so that they are reached."""
     for name, content in (("finger.mcap", data), ("records.mcap", MCAP0_MAGIC + data)):
         recording = refused(lambda: load_recording(as_file(name, content)), RecordingError)  # noqa: B023
         if recording is not None:
@@ -142,7 +142,7 @@ def mcap(data: bytes) -> None:
 
 
 def mcap_seeds() -> list[bytes]:
-    """Whole, and plain: without chunks and sums, so that a change is no mere damage."""
+    """Return whole files, and plain ones without chunks and sums, so that a change is not mere damage."""
     path = FOLDER / "made.mcap"
     path.unlink(missing_ok=True)
     file = McapFile(path, "ros2", "fuzz")
@@ -192,7 +192,7 @@ def npy_in_npz_seeds() -> list[bytes]:
 
 
 def baseline(data: bytes) -> None:
-    """A file changed by hand, and the same with the id that its counts give, which an attacker can work out."""
+    """Read a file changed by hand, and the same with the id of its counts, which an attacker can compute."""
     for _ in range(3):
         try:
             load_baselines(as_file("zero.json", data))

@@ -57,14 +57,14 @@ from fuzz_wire import (
 
 @dataclass(frozen=True)
 class Target:
-    """A parser under fire.
+    """Parser that is fuzzed.
 
     Attributes:
-        name: what it parses.
-        run: one input; raises where a promise is broken.
+        name: name of its format.
+        run: function of one input; raises where a promise is broken.
         seeds: valid inputs to begin with.
-        longest: bytes of an input.
-        share: of the inputs of a long run; what is slow gets fewer.
+        longest: most bytes of an input.
+        share: share of the inputs of a long run; slow parsers get fewer.
     """
 
     name: str

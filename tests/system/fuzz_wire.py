@@ -17,7 +17,7 @@ from firmware_bridge.scans.xela_server_scans import ServerScans
 
 
 def slcan(data: bytes) -> None:
-    """The same frames whatever the chunks; each stands in the text; no byte is counted twice; memory is bounded."""
+    """Check slcan: equal frames for any chunks; each is in the text; no byte counts twice; memory is bounded."""
     whole, cut = SlcanDecoder(), SlcanDecoder()
     frames = whole.feed(data)
     step = 1 + len(data) % 31
@@ -35,7 +35,7 @@ def slcan(data: bytes) -> None:
 
 
 def gs_usb(data: bytes) -> None:
-    """The same frames whatever the chunks, each of them in the bytes; then scans of them, stamped or not."""
+    """Check gs_usb: equal frames for any chunks, each of them in the bytes; then their scans, stamped or not."""
     stamped, data = data[:1] > b"\x7f", data[1:]
     whole, cut = (GsUsbDecoder(stamped=stamped, channels=2) for _ in range(2))
     frames = whole.feed(data)
@@ -76,7 +76,7 @@ def gs_usb_limits_seeds() -> list[bytes]:
 
 
 def server(data: bytes) -> None:
-    """Messages by lines; what comes of them are readings of this geometry, and counters."""
+    """Feed messages by lines; the results are readings of this geometry, and counters."""
     scans = ServerScans()
     scans.begin()
     for number, text in enumerate(data.split(b"\n")):

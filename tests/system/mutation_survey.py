@@ -100,7 +100,7 @@ class Score:
 
 
 class _InPlaceOf(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Import a module with other code than its file's."""
+    """Importer of a module with other code than its file's."""
 
     def __init__(self, subject: Subject, code: CodeType) -> None:
         self._subject, self._code = subject, code

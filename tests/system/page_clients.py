@@ -61,7 +61,7 @@ def _get(connection: socket.socket, left: int) -> int:
 
 
 def _handshake(connection: socket.socket, left: int) -> int:
-    """Ask for what is refused, of as many kinds."""
+    """Ask for handshakes of all kinds that are refused."""
     with contextlib.suppress(ConnectionError):
         connection.sendall(_REFUSED[left % len(_REFUSED)])
         while connection.recv(1 << 16):
@@ -105,7 +105,7 @@ def _crowd(port: int, kind: str, count: int) -> None:
 
 
 def _measured(program: Program, port: int, kind: str, count: int) -> tuple[str, ...]:
-    """A row: what one kind of client leaves."""
+    """Return a row: the memory that one kind of client leaves."""
     before_mb, begun_s = program.resident_mb(), time.monotonic()
     with ThreadPoolExecutor(TOGETHER) as executor:
         crowds = [executor.submit(_crowd, port, kind, count // TOGETHER) for _ in range(TOGETHER)]

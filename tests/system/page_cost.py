@@ -68,7 +68,7 @@ class Blocks:
 
 
 def measured(rounds: int, seconds: float) -> dict[str, Blocks]:
-    """Blocks by who looked."""
+    """Return the blocks by number of viewers."""
     names = [WITHOUT, *map(_name, VIEWERS)]
     blocks = {name: Blocks() for name in names}
     with Progress("the live page", rounds * len(names), "block") as bar:
@@ -87,7 +87,7 @@ def measured(rounds: int, seconds: float) -> dict[str, Blocks]:
 
 
 def table(blocks: dict[str, Blocks]) -> str:
-    """Medians of blocks, and ratios to no page with 95 % intervals."""
+    """Return medians of blocks, and ratios to no page with 95 % intervals."""
     lines = [
         "| page | latency p50 us | p99 us | run time p50 us | CPU % | late | frames /s | p50, ratio | p99, ratio |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -122,14 +122,14 @@ def _running(*options: str) -> Iterator[Program]:
 
 
 def free_port() -> int:
-    """A port that nobody listens at."""
+    """Return a port without a listener."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         return free.getsockname()[1]
 
 
 @contextlib.contextmanager
 def _looking(port: int, viewers: int, block: Blocks, seconds: float) -> Iterator[None]:
-    """Viewers in a process of their own, for as long as this lasts."""
+    """Run viewers in a process of their own for the length of the block."""
     if not viewers:
         yield
         return

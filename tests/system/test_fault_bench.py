@@ -30,7 +30,7 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 
 def test_a_short_run_keeps_every_promise(tmp_path):
-    """Everything at once but time: what this machine does meanwhile, nobody knows."""
+    """All promises except those of time, as the load of this machine is unknown."""
     faults = (
         "lost@1+1,repeated@1+1,foreign@1.2+1,dead=4.3@1.5+.6,stuck=6.9@1.5+.7,garbage=.1@2.2+.5,truncated@2.3+.5,"
         "merged@2.4+.5,non-ascii@2.5+.5,reordered@2.6+.4,flipped@2.7+.3,bursts@3+.4,silent=6@3.2+.3,"

@@ -76,7 +76,7 @@ def test_what_no_reader_can_know_is_counted_apart():
 
 @pytest.mark.parametrize("first", [5, 8])
 def test_of_a_stuck_taxels_like_readings_one_that_an_outage_swallowed_is_not_told_from_the_next(first):
-    """Cycle 8 is swallowed: one in which it is stuck already, or the last in which it is not."""
+    """Cycle 8 is lost: one in which it is stuck already, or the last in which it is not."""
     forged = Forged()
     (place, taxel), *_ = ((at, taxel) for at, (_, taxel) in enumerate(USPA44_MAP.wire_order("4")) if taxel == 2)
     for cycle in range(first, 20):
@@ -141,7 +141,7 @@ def test_a_line_that_was_left_out_may_be_an_event():
 
 
 def test_what_an_opening_dropped_while_the_injector_did_not_run_is_consistent():
-    """Seen on a busy machine: 56 frames that the one had as read, and the other had dropped."""
+    """A busy machine once had 56 frames that the injector had as read, and the program had dropped."""
     forged = Forged()
     counters = forged.seen[-1].head["counters"]
     counters |= {"frames": 304, "readings": 304, "scans": 19, "reopenings": 1, "skipped_bytes": 19}
@@ -159,7 +159,7 @@ def test_what_an_opening_dropped_while_the_injector_did_not_run_is_consistent():
 
 
 def mixing(first: int = 9, cycle: int = 12) -> Forged:
-    """The last record mixes: its taxels, from the one at this place on, are of the cycle after."""
+    """Return a run whose last record mixes: its taxels, from the one at this place on, are of the cycle after."""
     forged = Forged()
     for _, taxel in USPA44_MAP.wire_order("4")[first:]:
         forged.seen[cycle].counts[taxel] = forged.seen[cycle + 1].counts[taxel]

@@ -79,10 +79,10 @@ brackets; CPU in % of one core."""
 
 
 class PacedLink(Link):
-    """Gives a scan of each of its sensors every 10 ms, taken from a stream in a circle."""
+    """Link with a scan of each of its sensors every 10 ms, taken from a stream in a circle."""
 
     def __init__(self, scans: Sequence[Scan], sensors: Sequence[str], ticks: int) -> None:
-        """Begin when it is first read; each sensor is elsewhere in the stream."""
+        """Set up the link; it begins at its first read, and each sensor is elsewhere in the stream."""
         self.name, self.kind, self.ended = "bench", "emulated", False
         self._scans, self._sensors, self._ticks = scans, sensors, ticks
         self._tick = 0
@@ -95,7 +95,7 @@ class PacedLink(Link):
         pass
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """The next tick's."""
+        """Return the scans of the next tick."""
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns()
         due_ns = self._start_ns + self._tick * PERIOD_NS
