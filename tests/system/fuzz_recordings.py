@@ -142,7 +142,7 @@ def mcap(data: bytes) -> None:
 
 
 def mcap_seeds() -> list[bytes]:
-    """Return whole files, and plain ones without chunks and sums, so that a change is not mere damage."""
+    """Return a whole file, and plain records without chunks and sums, so that a change is not mere damage."""
     path = FOLDER / "made.mcap"
     path.unlink(missing_ok=True)
     file = McapFile(path, "ros2", "fuzz")

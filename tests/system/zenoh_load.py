@@ -186,7 +186,7 @@ def consume(pipe: Connection, endpoint: str) -> None:
 
 
 def run(setup: str, sensors: int, processes: int, seconds: float) -> tuple[float, ...]:
-    """Measure once; figures in the order of the table.
+    """Measure once, and return the figures in the order of the table.
 
     Raises:
         BenchError: a process ended before its time.
