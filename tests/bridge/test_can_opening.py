@@ -14,8 +14,6 @@ from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.can_networks import can_networks
 from firmware_bridge.links.discovery import can_interfaces
 
-# What an interface gets, and what goes wrong before anything is open.
-
 
 def open_recorded(monkeypatch, interface, channel):
     asked = []

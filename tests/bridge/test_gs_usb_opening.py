@@ -15,8 +15,6 @@ from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.scans.can_id_maps import trigger_frame
 
-# What goes wrong before anything is open.
-
 
 def test_the_adapters_of_this_machine():
     foreign = GsUsbPort(usb_id=(0x0403, 0x6015))

@@ -1,4 +1,4 @@
-"""Public readers of gs_usb before the emulated adapter."""
+"""Public packages read the emulated gs_usb adapter, which shows that it is like a real one."""
 
 import pytest
 from gs_usb_emulator import GsUsbBackend
@@ -6,8 +6,6 @@ from gs_usb_samples import frames_of
 from usb.backend import libusb1
 
 from firmware_bridge.can.slcan import CanFrame
-
-# The public packages above the same pretended device, to show that it is like one.
 
 
 @pytest.fixture

@@ -16,8 +16,6 @@ from firmware_bridge.links import xela_server
 from firmware_bridge.links.parse import open_source, open_sources
 from firmware_bridge.links.xela_server import XelaServerLink, server_address
 
-# What goes wrong before anything is open.
-
 
 @contextlib.contextmanager
 def listening(answer):
