@@ -10,7 +10,6 @@ from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links.serial_ports import PluggedAdapter, Port
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
-
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
 GRIPPER = Port("/dev/ttyUSB0", (0x0403, 0x6015), "GRIP1", "gripper")
 
