@@ -1,4 +1,4 @@
-"""What every test can count on."""
+"""Conditions that hold in every test."""
 
 import signal
 

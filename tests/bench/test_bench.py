@@ -1,4 +1,4 @@
-"""`edge-sr bench` as a whole, and the errors that it tells."""
+"""`edge-sr bench` as a whole, and the errors that it reports."""
 
 import io
 import json
@@ -197,7 +197,7 @@ def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
         _, complaint = process.communicate(timeout=60)
     assert process.returncode == 130
     assert complaint == f"edge-sr: bench stopped before its end: what was measured is in {tmp_path}\n"
-    with pytest.raises(ProcessLookupError):  # it left no process behind
+    with pytest.raises(ProcessLookupError):  # no process of it is left
         os.killpg(process.pid, 0)
     told = json.loads((tmp_path / "bench.json").read_text())
     assert (told["complete"], len(told["errors"]), told["run_times"]) == (False, 1, [])

@@ -1,4 +1,4 @@
-"""What a bench keeps, and two of them held against each other."""
+"""Record of a bench, and the comparison of two."""
 
 import csv
 import io

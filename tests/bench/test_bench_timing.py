@@ -22,7 +22,7 @@ class Clock:
         self.now_ns += round(time_s * 1e9)
 
     def work(self, *took_ms):
-        """A run that takes these times in turn, then the last one always; keeps the numbers that it is given."""
+        """Return a run that takes these times in turn, then always the last one, and the list of its numbers."""
         numbers = []
 
         def run(number):

@@ -1,4 +1,4 @@
-"""No scan is of two cycles, whatever is lost, and a sensor's place is found again: readings here name their cycle."""
+"""Cycles of scans: none mixes two, whatever is lost, and a sensor's place is recovered; readings name their cycle."""
 
 import pytest
 from bridge_samples import read_until_lost
@@ -119,7 +119,7 @@ def test_two_sensors_whose_phases_drift_are_told_apart(reader):
 @pytest.mark.parametrize("first_frame", [0, 7])
 def test_another_order_is_learnt_and_nothing_mixed_meanwhile(reader, order, first_frame):
     worth = read(losing(0.005)(in_order(bus(300, first_frame=first_frame), ORDERS[order])), reader)
-    # Without stamps a pause is believed only once the period is known: until then the order of the ids is all there is.
+    # Without stamps a pause counts only once the period is measured: until then the order of the ids is all there is.
     assert worth.mixed <= (2 if reader is PLAIN and order == "begun elsewhere" else 0) and worth.whole > 250
     assert worth.numbers["4"][0] < FIRST + 12
     assert worth.numbers["4"][-1] == FIRST + 299
@@ -143,7 +143,7 @@ def test_other_layouts_are_cut_alike(model):
 @pytest.mark.parametrize("old_canable", [True, False], ids=["plain", "stamped"])
 @pytest.mark.parametrize("first_frame", [0, 5, 11, 15])
 def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_canable):
-    """Over the real serial path, whose reader waits for as many bytes as a cycle has, and could sleep through one."""
+    """The real serial path is used, as its reader waits for the bytes of a cycle and could sleep through one."""
     lost = Injector(parse_stretches("dead=4.5@.15+.01,dead=4.3@.25+.01"), Truth())
     recording = numbered(60, first=FIRST)
     with (

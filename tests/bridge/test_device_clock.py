@@ -45,7 +45,7 @@ def test_hours_of_silence_are_hours_and_not_what_is_left_of_a_turn() -> None:
     clock.host_ns(1_000, HOST_NS)
     silent_us = 3 * 3600 * 10**6
     arrival_ns = HOST_NS + silent_us * US + 4 * MS
-    # After so long nobody knows how far the clocks have parted: the offset is found anew, the turns are counted.
+    # After so long the drift between the clocks is unknown: the offset is estimated again, and the turns are counted.
     assert clock.host_ns((1_000 + silent_us) % WRAP_US, arrival_ns) == arrival_ns
     assert clock.host_ns((1_000 + silent_us + 10_000) % WRAP_US, arrival_ns + 26 * MS) == arrival_ns + 10 * MS
     assert clock.restarts == 0
@@ -84,7 +84,7 @@ def test_frames_that_changed_places_are_no_new_beginning() -> None:
 
 @pytest.mark.parametrize("back_ms", [-50, 0, 3, 12, 15, 20, 50, 80, 99, 3000])
 def test_a_wall_clock_that_is_set_back_costs_no_scan(back_ms: int) -> None:
-    """Stamps of socketcan and of a server are of one. No scan is lost, so none may be told to be missing.
+    """Stamps of socketcan and of a server are of one. No scan is lost, so none may be reported missing.
 
     A step that stamps do not show, being less than what they go on by meanwhile, may make one.
     """

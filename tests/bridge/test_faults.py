@@ -60,7 +60,7 @@ class Played:
             at += step
 
     def agrees(self) -> bool:
-        """The reader counted what the truth says that it must have."""
+        """Return True where the reader counted what it must by the truth."""
         counted, told = self.reader.counters(), self.truth.counters()
         counted["bad_lines"] += counted["non_ascii_lines"]
         counted["skipped_bytes"] += self.reader.decoder.pending_bytes
@@ -218,7 +218,7 @@ def test_what_the_kernel_may_not_have_counted_yet_is_not_taken_for_read():
     truth, frame = Truth(), CanFrame(0x004, bytes(8))
     for time_ns in (0, 5, 10):
         truth.hand_on(Piece(encode_frame(frame), BusFrame(0.0, frame, 0)), 22, time_ns)
-    truth.settle(22, counted_ns=5)  # one is counted; the last may be that one, or lie there beside it
+    truth.settle(22, counted_ns=5)  # one is counted; the last may be that one, or wait there after it
     assert truth.frames == 1
     truth.close_channel(44)
     assert truth.fates == Counter(intact=1, unread=2)

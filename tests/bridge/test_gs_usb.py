@@ -259,7 +259,7 @@ def test_frames_are_found_again_behind_a_wreck(lost):
 
 @pytest.mark.parametrize("kept_bytes", range(1, 24))
 def test_a_transfer_that_was_cut_short_takes_nothing_from_the_next(kept_bytes):
-    """What is missing of its frame was filled with the next once: readings, and a bus-off, that nobody sent."""
+    """The missing part of a frame was once filled with the next: readings, and a bus-off, that nobody sent."""
     scans = GsUsbScans()
     scans.start(stamped=True, channels=1)
     got = []
@@ -345,7 +345,7 @@ def test_device_time_goes_on_over_its_wrap_after_71_minutes():
     scans.start(stamped=True, channels=1)
     host_ns, delay_ns = 5_000_000_000_000, 300_000
     got = []
-    for cycle in range(40):  # 0x1000000 us are 16.8 s: number 17 is the first behind the wrap, and comes late
+    for cycle in range(40):  # 0x1000000 us are 16.8 s: number 17 is the first after the wrap, and comes late
         for index, frame in enumerate(SCAN):
             at_us = cycle * 1_000_000 + index * 130
             data = host_frame(frame, stamp_us=(0xFF000000 + at_us) & 0xFFFFFFFF)

@@ -1,12 +1,10 @@
 """The python-can link: the real library, its virtual bus, and what its other interfaces do."""
 
-import builtins
 import errno
 import random
 import threading
 import time
 from functools import partial
-from pathlib import Path
 
 import can
 import pytest
@@ -14,11 +12,9 @@ from bridge_samples import make_counts, read_scans
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.xela_controller import scan_frames
-from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.can_bus import CanBusLink
-from firmware_bridge.links.can_networks import can_networks
-from firmware_bridge.links.discovery import can_interfaces
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -74,7 +70,7 @@ def test_a_scan_comes_with_its_last_frame(bus):
         assert [link.read(0.0) for _ in range(15)] == [[]] * 15 and link.read(0.01) == []
         bus.send(message_of(frames_of(1)[15]))
         (scan,) = link.read(100.0)
-        assert scan.complete and scan.device_ns is None  # it says no time
+        assert scan.complete and scan.device_ns is None  # it carries no time
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
@@ -225,7 +221,7 @@ def error_message(classes, *data):
 
 @pytest.fixture
 def lasting(bus, monkeypatch):
-    """A socketcan link that is opened anew when it is silent, over the virtual bus, on a clock of its own."""
+    """Link of socketcan that is opened again when it is silent, over the virtual bus, on a clock of its own."""
     now_ns = [10**12]
     monkeypatch.setattr(can_bus, "_check_network", lambda name: None)
     link = link_to(bus, clock_ns=lambda: now_ns[0])
@@ -235,7 +231,7 @@ def lasting(bus, monkeypatch):
     with LastingLink(link, clock_ns=lambda: now_ns[0]) as lasting:
 
         def read(*messages):
-            """What came, then a second of nothing, and what the next read does about that."""
+            """Read messages, then let a second pass without any, and read again."""
             for message in messages:
                 bus.send(message)
                 lasting.read(0.0)
@@ -249,7 +245,7 @@ def lasting(bus, monkeypatch):
 
 @pytest.mark.parametrize(("told", "words"), [(error_message(0x40), "bus-off"), (error_message(4, 0, 0x10), "passive")])
 def test_a_bus_that_is_off_stays_so_however_often_a_socket_is_opened(lasting, told, words):
-    """The kernel tells of it once, to the sockets that are open then."""
+    """The kernel reports it once, to the sockets that are open then."""
     for number in range(4):
         link = lasting(told) if number == 0 else lasting()
         assert words in (link.trouble or ""), number
@@ -273,123 +269,6 @@ def test_a_network_that_was_down_begins_anew(lasting, monkeypatch):
     assert not link._open
     lasting()
     assert lasting().trouble is None and link._open
-
-
-# What an interface gets, and what goes wrong before anything is open.
-
-
-def open_recorded(monkeypatch, interface, channel):
-    asked = []
-    monkeypatch.setattr(can, "Bus", lambda **settings: asked.append(settings))
-    monkeypatch.setattr(can_bus, "_check_network", lambda name: None)
-    CanBusLink(interface, channel).__enter__()
-    return asked[0]
-
-
-def test_the_bitrate_is_given_where_it_is_taken(monkeypatch):
-    common = {"ignore_config": True}
-    assert open_recorded(monkeypatch, "kvaser", "0") == common | {
-        "interface": "kvaser",
-        "channel": 0,
-        "bitrate": 1_000_000,
-    }
-    assert open_recorded(monkeypatch, "pcan", "PCAN_USBBUS1")["channel"] == "PCAN_USBBUS1"
-    assert open_recorded(monkeypatch, "virtual", "0") == common | {"interface": "virtual", "channel": "0"}
-    socketcan = open_recorded(monkeypatch, "socketcan", "can0")
-    assert "bitrate" not in socketcan
-    assert socketcan["can_filters"] == [{"can_id": 0, "can_mask": 0, "extended": False}]
-
-
-@pytest.mark.parametrize("interface", ["slcan", "gs_usb"])
-def test_what_we_read_better_ourselves_is_refused(interface):
-    with pytest.raises(SourceError, match=rf"use {interface}:"):
-        CanBusLink(interface, "0")
-
-
-def test_an_unknown_interface_gives_those_there_are():
-    with pytest.raises(
-        SourceError, match=r"expected can:INTERFACE:CHANNEL of .*kvaser.*pcan.*socketcan.*virtual"
-    ) as no:
-        CanBusLink("socketcam", "can0")
-    assert "slcan" not in str(no.value) and "gs_usb" not in str(no.value)
-
-
-def test_python_can_is_not_installed(monkeypatch):
-    real = builtins.__import__
-
-    def no_can(name, *arguments, **settings):
-        if name == "can":
-            raise ImportError(name)
-        return real(name, *arguments, **settings)
-
-    monkeypatch.setattr(builtins, "__import__", no_can)
-    with pytest.raises(DeviceError, match=r"pip install '.+\[can\]'"):
-        CanBusLink("virtual", "x")
-
-
-@pytest.mark.parametrize("interface", ["pcan", "kvaser", "neovi", "socketcand", "vector"])
-def test_a_driver_that_is_not_there(interface):
-    with pytest.raises(DeviceError, match=rf"^can:{interface}:0: cannot be opened"):
-        CanBusLink(interface, "0").__enter__()
-
-
-def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: str | None = None) -> None:
-    network = root / "class/net" / name
-    network.mkdir(parents=True)
-    (network / "flags").write_text("0x40081\n" if up else "0x40080\n")
-    (network / "type").write_text(f"{kind}\n")
-    if driver:
-        (root / driver).mkdir()
-        (network / "device").mkdir()
-        (network / "device/driver").symlink_to(root / driver)
-
-
-@pytest.fixture
-def sys_root(monkeypatch, tmp_path):
-    monkeypatch.setattr(can_bus, "can_networks", partial(can_networks, tmp_path))
-    return tmp_path
-
-
-def test_a_network_that_is_not_there_or_down(sys_root):
-    make_network(sys_root, "can1", up=True)
-    make_network(sys_root, "eth0", up=True, kind="1")
-    with pytest.raises(DeviceError, match=r"no CAN network can0: .*seen: can1$"):
-        CanBusLink("socketcan", "can0").__enter__()
-    with pytest.raises(DeviceError, match=r"no CAN network eth0: .*seen: can1$"):
-        CanBusLink("socketcan", "eth0").__enter__()
-    make_network(sys_root, "can0", up=False, driver="peak_usb")
-    up = "sudo ip link set can0 up type can bitrate 1000000 restart-ms 100"
-    with pytest.raises(DeviceError, match=rf"can0 is down: {up}$"):
-        CanBusLink("socketcan", "can0").__enter__()
-    make_network(sys_root, "vcan0", up=False)
-    with pytest.raises(DeviceError, match=r"vcan0 is down: sudo ip link set vcan0 up$"):
-        CanBusLink("socketcan", "vcan0").__enter__()
-
-
-def test_what_the_list_of_devices_advises_is_what_opening_does(sys_root):
-    make_network(sys_root, "can0", up=False, driver="gs_usb")
-    (listed,) = can_interfaces(sys_root, lambda name: None)
-    with pytest.raises(DeviceError) as refused:
-        CanBusLink("socketcan", "can0").__enter__()
-    assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
-
-
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "modprobe can_raw"),
-        (PermissionError(errno.EPERM, "Operation not permitted"), "no permission"),
-        (can.CanInitializationError("no such channel"), "cannot be opened: no such channel"),
-    ],
-)
-def test_why_a_network_cannot_be_opened(monkeypatch, sys_root, error, words):
-    def refuse(**settings):
-        raise error
-
-    monkeypatch.setattr(can, "Bus", refuse)
-    make_network(sys_root, "can0", up=True)
-    with pytest.raises(DeviceError, match=words):
-        CanBusLink("socketcan", "can0").__enter__()
 
 
 def test_read_ends_with_the_scan_though_more_time_is_left(bus):

@@ -143,5 +143,5 @@ def test_the_emulator_ends_however_its_parent_ends(recording, how):
         last_words, _ = parent.communicate(timeout=60)
     wait_until_gone(recording)
     if how == signal.SIGINT:
-        # Ctrl-C was for the parent alone: the emulator was told to end, and ended well.
+        # Ctrl-C was for the parent alone: the emulator was asked to end, and ended well.
         assert last_words == "interrupted, the emulator ended with 0\n"

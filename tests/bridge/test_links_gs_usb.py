@@ -1,8 +1,6 @@
 """The gs_usb link: the real pyusb above pretended USB."""
 
 import errno
-import random
-import sys
 import threading
 import time
 
@@ -12,28 +10,15 @@ import usb.core
 from bridge_samples import make_counts, read_scans
 from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
-from usb.backend import libusb1
+from gs_usb_samples import frames_of, opened
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.xela_controller import scan_frames
-from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
-from firmware_bridge.links import gs_usb_devices, gs_usb_link
-from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
+from firmware_bridge.errors import LinkLostError, NoDeviceError
+from firmware_bridge.links import gs_usb_link
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
-
-
-def frames_of(scans, controller=4, seed=0):
-    """Frames of so many scans that all differ."""
-    noise = random.Random(seed)
-    return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
-
-
-def opened(port=None, **settings):
-    backend = GsUsbBackend(port or GsUsbPort())
-    return backend.ports[0], GsUsbLink(backend=backend, **settings)
 
 
 def feed_slowly(adapter, frames):
@@ -105,7 +90,7 @@ def test_the_time_of_the_device_is_what_it_says():
     clock_ns = [10**12]
     port, link = opened(clock_ns=lambda: clock_ns[0])
     with link:
-        for start_us in (0xFFFFFF00, 0xFFFFFF00 + 10_000):  # the second behind the wrap
+        for start_us in (0xFFFFFF00, 0xFFFFFF00 + 10_000):  # the second after the wrap
             for number, frame in enumerate(frames_of(1)):
                 port.adapter.hear(frame, stamp_us=start_us + 130 * number)
                 clock_ns[0] += 130_000 + 2_000_000 * (number == 15)
@@ -338,161 +323,6 @@ def test_closing_what_is_gone():
 def test_what_it_says_about_itself():
     assert (GsUsbLink().name, GsUsbLink("AB").name) == ("gs_usb", "gs_usb:AB")
     assert (GsUsbLink().kind, GsUsbLink().ended) == ("device", False)
-
-
-# What goes wrong before anything is open.
-
-
-def test_the_adapters_of_this_machine():
-    foreign = GsUsbPort(usb_id=(0x0403, 0x6015))
-    nameless = GsUsbPort(serial_number=None, product=None, usb_id=(0x1209, 0x2323))
-    backend = GsUsbBackend(GsUsbPort(serial_number="AB"), foreign, nameless)
-    nameless.address = 9
-    named, unnamed = list_devices(backend)
-    assert str(named) == "bus 1 device 5 1d50:606f serial=AB (candleLight USB to CAN adapter)"
-    assert str(unnamed) == "bus 1 device 9 1209:2323 (candleLight)"
-    assert list_devices(GsUsbBackend(foreign)) == []
-    assert [port.handles for port in backend.ports] == [0, 0, 0]
-
-
-def test_only_one_may_go_unnamed():
-    backend = GsUsbBackend(GsUsbPort(serial_number="AB"), GsUsbPort(serial_number="CD"))
-    with pytest.raises(NoDeviceError, match=r"2 gs_usb adapters found: .*--source gs_usb:AB.*serial=CD"):
-        GsUsbLink(backend=backend).__enter__()
-    with GsUsbLink("CD", backend=backend):
-        assert [port.adapter.started for port in backend.ports] == [False, True]
-
-
-def test_none_or_another():
-    backend = GsUsbBackend(GsUsbPort(usb_id=(1, 1)))
-    with pytest.raises(NoDeviceError, match=r"no gs_usb adapter found: .* seen: none"):
-        GsUsbLink(backend=backend).__enter__()
-    with pytest.raises(NoDeviceError, match=r"no gs_usb adapter with serial number XY, .*serial=0039"):
-        GsUsbLink("XY", backend=GsUsbBackend()).__enter__()
-
-
-@pytest.mark.parametrize("serial_number", [None, "AB"])
-def test_no_permission_gives_the_rule_to_write(serial_number):
-    port, _ = opened(GsUsbPort(serial_number="AB"))
-    port.permitted = False
-    with pytest.raises(DeviceError, match=r'idVendor}=="1d50".*udev/rules.d'):
-        GsUsbLink(serial_number, backend=GsUsbBackend(port)).__enter__()
-
-
-def test_in_use():
-    port, link = opened()
-    with link, pytest.raises(DeviceError, match=r"in use: .*can0 down"):
-        GsUsbLink(backend=GsUsbBackend(port)).__enter__()
-
-
-def test_a_controller_that_cannot_do_1_mbit():
-    limits = CANDLELIGHT._replace(clock_hz=8_500_000)
-    port, link = opened(GsUsbPort(lambda: GsUsbAdapter(limits)))
-    port.kernel_driver = True
-    with pytest.raises(DeviceError, match="cannot do 1 Mbit/s"):
-        link.__enter__()
-    assert port.kernel_driver and not port.claimed
-
-
-def test_an_adapter_that_does_not_answer(monkeypatch):
-    def request_out(adapter, number, payload):
-        raise gs_usb_emulator._error(gs_usb_emulator.TIMEOUT)
-
-    monkeypatch.setattr(GsUsbAdapter, "request_out", request_out)
-    with pytest.raises(DeviceError, match="does not answer: unplug it"):
-        opened()[1].__enter__()
-
-
-def test_a_device_that_answers_something_else(monkeypatch):
-    monkeypatch.setattr(GsUsbAdapter, "request_in", lambda adapter, number: b"no")
-    with pytest.raises(DeviceError, match="2 bytes, expected 12"):
-        opened()[1].__enter__()
-
-
-def test_a_trigger_that_does_not_go_out(monkeypatch):
-    monkeypatch.setattr(GsUsbAdapter, "take", lambda adapter, data: False)
-    with pytest.raises(DeviceError, match="does not answer"):
-        opened(triggers=[trigger_frame(1)])[1].__enter__()
-
-
-def test_usb_that_cannot_be_read(monkeypatch):
-    def enumerate_devices(backend):
-        raise gs_usb_emulator._error(gs_usb_emulator.ACCESS)
-
-    monkeypatch.setattr(GsUsbBackend, "enumerate_devices", enumerate_devices)
-    with pytest.raises(DeviceError, match="USB cannot be read"):
-        list_devices(GsUsbBackend())
-
-
-def test_no_libusb(monkeypatch):
-    import libusb_package
-
-    monkeypatch.setattr(libusb_package, "get_libusb1_backend", lambda: None)
-    with pytest.raises(DeviceError, match="libusb cannot be loaded: pip install libusb-package"):
-        gs_usb_devices.usb_backend()
-
-
-def test_without_the_package_the_systems_libusb_is_taken(monkeypatch):
-    backend = GsUsbBackend()
-    monkeypatch.setitem(sys.modules, "libusb_package", None)
-    monkeypatch.setattr(libusb1, "get_backend", lambda: backend)
-    assert gs_usb_devices.usb_backend() is backend
-
-
-def test_the_libusb_of_the_package_works_here():
-    assert isinstance(list_devices(), list)
-
-
-# The public packages above the same pretended device, to show that it is like one.
-
-
-@pytest.fixture
-def public_port(monkeypatch):
-    backend = GsUsbBackend()
-    monkeypatch.setattr(libusb1, "get_backend", lambda **_: backend)
-    return backend.ports[0]
-
-
-def test_the_public_package_reads_it_and_never_sees_the_unplugging(public_port):
-    from gs_usb.gs_usb import GsUsb
-    from gs_usb.gs_usb_frame import GsUsbFrame
-
-    (device,) = GsUsb.scan()
-    assert device.serial_number == public_port.serial_number and device.device_info.icount == 0
-    assert device.set_bitrate(1_000_000)
-    device.start()
-    public_port.adapter.hear(CanFrame(0x334, b"abcdefgh"), stamp_us=77)
-    frame = GsUsbFrame()
-    assert device.read(frame, 100)
-    assert (frame.can_id, bytes(frame.data), frame.timestamp_us) == (0x334, b"abcdefgh", 77)
-    public_port.adapter.unplug()
-    assert device.read(frame, 100) is False
-
-
-def test_the_public_package_finds_it_mute_on_the_second_run(public_port):
-    """gs_usb issue 20: it resets the device while a frame waits to be fetched."""
-    from gs_usb.gs_usb import GsUsb
-    from gs_usb.gs_usb_frame import GsUsbFrame
-
-    for run in range(2):
-        device = GsUsb.scan()[0]
-        device.set_bitrate(1_000_000)
-        device.start()
-        public_port.adapter.hear(*frames_of(1))
-        assert device.read(GsUsbFrame(), 10) is (run == 0)
-        device.stop()
-
-
-def test_python_can_reads_it(public_port):
-    import can
-
-    with can.Bus(interface="gs_usb", channel=0, bitrate=1_000_000) as bus:
-        public_port.adapter.hear(CanFrame(0x114, b"\1\2"), stamp_us=5_000_000)
-        message = bus.recv(1.0)
-        assert message is not None
-        assert (message.arbitration_id, bytes(message.data), message.timestamp) == (0x114, b"\1\2", 5.0)
-        bus.send(can.Message(arbitration_id=0x201, data=b"\7\0", is_extended_id=False))
-        assert public_port.adapter.sent == [CanFrame(0x201, b"\7\0")]
 
 
 def test_a_short_packet_ends_a_transfer():

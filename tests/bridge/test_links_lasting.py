@@ -102,7 +102,7 @@ def test_a_long_outage_is_asked_after_every_two_seconds():
 
 
 def test_a_device_that_falls_silent_is_opened_anew_and_told_once():
-    """As an adapter that was reset: its port is there, its channel closed until it is opened."""
+    """An adapter that was reset has a port, but its channel is closed until it is opened."""
     world = World(mute=[(1.0, 1.0 + LINK_SILENT_S + 0.015)])
     notices, link, heard_s = lasting(world, 4.0)
     assert kinds(notices) == ["silent", "back"]
@@ -134,7 +134,7 @@ def test_each_outage_is_met_with_the_same_haste():
 
 
 def test_the_silence_of_one_that_came_back_begins_with_its_opening():
-    """Who has to settle after it was plugged in is not opened over and over."""
+    """A device that has to settle after it was plugged in is not opened over and over."""
     world = World(away=[(1.0, 5.0)], mute=[(5.0, 5.0 + 0.9 * LINK_SILENT_S)])
     lasting(world, 8.0)
     assert len(world.opened_at_s) == 2
@@ -179,7 +179,7 @@ def test_after_a_long_silence_one_that_was_plugged_again_is_opened_anew_as_soon_
 
 
 def test_one_that_comes_back_as_another_kind_is_given_up():
-    """Every result says of what kind its source is: the pretended must not follow the real under its name."""
+    """Every result states the kind of its source: an emulated one must not follow a real one under its name."""
 
     class Changeling(WorldLink):
         def __enter__(self):
@@ -256,7 +256,7 @@ class SlowToClose(WorldLink):
 
 @pytest.mark.parametrize("stretches", [{"away": [(0.1, 3.0)]}, {"mute": [(0.1, 3.0)]}])
 def test_a_read_that_may_take_long_is_asked_for_a_thread_of_its_own(stretches):
-    """Whoever shares a thread reads only while `wait_on` names a descriptor, and never waits then."""
+    """Links that share a thread are read only while `wait_on` names a descriptor, and never wait then."""
     world = World(**stretches)
     with LastingLink(SlowToClose(world), clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
         apart = 0

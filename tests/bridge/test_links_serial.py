@@ -1,4 +1,3 @@
-import contextlib
 import errno
 import os
 import pty
@@ -6,19 +5,18 @@ import select
 import threading
 import time
 import tty
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import serial
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
+from serial_samples import SilentDevice, wait_for
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
+from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links import fd_reader as bursts
-from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, USPA44_MAP, trigger_frame
@@ -82,7 +80,7 @@ def test_opening_late_loses_nothing_of_a_recording():
 
 
 def counting_recording(scans: int, rate_hz: float) -> Recording:
-    """Every count tells which cycle it is of."""
+    """Return a recording whose counts encode their cycle."""
     counts = REST_COUNTS.astype(np.int32) + np.arange(scans, dtype=np.int32)[:, None, None, None]
     return Recording(Path("counting.csv"), (Track("4", counts, None),), rate_hz)
 
@@ -91,13 +89,6 @@ def cycles_in(scan: Scan) -> set[int]:
     cycles = set((scan.counts - REST_COUNTS)[:, scan.fresh].ravel().tolist())
     assert cycles <= set(range(500)), "a value that no cycle had"
     return cycles
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 def test_what_is_older_than_the_opening_is_dropped():
@@ -207,7 +198,7 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
 
 @pytest.mark.parametrize("piece_bytes", [1, 22, 62, 100, 352])
 def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes):
-    """Also behind one that was torn, which its own end cannot close."""
+    """The same holds after a torn scan, which its own end cannot close."""
     lines = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         for sent, complete in ((lines, [True]), (lines[:3] + lines[4:], []), (lines, [False, True]), (lines, [True])):
@@ -274,42 +265,6 @@ def test_opening_again_joins_nothing_to_what_came_before():
         assert counters["abandoned"] == 4 and counters["skipped_bytes"] > 0
 
 
-class SilentDevice:
-    """The far end of a pseudo-terminal that takes nothing: a dead adapter, its cable in."""
-
-    def __enter__(self):
-        self.device_fd, self.client_fd = os.openpty()
-        tty.setraw(self.client_fd)
-        self.port = os.ttyname(self.client_fd)
-        return self
-
-    def received(self, count: int) -> bytes:
-        """The first bytes that came, and any that came with them."""
-        data = b""
-        while len(data) < count and select.select([self.device_fd], [], [], 5)[0]:
-            data += os.read(self.device_fd, 1000)
-        return data
-
-    def __exit__(self, *exc_info):
-        os.close(self.device_fd)
-        os.close(self.client_fd)
-
-
-def test_commands_on_opening_and_closing():
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port) as link:
-            assert link.read(0.0) == []
-        # Nothing before, nothing between and nothing after: an empty command is refused by some adapters.
-        assert device.received(15) == b"C\rS8\rZ1\rO\rC\rZ0\r"
-
-
-def test_no_time_stamps_where_the_line_carries_none():
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port, 921_600) as link:
-            assert link.read(0.0) == []
-        assert device.received(9) == b"C\rS8\rO\rC\r"
-
-
 def test_triggers_wake_older_controllers():
     triggers = [trigger_frame(1), trigger_frame(2)]
     with SilentDevice() as device, SlcanSerialLink(device.port, model=LAYOUT_A_MAP, triggers=triggers) as link:
@@ -320,147 +275,9 @@ def test_triggers_wake_older_controllers():
         assert scan.sensor == "1" and scan.complete and set(scan.counts[1].ravel().tolist()) == {2}
 
 
-def fill(port_fd: int) -> None:
-    os.set_blocking(port_fd, False)
-    for _ in range(5):  # the kernel moves bytes on to a second buffer, with a delay
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                os.write(port_fd, b"xxxx")
-        time.sleep(0.01)
-
-
-def test_a_device_that_takes_nothing_does_not_hold_up_closing(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.05)
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port):
-            fill(device.client_fd)
-        serial.Serial(device.port, exclusive=True).close()  # the port is free again
-
-
-def test_a_device_that_takes_nothing_does_not_hold_up_opening(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.05)
-    with SilentDevice() as device:
-        fill(device.client_fd)
-        with pytest.raises(DeviceError, match="does not take commands"):
-            SlcanSerialLink(device.port).__enter__()
-        serial.Serial(device.port, exclusive=True).close()
-
-
-@pytest.mark.parametrize("unsent", [0, 5])
-def test_commands_are_thrown_away_only_if_the_device_does_not_take_them(monkeypatch, unsent):
-    """Throwing them away always would throw away the closing as well."""
-    thrown = []
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port):
-            monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.02)
-            # A pseudo-terminal never tells that something is unsent.
-            monkeypatch.setattr(serial.Serial, "out_waiting", unsent)
-            monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda port: thrown.append(port))
-        assert bool(thrown) == bool(unsent)
-
-
-def test_a_stream_that_will_not_stop_does_not_hold_up_opening(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "LONGEST_SETTLE_S", 0.1)
-    stop = threading.Event()
-    with SilentDevice() as device:
-        os.set_blocking(device.device_fd, False)
-
-        def chatter():
-            while not stop.wait(0.001):
-                with contextlib.suppress(BlockingIOError):
-                    os.write(device.device_fd, b"t0048937E317E1593120F\r")
-
-        thread = threading.Thread(target=chatter)
-        thread.start()
-        try:
-            with SlcanSerialLink(device.port) as link:
-                while not link.counters()["frames"]:
-                    link.read(1.0)
-        finally:
-            stop.set()
-            thread.join()
-
-
-def test_flow_control_is_asked_for():
-    with SilentDevice() as device:
-        for rtscts in (True, False):
-            with SlcanSerialLink(device.port, rtscts=rtscts):
-                assert (
-                    bool(slcan_serial.termios.tcgetattr(device.client_fd)[2] & slcan_serial.termios.CRTSCTS) == rtscts
-                )
-
-
-# What goes wrong before anything is open.
-
-
-def test_no_such_port():
-    with pytest.raises(DeviceError, match=r"/dev/ttyNONE: no such port\. Serial ports seen: "):
-        SlcanSerialLink("/dev/ttyNONE").__enter__()
-
-
-def test_something_that_is_no_serial_port(tmp_path):
-    path = tmp_path / "file"
-    path.write_text("")
-    for port in (str(path), str(tmp_path), "/dev/null"):
-        with pytest.raises(DeviceError, match="cannot be used as a serial port"):
-            SlcanSerialLink(port).__enter__()
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [(errno.EACCES, "dialout"), (errno.EPERM, "dialout"), (errno.EBUSY, "slcand"), (errno.EIO, "Input/output error")],
-)
-def test_why_a_port_cannot_be_opened(monkeypatch, code, words):
-    def refuse(*args, **kwargs):
-        raise serial.SerialException(code, f"could not open port: [Errno {code}]")
-
-    monkeypatch.setattr(serial, "Serial", refuse)
-    with pytest.raises(DeviceError, match=words) as refused:
-        SlcanSerialLink("/dev/ttyUSB0").__enter__()
-    assert isinstance(refused.value, BridgeError) and isinstance(refused.value, OSError)
-
-
-def test_an_adapter_that_goes_while_it_is_opened(monkeypatch):
-    with Emulator([make_recording(1)]) as emulator:
-        link = SlcanSerialLink(emulator.port)
-        opened = link._open_port
-
-        def open_and_pull():
-            port = opened()
-            emulator.hang_up()
-            return port
-
-        monkeypatch.setattr(link, "_open_port", open_and_pull)
-        with pytest.raises(DeviceError):
-            link.__enter__()
-
-
-def test_terminal_errors_are_link_errors(monkeypatch):
-    """pyserial lets them through from some calls, and they are no OSError."""
-
-    def fail(*args, **kwargs):
-        raise slcan_serial.termios.error(errno.EIO, "Input/output error")
-
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port) as link:
-            monkeypatch.setattr(serial.Serial, "write", fail)
-        with pytest.raises(DeviceError):
-            link.__enter__()
-        monkeypatch.setattr(serial, "Serial", fail)
-        with pytest.raises(DeviceError):
-            link.__enter__()
-
-
-def test_low_latency_where_the_driver_has_it(monkeypatch):
-    asked = []
-    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda port, on: asked.append(on))
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        assert asked == [True] and link.low_latency
-
-
 @pytest.mark.parametrize("old_canable", [True, False])
 def test_what_lay_there_because_nobody_read_is_marked_old(old_canable):
-    """Without stamps readings of seconds ago were as new as any."""
+    """Readings without stamps that are seconds old would look new."""
     playing = Emulator([make_recording(50)], loop=True, old_canable=old_canable)
     with playing as emulator, SlcanSerialLink(emulator.port) as link:
         read_scans(link, 20)

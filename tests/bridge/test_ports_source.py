@@ -252,13 +252,13 @@ def test_the_demo_source(tmp_path):
 
 
 def read_one_scan(model, ids, cycles=1):
-    """What comes of so many frames of each id, put on a line that `open_source` reads, and what it sent."""
+    """Return the scan of so many frames of each id, on a line that `open_source` reads, and the commands it sent."""
     master, slave = os.openpty()
     tty.setraw(slave)
     sent = bytearray()
 
     def take():
-        """As an adapter does; with nobody there the link waits a second for each command to be taken."""
+        """Take commands as an adapter does; without one the link waits a second for each of them."""
         with suppress(OSError):  # the terminal is closed
             while True:
                 sent.extend(os.read(master, 4096))

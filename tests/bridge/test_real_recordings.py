@@ -78,6 +78,6 @@ def test_torn_and_repeated_rows_are_told(played, trial):
         assert [scan.repeated for scan in scans] == (renewed == 0).tolist()
         torn += int(((renewed > 0) & (renewed < 16)).sum())
         repeated += int((renewed == 0).sum())
-    # The recordings are known to hold both; a comparison that finds none would prove nothing.
+    # The recordings hold both; a comparison without any would prove nothing.
     assert torn > 200 and repeated > 40
     assert (told.counters["torn_source"], told.counters["repeated"], told.counters["torn_wire"]) == (torn, repeated, 0)

@@ -11,7 +11,7 @@ from firmware_bridge.scans.xela_server_scans import FARTHEST_BACK, MOST_MISSED, 
 
 
 class Server:
-    """Says what it is told to, at times that are told; arrivals are 2 ms after the sending."""
+    """Server with messages and times of the test; arrivals are 2 ms after the sending."""
 
     def __init__(self) -> None:
         self.scans = ServerScans()
@@ -21,7 +21,7 @@ class Server:
     def say(
         self, at_ms: float, counts=REST_COUNTS, *, age_ms: float = 0.0, way_ms=2, number: int | None = None, **changes
     ):
-        """The scans that one message about one sensor closes, sent at a time in [ms]."""
+        """Return the scans that one message about one sensor closes, sent at a time in [ms]."""
         sent_s = self.clock_s + at_ms / 1e3
         entry = sensor_entry(counts, **({"time_s": sent_s - age_ms / 1e3} | changes))
         text = message(self.sequence if number is None else number, entry, time_s=sent_s)
@@ -149,7 +149,7 @@ def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
     assert server.scans.trouble is not None and "nothing comes of sensor 1: see to its cable" in server.scans.trouble
     assert not any(scan.renewed.any() for scan in scans) and len(scans) <= 67  # a second long it may be a still pad
     assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
-    server.scans.begin()  # opening it anew brings no scan either
+    server.scans.begin()  # opening it again brings no scan either
     assert server.say(5000, cycle(19), **dead) == [] and server.scans.trouble is not None
     server.say(5010, cycle(20))
     assert server.say(5020, cycle(21)) and server.scans.trouble is None
@@ -157,7 +157,7 @@ def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
 
 @pytest.mark.parametrize("set_by_s", [0.0, -3600.0, 3600.0])
 def test_a_sensor_that_died_long_ago_stays_dead(set_by_s):
-    """Its last reading is then of an age that no clock vouches for, or of times to come."""
+    """The age of its last reading would then be unreliable, or lie in the future."""
     server = Server()
     assert server.say(0, cycle(1))
     server.clock_s += set_by_s
@@ -303,7 +303,7 @@ def test_when_it_was_acquired():
 
 
 def test_a_server_whose_readings_are_always_of_some_age_is_no_trouble():
-    """As in the vendor's own sample, .3 s from acquired to sent."""
+    """The vendor's own sample has 0.3 s from acquired to sent."""
     server = Server()
     for step in range(300):
         server.say(10 * step, cycle(step), age_ms=300 + step % 7)
@@ -328,7 +328,7 @@ def test_what_comes_later_than_usual_is_counted_and_is_trouble():
 
 
 def test_what_lay_on_the_way_is_counted():
-    """Sent at the usual pace, read late, as behind a client that hung."""
+    """Messages are sent at the usual pace and read late, as after a client that hung."""
     server = Server()
     for step in range(10):
         server.say(10 * step, cycle(step))

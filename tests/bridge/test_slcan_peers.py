@@ -9,7 +9,7 @@ import can
 import pytest
 from bridge_samples import make_recording, read_scans
 from can.interfaces.slcan import slcanBus
-from test_links_serial import SilentDevice
+from serial_samples import SilentDevice
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -19,7 +19,7 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 
 def open_peer(port: str) -> slcanBus:
-    """As its users do, without the two seconds that it sleeps."""
+    """Open it as its users do, without the two seconds that it sleeps."""
     return slcanBus(f"{port}@3000000", bitrate=1_000_000, rtscts=True, sleep_after_open=0)
 
 
@@ -51,7 +51,7 @@ def test_it_reads_our_emulator_with_time_stamps():
 
 
 def test_we_read_what_it_writes():
-    """It takes the place of the adapter: what it sends is put on our line."""
+    """The package takes the place of the adapter: what it sends is put on our line."""
     counts = make_recording(3).tracks[0].counts
     noise = random.Random(1)
     frames = [frame for scan in counts for frame in scan_frames(scan, 4, noise)]
@@ -72,7 +72,7 @@ def test_what_it_says_on_opening_is_obeyed_and_is_no_frame():
     with SilentDevice() as device:
         opened = threading.Thread(target=lambda: open_peer(device.port).shutdown())
         opened.start()
-        while b"C\r" not in heard[2:]:  # the last thing it says
+        while b"C\r" not in heard[2:]:  # the last command that it sends
             heard += os.read(device.device_fd, 1000)
         opened.join()
     assert heard.startswith(b"C\rS8\r\rO\rO\r")

@@ -103,7 +103,7 @@ T0 = 10**12
 
 
 def times_asked(until_ns: int, *, scans=lambda ns: True, answer=lambda status: status.hear(b"F00", 0), refuse=False):
-    """When questions were asked, in [ms] from the opening, with a read every 10 ms."""
+    """Return the times of questions, in [ms] from the opening, with a read every 10 ms."""
     status, refusals = AdapterStatus(), 0
     questions = StatusQuestions(status)
     asked = []

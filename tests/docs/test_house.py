@@ -11,7 +11,7 @@ PACKAGES = ("firmware_bridge", "edge", "train", "export")
 MOST_ROOT_MODULES = 10
 MOST_LINES = 400
 OF_A_ROOM = {"__init__.py", "__main__.py", "command.py", "options.py", "errors.py", "base.py", "sink.py"}
-"""Names that say the same of every room."""
+"""Names that mean the same in every room."""
 SOURCES = {".py", ".js", ".css", ".html"}
 LONG: set[str] = set()
 """Files that are longer all the same; keep this empty."""

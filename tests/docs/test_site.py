@@ -24,7 +24,7 @@ FETCHED = {
 
 
 class Page(HTMLParser):
-    """What a page fetches, where it leads, and what can be led to in it."""
+    """Page of the site: its fetches, its links, and the anchors in it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()

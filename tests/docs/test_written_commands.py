@@ -53,7 +53,7 @@ PARSED = {
     r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench and test_zenoh run them",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
-    r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until it is ended; test_emulator runs it",
+    r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until ended; test_emulator_port runs it",
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
@@ -65,7 +65,7 @@ LEFT_OUT = {
     r"(echo .*\| )?sudo .*": "needs root, and the machine that the adapter is plugged into",
     r"(cmake|export) .*|pip install [\w-]+": "makes, or fetches, what is of others",
     r"ros2 .*": "needs ROS",
-    r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm runs it",
+    r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm_reading runs it",
     r"python examples/zenoh_listen\.py .*": "goes on until it is ended; test_zenoh runs it",
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
@@ -133,7 +133,7 @@ def emulated():
 
 @pytest.fixture
 def world(emulated, tmp_path, monkeypatch):
-    """A folder with what the pages take for granted, and adapters where they say they are."""
+    """Folder with what the pages take for granted, and adapters at the places that they name."""
     left, right, server = emulated
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
@@ -216,7 +216,7 @@ def test_edge_sr_does_what_is_typed(command, world, monkeypatch, capfd):
 @pytest.mark.parametrize("command", [one for one in RUN if one.startswith("python ")])
 def test_programs_run(command, world, monkeypatch, capfd):
     words = world(command)
-    if words[1].startswith("docs/"):  # such a program writes beside itself
+    if words[1].startswith("docs/"):  # such a program writes next to itself
         Path("docs").mkdir()
         shutil.copy(ROOT / words[1], words[1])
         monkeypatch.setattr(sys, "argv", words[1:])

@@ -1,4 +1,4 @@
-"""Keys that docs/formats.md tells of are those that there are, and figures of the pages are those of the reports."""
+"""Keys in docs/formats.md are those that exist, and figures of the pages are those of the reports."""
 
 import csv
 import json
@@ -101,7 +101,7 @@ def rows(text: str) -> list[list[str]]:
 
 
 def trained_out(method: str) -> set[str]:
-    """Errors of a network that another run judged, rounded as the pages have them."""
+    """Return the errors of a network that another run evaluated, rounded as the pages have them."""
     with (ROOT / "reports" / "trained_out.csv").open() as file:
         for row in csv.DictReader(file):
             if row["network"] == TRAINED_OUT.get(method):

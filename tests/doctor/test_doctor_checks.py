@@ -27,7 +27,7 @@ FREE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")
 
 
 def faults(scans, **changes):
-    """Names and verdicts of what is not ok, where all that can be known is."""
+    """Return names and verdicts of the findings that are not ok, where every input is available."""
     changes.setdefault("references", {"4": FREE})
     return {
         finding.name: finding.verdict
@@ -53,7 +53,7 @@ class TestSensor:
     def test_noise(self, sigma, verdict):
         counts = healthy_counts()
         counts[:, 0, 1, 1] += np.rint(np.random.default_rng(3).normal(0, sigma, len(counts))).astype(np.int32)
-        # So loud a taxel cannot be zeroed, which is told as what follows from it.
+        # So loud a taxel cannot be zeroed, and the report shows that consequence.
         assert faults(as_scans(counts)) == {"noise": verdict, "baseline": "not known"}
         assert "taxel 5 alone is loud" in remedy_of("noise", as_scans(counts))
 
@@ -138,7 +138,7 @@ class TestSensor:
         assert "taken of a loaded pad" in remedy_of("load", as_scans(counts), references={"4": FREE})
 
     def test_a_load_is_told_by_the_pads_own_z(self):
-        """Where z is reversed, what reads less is pressed."""
+        """A lower reading is a press where z is reversed."""
         counts = healthy_counts()
         counts[:, 2, 1, 1] -= 800
         given = {"references": {"4": FREE}, "mountings": {"4": Mounting(signs=(1, 1, -1))}}

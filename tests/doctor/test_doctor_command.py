@@ -1,4 +1,4 @@
-"""`edge-sr doctor` over a real pseudo-terminal: an emulated sensor, its faults, and a person who does as told."""
+"""`edge-sr doctor` over a real pseudo-terminal: an emulated sensor, its faults, and a person who obeys prompts."""
 
 import io
 import json
@@ -76,7 +76,7 @@ class Person:
 
 
 class Terminal(io.StringIO):
-    """Where prompts go, with a person before it."""
+    """Terminal that shows prompts to a person."""
 
     def __init__(self, *people: Person) -> None:
         super().__init__()
@@ -109,7 +109,7 @@ def doctor(monkeypatch, port, *arguments, **settings):
 
 
 def look(monkeypatch, port, *arguments, drift_s=0.7, people=()):
-    """The exit code, what was printed, and what was said to the people."""
+    """Return the exit code, the output, and the prompts to the people."""
     out, err = io.StringIO(), Terminal(*people)
     with monkeypatch.context() as streams:
         streams.setattr(sys, "stdout", out)
@@ -125,7 +125,7 @@ BY_THE_CLOCK = {"rate", "lost scans", "latency timer", "torn scans"}
 
 
 def verdicts(done):
-    """Of what is neither ok nor by the clock, nor left unknown for want of a person or an earlier baseline."""
+    """Return verdicts that are not ok, except by the clock or undecided without a person or an earlier baseline."""
     document = json.loads(done.out)
     assert done.code == (document["verdict"] == "wrong")
     return {
@@ -150,7 +150,7 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
 
 
 def test_a_line_that_is_too_slow(monkeypatch):
-    """At 115200 baud a frame takes 1.9 ms on the line: 32 scans a second arrive of a hundred."""
+    """A frame takes 1.9 ms on the line at 115200 baud: 32 scans a second arrive of a hundred."""
     monkeypatch.setattr(pseudo_port, "LINE_SPEED_BAUD", 115_200)
     with Emulator([recording(healthy_counts(200))], loop=True, frame_s=220 / 115_200, jitter_s=0) as emulator:
         done = doctor(monkeypatch, f"{emulator.port}@115200", "--json", drift_s=1.7)

@@ -1,4 +1,4 @@
-"""The doctor's sensor file: never less than it held, and marked where it was not found of a real sensor."""
+"""The doctor's sensor file: never less than it held, and marked where it was not made from a real sensor."""
 
 import io
 import json

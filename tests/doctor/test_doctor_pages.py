@@ -1,4 +1,4 @@
-"""Every finding of the doctor, and what it says is to be done, is on the page for those who look for help."""
+"""Findings of the doctor and their remedies: every one is on the page for users who need help."""
 
 import ast
 
@@ -35,7 +35,7 @@ def texts(node: ast.AST) -> list[str]:
 
 
 def remedies() -> set[str]:
-    """What is said, as far as it does not depend on what was measured."""
+    """Return the remedies, as far as they do not depend on measurements."""
     said = {text for call in findings() for one in call.args[4:5] for text in texts(one)}
     assigned = [node for tree in trees() for node in ast.walk(tree) if isinstance(node, (ast.Assign, ast.AnnAssign))]
     for node in assigned:

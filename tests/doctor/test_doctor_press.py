@@ -24,7 +24,7 @@ UPRIGHT = list(range(16))
 
 
 def answer_to(deformations, guide=None, period_s=0.01):
-    """What a guide asked, and itself, for these deformations (n, 3, 4, 4)."""
+    """Return the questions of a guide, and the guide, for these deformations (n, 3, 4, 4)."""
     guide = guide or GuidedPress()
     asked = [guide.first]
     for number, zeroed in enumerate(deformations):

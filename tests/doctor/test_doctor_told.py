@@ -1,4 +1,4 @@
-"""What the doctor says at the end: nothing that was not known is well, and nothing found is lost with a file."""
+"""Summary of the doctor: an undecided check is not ok, and no finding is lost with a file."""
 
 import io
 import json
@@ -111,7 +111,7 @@ def test_what_was_found_is_told_though_the_file_cannot_be_written_any_more(tmp_p
 
 
 def test_a_load_is_told_by_the_z_of_the_sensor_file(tmp_path):
-    """Where z is reversed, what reads less than its baseline is pressed."""
+    """A reading below its baseline is a press where z is reversed."""
     path = tmp_path / "s.toml"
     told("--out", path)
     pressed = healthy_counts(200)

@@ -30,7 +30,7 @@ COLUMNS = {
 
 @pytest.fixture(autouse=True)
 def timed_once(monkeypatch):
-    """What a network of the paper's size costs takes seconds to measure, and is asserted nowhere."""
+    """Skip the cost of a network of the paper's size: it takes seconds to measure, and is asserted nowhere."""
     monkeypatch.setattr(workbench, "_TIMED_MS", 0.001)
 
 
@@ -107,7 +107,7 @@ def test_every_experiment_is_a_file_that_can_be_run():
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_its_own_steps_are_followed_by_a_bar(name):
-    """For one of a single page never moves; that of its training is another."""
+    """A bar of a single page would never move; that of its training is another."""
     source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"{module_of(name).replace('.', '/')}.py")
     assert re.search(r"\bfor .* in .*tracked\(", (ROOT / source).read_text())
 

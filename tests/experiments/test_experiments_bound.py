@@ -18,7 +18,7 @@ def taps():
 
 
 def test_one_unknown_force_is_known_to_the_noise_over_the_readings():
-    """Its variance is noise^2 / sum of squares, and the pattern's error is that of its amplitude."""
+    """The variance is noise^2 / sum of squares, and the pattern's error is that of its amplitude."""
     counts = np.repeat(np.full((1, 1, 48), 100.0)[:, :, None], 7, axis=2)
     patterns = np.full((1, 7, 9), 0.2)
     noise_var = 1 + 1 / 12 + (0.0025 * 100) ** 2
@@ -38,7 +38,7 @@ def test_more_taps_tell_more_and_nuisances_tell_less(taps):
 
 
 def test_taps_that_were_not_turned_do_not_tell_gain_from_place():
-    """Without pose errors they are the same readings again: only the noise is averaged."""
+    """Taps without pose errors repeat the same readings: only the noise is averaged."""
     same, turned = nudged(("S",), 2, 0.0), nudged(("S",), 2, 5.0)
     exact = replace(Nuisances(), pose_error_mm=0, pose_error_deg=0)
     gained = least_mse(same, 1, exact) / least_mse(same, 2, exact)

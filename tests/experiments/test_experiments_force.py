@@ -40,7 +40,7 @@ def test_the_report_has_every_range_and_method(bench, tmp_path):
 
 
 def test_forces_lie_within_their_range(sequences, scans):
-    # Contacts are flat: force goes with the pattern, and the whole press' force and pattern are known.
+    # Contacts are flat: force is proportional to the pattern, and the whole press' force and pattern are given.
     whole = sequences.patterns_at(scans.tap, np.ones(len(scans.tap))).sum(axis=(1, 2))
     force_n = sequences.force_n[scans.tap, 0, -1] * scans.patterns.sum(axis=(1, 2)) / whole
     assert (force_n > 0.2 * 0.999).all()

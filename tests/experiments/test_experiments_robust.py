@@ -36,7 +36,7 @@ def page(bench, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def numbered(plain):
-    """The same taps, every reading a number of its own that says where it is from: none is 0."""
+    """The same taps, every reading a number of its own that identifies its place, never 0."""
     return replace(
         plain,
         newest=np.arange(1, plain.newest.size + 1).reshape(plain.newest.shape),
@@ -79,7 +79,7 @@ def test_a_sweep_changes_the_readings_and_nothing_else(bench, plain):
         if sweep.name != "pose error":
             np.testing.assert_allclose(strongest.indentation_mm, plain.indentation_mm, rtol=1e-5)
             np.testing.assert_allclose(strongest.unit_patterns, plain.unit_patterns, atol=2e-3)
-        same_newest = np.abs(strongest.newest - plain.newest).max() <= 1  # solved anew, a rounding may fall otherwise
+        same_newest = np.abs(strongest.newest - plain.newest).max() <= 1  # solved again, a rounding may differ
         assert same_newest == (sweep.name in EARLIER_ONLY), sweep.name
 
 

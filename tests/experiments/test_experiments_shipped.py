@@ -22,7 +22,7 @@ from train.physics.sensor_noise import Nuisances
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """Of a model that makes squares of taxels, with pad and traction."""
+    """Workbench with a model that makes squares of taxels, with pad and traction."""
     folder = tmp_path_factory.mktemp("models")
     write_model(folder / "stsr-int8.onnx", make_pad_contract(taps=1, output_full_scale=0.5))
     return replace(quick_bench(tmp_path_factory), models=folder)
@@ -101,7 +101,7 @@ class TestBaselines:
         assert nearest(newest[:1]).max() == pytest.approx(0.1, abs=1e-3)
 
     def test_kriging_finds_a_light_smooth_press(self):
-        """What its own fields would read it brings back, and the longer the length the smoother."""
+        """The readings of its own fields are recovered, and a longer length is smoother."""
         pad = GrippedPad(NOMINAL)
         field = kriging.Kriging(pad)
         across = (np.arange(pad.size) - (pad.size - 1) / 2) * pad.cell_mm

@@ -40,7 +40,7 @@ def frozen_of(truth_mm, indentation_mm):
 
 
 def laplace_intervals(deviation_factor):
-    """Errors of a Laplace density of deviation .02 mm, told as `deviation_factor` times that."""
+    """Return errors of a Laplace density of deviation 0.02 mm, predicted as `deviation_factor` times that."""
     rng = np.random.default_rng(0)
     truth, indentation_mm = np.zeros((8, 40, 40), np.float32), np.linspace(0.1, 0.4, 8)
     error = rng.laplace(scale=0.02 / np.sqrt(2), size=truth.shape).astype(np.float32)
@@ -110,7 +110,7 @@ def test_the_bound_is_on_the_mean_change_and_another_on_seen_surfaces(lift_db, m
     )
     assert rows["15 seen"]["met"] == ("yes" if lift_db >= -0.3 else "no")
     assert rows["all unseen"]["PSNR change dB"] == rows["glyphs"]["PSNR change dB"]
-    # The networks see the same frames: a change that is the same everywhere is known exactly.
+    # The networks see the same frames: the effect of a change that is the same everywhere is exact.
     assert rows["3 held out"]["PSNR change dB"] == f"{lift_db:.2f} ({lift_db:.2f}..{lift_db:.2f})"
 
 

@@ -1,4 +1,4 @@
-"""What the default model draws of real grips: the face of a box over the whole pad, not figures."""
+"""Patterns of the default model for real grips: the face of a box over the whole pad, not figures."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ RECORDINGS = recordings_folder()
 PATHS = recording_paths(RECORDINGS)
 LEAST_SHARE, MOST_UNEVEN = 0.9, 0.3
 DENTED = "data_sample_2022-02-22-08-10-01"
-"""The weakest grip: a known fault, on both fingers a dent is drawn that falls below half (docs/log.md)."""
+"""The weakest grip, a documented fault: on both fingers the pattern has a dent below half (docs/log.md)."""
 
 pytestmark = pytest.mark.skipif(not PATHS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
 

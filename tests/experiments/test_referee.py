@@ -23,7 +23,7 @@ def test_a_verdict_is_kept_and_recalled_without_finite_elements(tmp_path, monkey
     again = press_or_recall("large circle", COARSE, STEPS_MM, tmp_path)
     assert np.array_equal(again.patterns_mm, first.patterns_mm)
     assert np.array_equal(again.force_n, first.force_n)
-    # Whatever the answer depends on asks anew.
+    # A change of anything that the answer depends on asks again.
     for other in (("small circle", COARSE, STEPS_MM), ("large circle", Mesh(2, 2), STEPS_MM)):
         with pytest.raises(AssertionError, match="worked out again"):
             press_or_recall(*other, tmp_path)

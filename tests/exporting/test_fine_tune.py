@@ -43,7 +43,7 @@ def windows():
 
 
 def seen_of(windows) -> Batch:
-    """What ranges are taken of; truth is not looked at."""
+    """Return the batch that ranges are taken from; its truth is not used."""
     return Batch(torch.from_numpy(windows), torch.zeros(len(windows), 40, 40))
 
 
@@ -73,7 +73,7 @@ def hostile_graphs(hostile, taps, tuning):
 
 
 def seed_size() -> SeedNet:
-    """Of the paper, its batch normalisation as after some training."""
+    """Return the network of the paper, its batch normalisation as after some training."""
     torch.manual_seed(0)
     net = SeedNet(1, 1)
     for module in net.modules():
@@ -84,7 +84,7 @@ def seed_size() -> SeedNet:
 
 
 def steps_apart(net, model, integers, windows):
-    """How far torch's convolutions lie from those of the quantised graph, given what these take: steps, by weight."""
+    """Return distances of torch's convolutions from the quantised graph's on equal inputs: steps, by weight."""
     weights = {node.name: node.input[1] for node in model.graph.node if node.op_type == "Conv"}
     convs = {weights[node.name]: node for node in integers.graph.node if node.name in weights}
     opened = onnx.ModelProto.FromString(integers.SerializeToString())

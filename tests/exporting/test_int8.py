@@ -39,7 +39,7 @@ def windows():
 
 @pytest.fixture(scope="module")
 def seen(windows):
-    """What ranges are taken of; truth is not looked at."""
+    """Batch that ranges are taken from; its truth is not used."""
     return Batch(torch.from_numpy(windows), torch.zeros(len(windows), 40, 40))
 
 

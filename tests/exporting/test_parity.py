@@ -26,7 +26,7 @@ from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 
 passes: Counter[str] = Counter()
-"""That were told of each model in `rows`."""
+"""Passes that were reported for each model in `rows`."""
 MODELS = [path.stem for path in bundled_models()]
 IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]
 IN_INTEGERS = [name for name in MODELS if name.endswith("-int8")]

@@ -96,7 +96,7 @@ def test_an_unknown_part_is_a_usage_error(capsys):
 
 
 def test_a_thick_layer_needs_a_wide_grid(monkeypatch):
-    """The row that found it: on twice the pad, copies of the pad were felt."""
+    """The row that detected it: on twice the pad, copies of the pad had an effect."""
     monkeypatch.setattr("train.physics.contact._DIES_WITHIN", 0)
     broken = [row for row in layer_contact.cases() if not row.holds]
     assert {row.severity for row in broken} == {"10 mm", "20 mm", "50 mm"}

@@ -11,7 +11,7 @@ import numpy as np
 import onnx
 import pytest
 from edge_samples import BASELINE, make_contract, write_model
-from fuzz_targets import archive, npy, recording_arrays, stored
+from fuzz_recordings import archive, npy, recording_arrays, stored
 from onnx import TensorProto, helper, numpy_helper
 
 from edge.bench.errors import BenchError

@@ -1,7 +1,7 @@
 """Sensor files made to harm."""
 
 import pytest
-from fuzz_targets import sensor_toml_seeds
+from fuzz_recordings import sensor_toml_seeds
 
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.sensor_file.model import load_sensor_file

@@ -14,8 +14,8 @@ from typing import get_type_hints
 
 import numpy as np
 import pytest
+from cli_samples import records, run, write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
-from test_cli import records, run, write_recording
 
 from edge import api
 from edge.api import (
@@ -60,7 +60,7 @@ FRONT = {
         "edge.view.live_view",
         "edge.pipeline.replay_setup",
         "edge.cli.new_recording",
-    ),  # the page, and what is told of a recording
+    ),  # the page, and the note about a recording
     *("edge.doctor.command", "edge.bench.command"),  # commands of their own
 }
 NAN = float("nan")
@@ -104,7 +104,7 @@ def files(tmp_path_factory):
 
 
 def timeless(record):
-    """What does not depend on when it was made; a reader may be ahead of its scan, and counters with it."""
+    """Return the parts of a record without its time; a reader, with its counters, may be ahead of the scan."""
     kept = {name: value for name, value in record.items() if name not in OF_THE_MOMENT}
     return kept | {"counters": sorted(record["counters"])}
 
@@ -267,7 +267,7 @@ class Outage(FakeLink):
 
 
 def test_a_loop_that_was_left_goes_on_with_the_next_result():
-    """What waited in its batch has its results, and a cable that was out in between is not forgotten."""
+    """Scans that waited in its batch have their results, and a cable that was out in between is not forgotten."""
     torn = make_scan(10, press_counts=3000, absent=(1,))
     link = Outage([[make_scan(n, press_counts=3000) for n in range(9)], *[[]] * 9, [torn, make_scan(11)]])
     heard = []

@@ -1,11 +1,11 @@
-"""What a sensor file does to a run, and what goes before it."""
+"""Effects of a sensor file on a run, and options that take precedence."""
 
 import json
 
 import numpy as np
 import pytest
+from cli_samples import assert_refused, records, run, write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
-from test_cli import assert_refused, records, run, write_recording
 
 from edge.api import Stream, open_recording, open_runtime, open_source
 from edge.doctor.options import doctor_parser
@@ -38,7 +38,7 @@ def file(tmp_path):
 
 @pytest.fixture
 def pressed(tmp_path):
-    """What replays a press of 1800 counts, recorded in place."""
+    """Source that replays a press of 1800 counts, recorded in place."""
     write_recording(tmp_path / "taps.npz", [1800] * 3)
     return f"replay:{tmp_path}/taps.npz"
 
@@ -139,7 +139,7 @@ def test_a_file_that_cannot_be_used_is_2(tmp_path):
 
 
 def turned_rest():
-    """What the free pad reads where its taxels lie, (3, 4, 4)."""
+    """Return the readings of the free pad where its taxels lie, (3, 4, 4)."""
     return REST.reshape(3, 16)[:, list(TURNED.order)].reshape(3, 4, 4)
 
 

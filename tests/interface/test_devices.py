@@ -89,7 +89,7 @@ def test_who_holds_a_port(roots):
         assert found.problems == ("held by slcand (7), a process (12): end it first",)
         (free,) = serial_devices([port._replace(path="/dev/null0")], *roots, may_open=lambda path: True)
         assert free.problems == ()
-        # The real /proc says the same of another process that has it open.
+        # The real /proc shows the same for another process that has it open.
         with subprocess.Popen(["sleep", "60"], stdin=slave) as holder:
             (found,) = serial_devices([port])
             holder.kill()
@@ -146,7 +146,7 @@ def test_the_bitrate_is_asked_of_ip(tmp_path, monkeypatch, says, bitrate):
 
 @pytest.fixture
 def plugged(monkeypatch):
-    """What is plugged in, to be filled."""
+    """Devices that are plugged in, to be filled by a test."""
     there: dict[str, list] = {"ports": [], "gs_usb": [], "can": []}
     monkeypatch.setattr(devices, "serial_ports", lambda: there["ports"])
     monkeypatch.setattr(devices, "can_interfaces", lambda: there["can"])

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import pytest
 import trimesh
+from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_model
-from test_cli import write_recording
 
 from edge.api import Result
 from edge.perception.event import Note
@@ -23,7 +23,7 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 TIMEOUT_S = 120
 PATIENT = ("--oldest-ms", "20000")
-"""For a machine that has other things to do; what 100 ms do is tested with scans of any age."""
+"""Option for a busy machine; the effect of 100 ms is tested with scans of any age."""
 
 
 def start(folder, name, *arguments):
@@ -196,7 +196,7 @@ def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
     grip, gripper = grip_of(stop_on_area, oldest_ms=20_000)
     grip.follow(reading(sensor="left", age_ms=1000))
     grip.follow(reading(sensor="left", age_ms=600))
-    assert gripper.done == []  # the other one may not have been heard yet
+    assert gripper.done == []  # the other one may not have sent yet
     grip.follow(reading("zeroing", "right", force_counts=None))
     grip.follow(reading(sensor="left"))
     grip.follow(reading("contact", "right", area_mm2=5.0))
@@ -251,7 +251,7 @@ def test_a_limit_is_a_positive_number(stop_on_area, monkeypatch, capsys, limit, 
 
 
 class Live(FakeLink):
-    """Gives scans of this moment, and tells something after ten."""
+    """Link of scans of this moment, with notices after ten reads."""
 
     told: tuple[str, ...] = ()
 

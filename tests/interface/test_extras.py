@@ -1,4 +1,4 @@
-"""What is said where an extra is not installed: from the sources, from a wheel, and by the commands that need one."""
+"""Errors where an extra is not installed: from the sources, from a wheel, and by the commands that need one."""
 
 import importlib.metadata
 import subprocess

@@ -92,7 +92,7 @@ class Terminal:
         os.write(self.leader, text.encode())
 
     def line_mode(self):
-        """Whether the terminal waits for lines and shows them."""
+        """Return True where the terminal waits for lines and echoes them."""
         mode = termios.tcgetattr(self.leader)[3]
         return bool(mode & termios.ICANON) and bool(mode & termios.ECHO)
 
@@ -110,7 +110,7 @@ class Terminal:
 
     def close(self):
         with contextlib.suppress(OSError):
-            os.kill(self._process, signal.SIGKILL)  # the terminal goes with its leader, and the job is told
+            os.kill(self._process, signal.SIGKILL)  # the terminal goes with its leader, and the job gets a signal
         os.close(self.leader)
         os.waitpid(self._process, 0)
 

@@ -53,7 +53,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(recording, model, tmp_path_factory):
-    """What a run over a pseudo-terminal wrote, and its results."""
+    """Files that a run over a pseudo-terminal wrote, and its results."""
     folder, loaded = tmp_path_factory.mktemp("out"), api.load_model(model)
     with (
         Emulator([recording]) as emulator,

@@ -28,7 +28,7 @@ from train.learning import expected_error_table as confidence
 
 CLEARED = re.compile(r"\r *\r$")
 RATE = re.compile(r"scan/s|s/scan")
-"""Below one a second it is told the other way round."""
+"""Rate, as seconds per scan below one a second."""
 
 
 class Terminal:
@@ -201,7 +201,7 @@ def test_what_is_tracked_comes_whole_and_must_tell_how_much_it_is():
 
 
 def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeypatch):
-    """What `python -m export.to_onnx` and `python tests/system/page_cost.py` do for most of their time."""
+    """These steps take most of the time of `python -m export.to_onnx` and `python tests/system/page_cost.py`."""
     reached = []
     monkeypatch.setattr(Progress, "advance", lambda bar: reached.append((bar._what, bar._total)))
     monkeypatch.setattr(confidence, "doubts_and_errors", lambda *_: np.ones((3, 40)))

@@ -7,8 +7,8 @@ import subprocess
 import sys
 
 import pytest
+from cli_samples import TIMEOUT_S, base_options, files
 from edge_samples import ROOT
-from test_cli import TIMEOUT_S, base_options, files
 
 __all__ = ["files"]
 
@@ -50,7 +50,7 @@ def test_without_a_stderr_there_are_records_on_stdout_and_nothing_else(files, re
 
 
 def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
-    """Not in the interpreter's own start, which no program can guard: in the first module of others."""
+    """The signal comes in the first foreign module, as no program can guard the interpreter's own start."""
     (tmp_path / "numpy.py").write_text("print('importing', flush=True)\nimport time\ntime.sleep(60)\n")
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
     command = [sys.executable, "-m", "edge", "demo"]

@@ -1,4 +1,4 @@
-"""The bundled models on both test sets: what they must beat, and what their contracts say of it.
+"""The bundled models on both test sets: what they must beat, and what their contracts state.
 
 The frozen set has the eighteen figures on one pad, the wide one has every family on pads of their own.
 """
@@ -20,7 +20,7 @@ from train.report import bootstrap_interval
 IN_FLOAT = ("stsr", "stsr-small", "mtsr2", "mtsr4")
 NAMES = (*IN_FLOAT, *(f"{name}-int8" for name in IN_FLOAT))
 HARD_FIGURES = {"O", "hollow square", "large circle", "large square"}
-"""On which the linear map beats the bundled models other than the STSR of full size, by .1 to 3 dB."""
+"""Figures on which the linear map beats all bundled models except the STSR of full size, by 0.1 to 3 dB."""
 
 
 @cache
@@ -80,7 +80,7 @@ def test_the_contract_tells_the_error_that_is_measured_here(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_interval_said_to_hold_90_percent_of_pixels_does(name):
-    """It is calibrated on presses of the wide world; the figures are easier than these, and it holds more of them."""
+    """Intervals are calibrated on presses of the wide world; figures are easier, and more of their pixels held."""
     assert 0.88 <= errors(name, all_taps(name), wide)["coverage_90"].mean() <= 0.92
     assert errors(name, all_taps(name), frozen)["coverage_90"].mean() >= 0.88
 
@@ -96,7 +96,7 @@ def test_every_model_beats_the_classical_methods(name):
 
 @pytest.mark.parametrize("test_set", [frozen, wide])
 def test_no_model_of_several_taps_is_clearly_better_than_the_default(test_set):
-    """Why STSR is the default. Measured on the wide set 27.27 dB against 27.28, on the figures 28.6 against 28.1.
+    """STSR is the default for this: on the wide set 27.27 dB against 27.28, on the figures 28.6 against 28.1.
 
     Clearly: the difference's 95 % interval, frames of one tap drawn together, lies above zero.
     """

@@ -1,4 +1,4 @@
-"""What stands for dead taxels: exact where it must be, better than nothing where it is measured, and said."""
+"""Estimates for dead taxels: exact where they must be, better than none where they are measured, and reported."""
 
 import json
 from functools import cache
@@ -50,7 +50,7 @@ def noisy(scans, *, z_counts=0.0, seed=0):
 
 
 def one_way(shape) -> NDArray[np.float64]:
-    """Covariance of readings in which any living taxel tells every dead one: rank 3, one pattern an axis."""
+    """Return a covariance in which any living taxel determines every dead one: rank 3, one pattern an axis."""
     return np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape)).astype(np.float64)
 
 
@@ -160,7 +160,7 @@ def test_deviations_are_wider_the_more_taxels_are_dead():
 
 
 def test_earlier_taps_are_forgotten_when_a_taxel_dies_and_when_it_is_believed_again():
-    """A window never holds, unsaid, what was read by a taxel not yet found out, or filled in."""
+    """A window never holds readings of an undetected dead taxel, or filled in ones, without a note."""
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, estimator=estimator())
     used: list[int] = []
     presses = [PRESS, PRESS, 0] * 12

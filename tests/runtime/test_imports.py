@@ -1,4 +1,4 @@
-"""What the runtime really loads, in a process of its own."""
+"""Modules that the runtime really loads, in a process of its own."""
 
 import ast
 import os

@@ -184,7 +184,7 @@ def test_a_record_tells_what_was_left_out_before_it_and_the_run_all_of_it(error)
 
 
 class Script:
-    """Commands that come before the given polls."""
+    """Commands that come before certain polls."""
 
     def __init__(self, at) -> None:
         self.refused = 3
@@ -228,7 +228,7 @@ def test_reader_gives_nothing_after_the_timeout():
 
 
 class Telling(FakeLink):
-    """Has one notice to tell, at a given read."""
+    """Link with one notice, at a certain read."""
 
     def __init__(self, batches, at, kind):
         super().__init__(batches)

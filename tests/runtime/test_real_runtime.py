@@ -57,7 +57,7 @@ def play(trial, folder) -> Played:
         )
         lost_frames = emulator.lost_frames
     assert done.returncode == 3, done.stderr  # the emulator hangs up at the end, which is the cable out
-    # A machine that stands still for a moment tells of a silent sensor; what counts is that no scan is lost of it.
+    # A machine that stands still for a moment reports a silent sensor; what counts is that no scan is lost of it.
     records = [one for one in map(json.loads, done.stdout.splitlines()) if one["state"] != "event"]
     by_sensor = {sensor: [record for record in records if record["sensor"] == sensor] for sensor in SENSORS}
     return Played(by_sensor, lost_frames)

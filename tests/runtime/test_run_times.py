@@ -1,4 +1,4 @@
-"""How run times are taken, and how they are kept."""
+"""Run times: how they are taken and kept."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""What a scan needs: nothing, the pattern before, or one from the taps that matter."""
+"""Needs of a scan: nothing, the pattern before, or one from the taps that matter."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def tap(number, taps_used):
 
 class TestTapsThatMatter:
     def run(self, *verdicts, force_counts=1000.0):
-        """Taps used in each of a row of taps, of whose patterns this was said."""
+        """Return the taps used in each of a row of taps whose patterns got these verdicts."""
         matter, used = TapsThatMatter(), []
         for number, verdict in enumerate(verdicts):
             used.append(matter.of(tap(number, min(number + 1, 4))))
@@ -140,7 +140,7 @@ def test_a_reset_in_a_tap_is_inferred_anew():
 
 
 def taps_used(runtime, presses):
-    """Of one scan in each of a row of taps pressed so hard."""
+    """Return the taps used for one scan in each of a row of taps pressed so hard."""
     used, number = [], 0
     for press in presses:
         for counts in (press - 50, press, 0):

@@ -77,7 +77,7 @@ def test_non_contiguous_windows_are_right(session):
 
 @pytest.fixture(scope="module")
 def sure_session(tmp_path_factory):
-    """Of a model that says how sure it is."""
+    """Session of a model that gives deviations."""
     return ModelSession(write_model(tmp_path_factory.mktemp("sure") / "sure.onnx", make_contract(interval_factor=1.6)))
 
 

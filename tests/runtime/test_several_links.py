@@ -172,7 +172,7 @@ def test_two_ports_are_read_in_one_thread_and_nothing_is_lost_or_mixed_up(two_ad
         while any(len(numbers(taken, f"{name}/4")) < 90 for name in ("left", "right")):
             assert time.monotonic() < end_s
             taken += source.take(0.2) or ()
-            if len(taken) > 40:  # both are open and heard by then
+            if len(taken) > 40:  # both are open and have sent by then
                 threads |= {thread.name for thread in set(threading.enumerate()) - before}
         counters = source.counters()
     assert threads == {"scan-reader_0"}

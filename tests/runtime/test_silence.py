@@ -19,7 +19,7 @@ def scan(number, time_ms, sensor="4", device_ms=None):
 
 
 def missed(*scans):
-    """Of these and some more at their pace: only behind a gap is it known what was late and what never came."""
+    """Count what is missed of these scans and some more at their pace, as only scans after a gap show what was lost."""
     silence, last = Silence(), scans[-1]
     after = [
         replace(
@@ -65,7 +65,7 @@ def test_what_was_held_up_and_comes_in_a_burst_was_late_and_not_missed():
 
 
 def test_a_stall_that_lost_nothing_misses_nothing():
-    """By the median of the newest intervals, 1 % off, a second was a period too long."""
+    """The median of the newest intervals, 1 % off, once made a second a period too long."""
     for seed in range(40):
         noise = random.Random(seed)
         silence, deadline = Silence(), Deadline()
@@ -80,7 +80,7 @@ def test_a_stall_that_lost_nothing_misses_nothing():
 
 
 def missed_by_a_busy_reader(seed, *, stamped, away_ms, busy, lost=()):
-    """Of a thousand scans that came whenever it had time, which it did not have at first."""
+    """Count what is missed of a thousand scans that came when the reader had time, which it lacked at first."""
     noise, silence, deadline = random.Random(seed), Silence(), Deadline()
     free_ms, arrival_ms = away_ms, 0.0
     for number, due in enumerate(due for due in range(1000) if due not in lost):
@@ -103,7 +103,7 @@ def missed_by_a_busy_reader(seed, *, stamped, away_ms, busy, lost=()):
 
 @pytest.mark.parametrize("away_ms", [0, 500])
 def test_a_busy_reader_misses_with_time_stamps_just_what_was_lost(away_ms):
-    """By the pace at which it read, thousands were missed of a thousand."""
+    """The pace of reading alone would give thousands missed of a thousand."""
     lost = {*range(300, 307), *range(600, 640)}
     for seed in range(20):
         assert missed_by_a_busy_reader(seed, stamped=True, away_ms=away_ms, busy=0.6) == 0

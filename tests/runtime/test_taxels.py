@@ -1,4 +1,4 @@
-"""Dead taxels: found, named, believed again; and what is not one."""
+"""Dead taxels: detected, named, trusted again; and what is not one."""
 
 import os
 from pathlib import Path
@@ -32,7 +32,7 @@ from firmware_bridge.zeroing.baseline import Baseline, deformation
 RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
 NOISE_COUNTS = 2.0
 SPHERE_SHARE = 0.030
-"""Of what the taxel under it reads, in the largest neighbour: a sphere of 1.5 mm on one taxel, simulated."""
+"""Reading of the largest neighbour as a share of the taxel under a sphere of 1.5 mm, simulated."""
 
 
 class Pad:
@@ -129,7 +129,7 @@ def test_the_stuck_are_found_among_the_few_that_are_left(stuck, after):
     pad = Pad()
     pad.read(5)
     told = pad.read(after + 5, *(at(taxel, 16_000, 16_400, 38_700) for taxel in range(stuck)))
-    # A living taxel repeats itself now and then, and with few of them a scan then says nothing.
+    # A living taxel repeats itself now and then, and with few of them a scan then shows nothing.
     assert not any(told[:after]) and told[-1] == dict.fromkeys(range(stuck), "stuck")
     assert pad.watch.may_be_estimated == (stuck <= 8)
 

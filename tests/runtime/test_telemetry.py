@@ -1,4 +1,4 @@
-"""What onnxruntime, which sends telemetry unless told not to, leaves behind of a run."""
+"""Traces that a run leaves of onnxruntime, which sends telemetry unless it is switched off."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Force and torque of a traction, against closed forms; and that every sink tells of them."""
+"""Force and torque of a traction, against closed forms, and in every sink."""
 
 import json
 import math
@@ -28,7 +28,7 @@ PIXEL_MM = 4 * PITCH_MM / PIXELS
 AREA_MM2 = (4 * PITCH_MM) ** 2
 TAXEL_MM2 = PITCH_MM**2
 FORCE_N = 20 * TAXEL_MM2 / 1000
-"""Of make_wrench_result: 20 kPa on taxel 5, the second of the second row."""
+"""Force of make_wrench_result: 20 kPa on taxel 5, the second of the second row."""
 
 
 def even(x=0.0, y=0.0, z=0.0):

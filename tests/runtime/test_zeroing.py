@@ -78,7 +78,7 @@ def test_a_lost_link_is_told():
 
 
 def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it():
-    """Powered anew, a sensor rests elsewhere: half of each would be nobody's rest."""
+    """A sensor that was powered again rests elsewhere: a baseline of both halves would fit neither."""
 
     class Lost(FakeLink):
         def notices(self):

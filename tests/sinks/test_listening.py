@@ -1,4 +1,4 @@
-"""What others on the network can reach of a running `edge-sr`: nothing."""
+"""Sockets of a running `edge-sr`: others on the network can reach none."""
 
 import os
 import subprocess
@@ -33,7 +33,7 @@ def family(process_id: int) -> list[int]:
 
 
 def reachable(process_id: int) -> list[str]:
-    """Sockets of a process, and of those below it, that wait for whoever comes and are bound to more than loopback."""
+    """Return the listening sockets of a process, and of those below it, that are bound to more than loopback."""
     found = []
     for one in family(process_id):
         mine = set()

@@ -14,33 +14,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ros2_samples import ENVIRONMENT, TAG, contact, sink, without_pattern
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 import ros2_messages
-from edge_samples import BASELINE, ROOT, make_contract, make_scan, make_wrench_result
-from hypothesis import given
-from hypothesis import strategies as st
+from edge_samples import ROOT, make_contract, make_wrench_result
 
-from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
-from edge.perception.result import Result
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
-from edge.sinks.ros2.dds_types import TYPE_HASHES, DiagnosticArray
+from edge.sinks.ros2.dds_types import TYPE_HASHES
 from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import Ros2Sink
-from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
 from firmware_bridge.scans.scan import VendorReading
 
-TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
-"""Whoever else tests on this machine is not heard."""
-ENVIRONMENT = {
-    "ROS_DOMAIN_ID": str(1 + os.getpid() % 90),
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    "CYCLONEDDS_URI": TAG,
-}
+__all__ = ["sink"]
 LISTENERS_CONFIGURATION = (
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
     "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
@@ -58,19 +48,6 @@ TOPICS = {
     "skin/events": "std_msgs/msg/String",
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
-
-
-def contact(number, *, sensor="4", source="device", **changes):
-    random = np.random.default_rng(number)
-    maps = {name: random.random((40, 40), dtype=np.float32) for name in ("pattern", "deviation")}
-    scan = make_scan(number, sensor=sensor, time_ns=time.monotonic_ns())
-    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0, **maps)
-    return replace(made, **changes)
-
-
-def without_pattern(result, **changes):
-    scan = replace(result.scan, time_ns=time.monotonic_ns())
-    return replace(result, scan=scan, pattern=None, deviation=None, **changes)
 
 
 class Listener:
@@ -102,7 +79,7 @@ class Listener:
             self.heard.append(self._lines.get())
 
     def until(self, satisfied, act=lambda: None):
-        """Go on acting until what was heard is enough."""
+        """Go on acting until the messages that were received suffice."""
         end_s = time.monotonic() + PATIENCE_S
         while not satisfied():
             assert time.monotonic() < end_s, f"heard only {[line['topic'] for line in self.heard]}"
@@ -126,14 +103,6 @@ def pixels(image):
 
 def stamp_ns(message):
     return message["header"]["stamp"]["sec"] * 10**9 + message["header"]["stamp"]["nanosec"]
-
-
-@pytest.fixture
-def sink():
-    made = Ros2Sink("/skin", ENVIRONMENT)
-    yield made
-    if hasattr(made, "_domain"):
-        made.close()
 
 
 class Talker:
@@ -172,7 +141,7 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
             force, torque = message["wrench"]["force"], message["wrench"]["torque"]
             assert force["z"] == 1.5 and all(map(math.isnan, (force["x"], force["y"], *torque.values())))
 
-        # The end of a contact is told once, and by zeros; that readings were lost by what is no number.
+        # The end of a contact is reported once, by zeros; lost readings by NaN.
         four = contact(1000)
         sink.write(without_pattern(four, state="dropped"), {})
         for _ in range(3):
@@ -280,67 +249,6 @@ def open_sink_in(environment, text):
         return open_sink(text, make_contract())
 
 
-class Clock:
-    def __init__(self):
-        self.now_ns = 10**12
-
-    def __call__(self):
-        return self.now_ns
-
-
-def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
-    clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock, unix_ns=lambda: 1_700_000_000_123_456_789)
-    sink._publish = lambda writer, message: published.append(message)
-
-    def statuses():
-        taken = [message for message in published if isinstance(message, DiagnosticArray)]
-        published.clear()
-        return [(status.level, status.message) for array in taken for status in array.status]
-
-    scan = make_scan(1, time_ns=clock.now_ns)
-    idle = Result(scan, "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
-    for _ in range(250):
-        clock.now_ns += 10_000_000
-        sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns)), {"dropped": 2})
-    assert statuses() == [(Level.WARN, "2 dropped"), (Level.OK, "idle")]
-    sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
-    clock.now_ns += 1_500_000_000
-    sink.wait()
-    sink.wait()
-    assert statuses() == [(Level.STALE, "no scan for 2 s; bus-off")]
-    sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
-    sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
-    clock.now_ns += 1_000_000_000
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), dead={3: "stuck"}), {"dropped": 2})
-    assert statuses() == [(Level.WARN, "without taxel 3 (stuck)")]
-    assert sink._header(10**12 + 5, "4").stamp.nanosec == 123_456_794, "wall time, from the start's on"
-    sink.close()
-
-
-DAYS_NS = 3 * 86_400 * 10**9
-
-
-def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_silent():
-    """Recorded on a machine that was up for three days more than this one."""
-    recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
-    published, later_ns = [], time.monotonic_ns() + 60 * 10**9
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ENVIRONMENT.items():
-            patch.setenv(name, value)
-        sink = open_sink("ros2:skin", make_contract(), unix_offset_ns=offset_ns, source="replay")
-    sink._clock_ns = lambda: later_ns
-    sink._publish = lambda writer, message: published.append(message)
-    result = contact(1, source="replay", force_n=1.0)
-    sink.write(replace(result, scan=replace(result.scan, time_ns=recorded_ns)), {})
-    sink.close()
-    stamps = {one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in published}
-    assert stamps == {recorded_ns + offset_ns}
-    said = [status for one in published if isinstance(one, DiagnosticArray) for status in one.status]
-    assert [status.message for status in said] == ["REPLAY, not a sensor", "ended"]
-    assert "scan_age_s" not in {pair.key for status in said for pair in status.values}
-
-
 def test_a_force_that_is_known_no_more_is_taken_back_once():
     published = []
     sink = Ros2Sink("skin", ENVIRONMENT, source="emulated")
@@ -362,7 +270,7 @@ def test_a_force_that_is_known_no_more_is_taken_back_once():
     sink.tell(lost, {})
     assert taken_back() == []
     sink.write(idle, {})
-    sink.write(replace(idle, state="dropped", force_n=None), {})  # of a newer scan it is known
+    sink.write(replace(idle, state="dropped", force_n=None), {})  # of a newer scan it is available
     assert taken_back() == [False]
     for _ in range(2):
         sink.write(replace(idle, state="incomplete", contact=None, force_n=None), {})
@@ -370,16 +278,6 @@ def test_a_force_that_is_known_no_more_is_taken_back_once():
     sink.write(idle, {})
     sink.close()
     assert taken_back() == [False, True]
-
-
-def test_what_a_link_said_of_an_outage_holds_until_the_next_scan(sink):
-    sink.write(contact(1), {})
-    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
-    assert sink._sensors["4"].trouble == {"lost": "the plug is out"}
-    sink.write(contact(2), {})
-    assert not sink._sensors["4"].trouble
-    sink.tell(Event(time.monotonic_ns(), "silent", "5", "another one is silent"), {})
-    assert not sink._sensors["4"].trouble and sink._sensors["4"].shown, "what 4 shows is as true as before"
 
 
 @pytest.mark.parametrize("kind", list(TYPE_HASHES), ids=lambda kind: kind.__name__)
@@ -426,62 +324,3 @@ def test_recordings_hold_the_same_bytes(sink):
     recorded.append(ros_messages.wrench(result, unix_ns))
     for sent, kept in zip(published, recorded, strict=True):
         assert sent[: len(kept)] == kept and not any(sent[len(kept) :]) and len(sent) - len(kept) < 4
-
-
-ROS_TOPIC = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-NAMES = st.text(st.sampled_from("s4x_/é a0Z"), min_size=1, max_size=8)
-
-
-@given(NAMES, NAMES)
-def test_every_sensor_has_topics_of_its_own_that_ros_can_hold(one, other):
-    topics = [sensor_topic("skin", name, "pattern") for name in (one, other)]
-    assert all(map(ROS_TOPIC.fullmatch, topics)) and "__" not in "".join(topics)
-    assert (topics[0] == topics[1]) == (one == other)
-
-
-@pytest.mark.parametrize(
-    ("sensor", "topic"),
-    [("4", "s4"), ("left/4", "left/s4"), ("left_1", "left_1"), ("s4", "x_7334"), ("x_1", "x_785f31"), ("/", "x_0/x_0")],
-)
-def test_sensors_names_as_topics(sensor, topic):
-    assert sensor_topic("skin", sensor, "pattern") == f"skin/{topic}/pattern"
-
-
-def test_names_that_ros_cannot_hold_are_refused():
-    assert base_topic("/gripper/skin_1") == "gripper/skin_1"
-    for text in ("", "4", "a//b", "a/", "a b", "ä", "//a", "~/a"):
-        with pytest.raises(UsageError, match=r"is none of ROS: expected letters"):
-            base_topic(text)
-    with pytest.raises(SinkError, match=rf"ROS holds {LONGEST_TOPIC - 1}: name sensor"):
-        sensor_topic("skin", "ä" * 64, "pattern")
-
-
-@pytest.mark.parametrize(
-    ("environment", "said"),
-    [
-        ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
-        ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID is '233'"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, so that nobody finds us"),
-    ],
-)
-def test_an_environment_that_ros_would_not_take_is_refused(environment, said):
-    with pytest.raises(UsageError, match=said):
-        Ros2Sink("skin", environment)
-
-
-def test_a_configuration_that_is_none_is_told(capfd):
-    with pytest.raises(SinkError, match=r"cannot join DDS domain 7 .*CYCLONEDDS_URI"):
-        Ros2Sink(
-            "skin", {"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"}
-        )
-
-
-def test_without_the_package_one_line_says_how_to_get_it():
-    script = (
-        "import sys; sys.modules['cyclonedds'] = None\n"
-        "from edge.sinks.registry import open_sink\n"
-        "try: open_sink('ros2:skin', None)\n"
-        "except ValueError as error: print(error)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.stdout == f"ros2:skin needs Cyclone DDS: pip install '{ROOT}[ros2]'\n", done.stderr

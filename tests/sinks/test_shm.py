@@ -4,48 +4,33 @@ import math
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
-import zlib
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from struct import unpack_from
 
 import numpy as np
 import pytest
 from edge_samples import (
-    BASELINE,
     ROOT,
-    FakeModel,
-    ended,
     make_contract,
     make_pad_contract,
-    make_scan,
     make_wrench_result,
 )
+from shm_samples import fields, latest, make_result, name, sink, values
 
 from edge.errors import SinkError
-from edge.perception.event import Event
-from edge.perception.runtime import Runtime
-from edge.sinks.registry import open_sink
 from edge.sinks.shm import SharedMemorySink
 from edge.sinks.shm_layout import HEADER, HEARTBEAT_AT, IN_MEMORY, MEMBERS, SLOTS, Layout, offsets_of, struct_of
 
 sys.path.append(str(ROOT / "examples"))
-import shm_read
 from shm_read import attach
 
 pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="shared memory is a folder on Linux alone")
 
-CONTRACT = make_contract(interval_factor=1.6)
-READS = int(os.environ.get("EDGE_SHM_READS", "20000"))
-ENVIRONMENT = os.environ | {
-    "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/sinks'}:{ROOT / 'tests/support'}:{ROOT / 'examples'}",
-    "PYTHONUNBUFFERED": "",
-}
+__all__ = ["name", "sink"]
 VERSION_1 = {
     "checksum": (0, "I"),
     "reserved": (4, "I"),
@@ -89,86 +74,6 @@ VERSION_1 = {
     "centre_of_pressure_y_mm": (568, "d"),
 }
 """Byte and struct's character of what programs in the field read, as version 1 was published."""
-PATIENCE_S = 30
-WRITE = """
-import sys, time
-from dataclasses import replace
-import numpy as np
-from edge.sinks.shm import SharedMemorySink
-from test_shm import CONTRACT, make_result
-result = make_result(press_counts=3000)
-sink = SharedMemorySink(sys.argv[1], CONTRACT)
-number = 0
-while True:
-    for sensor in ("left/4", "right/4"):
-        counts, now_ns = np.full((3, 4, 4), number % 60_000), time.monotonic_ns()
-        scan = replace(result.scan, sensor=sensor, number=number, counts=counts, time_ns=now_ns)
-        pattern = np.full((40, 40), number % 60_000, np.float32)
-        sink.write(replace(result, scan=scan, pattern=pattern, deviation=pattern, force_counts=number), {})
-    number == 0 and print("writes", flush=True)
-    number += 1
-"""
-
-
-def make_result(number=0, *, contract=CONTRACT, press_counts=0, **of_the_scan):
-    runtime = Runtime(FakeModel(contract), source="emulated", baselines={"4": BASELINE}, unix_time_s=lambda: 1012.34)
-    return runtime.push(make_scan(number, press_counts=press_counts, **of_the_scan))
-
-
-def latest(memory: memoryview, sensor: str) -> bytes | None:
-    """Of any source and age: made up as they are here."""
-    return shm_read.latest(memory, sensor, oldest_s=math.inf, pretend=True)
-
-
-def heartbeat_ns(memory: memoryview) -> int:
-    return memory.cast("Q")[HEARTBEAT_AT // 8]
-
-
-def writing(memory: memoryview, within_s: float = 0.5) -> bool:
-    """Whether the writer lives."""
-    return time.monotonic_ns() - heartbeat_ns(memory) < within_s * 1e9
-
-
-def fields(half: bytes) -> dict:
-    names = [name for name, _ in MEMBERS]
-    return dict(zip(names, struct_of(MEMBERS).unpack_from(half), strict=True))
-
-
-def values(half: bytes, name: str) -> np.ndarray:
-    kind, shape, at = Layout(4, 4, 40, 40).maps[name]
-    return np.frombuffer(half, kind, int(np.prod(shape)), at).reshape(shape)
-
-
-@pytest.fixture
-def name():
-    name = f"test-{os.getpid()}-{time.monotonic_ns()}"
-    yield name
-    Path("/dev/shm", name).unlink(missing_ok=True)
-
-
-@pytest.fixture
-def sink(name):
-    sink = SharedMemorySink(name, CONTRACT)
-    yield sink
-    sink.close()
-
-
-@pytest.fixture
-def start_writer(name):
-    writers = []
-
-    def start():
-        command = [sys.executable, "-c", WRITE, name]
-        writer = subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE)
-        writers.append(writer)
-        assert writer.stdout is not None and writer.stdout.readline() == b"writes\n"
-        return writer
-
-    yield start
-    for writer in writers:
-        writer.kill()
-        writer.wait()
-        writer.stdout.close()
 
 
 class TestWhatIsThere:
@@ -336,179 +241,3 @@ class TestLayout:
         assert read("4", 9) == (1, "")  # emulated
         assert read("4", 10, age_ns=50_000_000, source="device") == (1, "")
         assert read("4", 11, age_ns=-60_000_000_000, source="device") == (1, "")
-
-
-class TestReading:
-    def test_no_read_is_torn_and_none_goes_back(self, name, start_writer):
-        """As many reads as wanted, and on, however little the writer is given of the processor, until it wrote much."""
-        start_writer()
-        memory, newest, torn, backwards = attach(name), {"left/4": -1, "right/4": -1}, 0, 0
-        kinds = [(kind, shape, at) for kind, shape, at in Layout(4, 4, 40, 40).maps.values()][1:]
-        reads, end_s = count(), time.monotonic() + PATIENCE_S
-        while (read := next(reads)) < READS or min(newest.values()) <= 1000:
-            assert time.monotonic() < end_s, f"the writer wrote {newest} meanwhile"
-            sensor = ("left/4", "right/4")[read % 2]
-            half = latest(memory, sensor)
-            assert half is not None
-            (number,) = unpack_from("<q", half, 24)
-            wanted = [np.array(number % 60_000, kind).tobytes() for kind, _, _ in kinds]
-            if any(
-                half[at : at + 4 * int(np.prod(shape))] != want * int(np.prod(shape))
-                for want, (_, shape, at) in zip(wanted, kinds, strict=True)
-            ):
-                torn += 1
-            backwards += number < newest[sensor]
-            newest[sensor] = number
-        assert (torn, backwards) == (0, 0)
-
-    def test_what_was_overwritten_while_it_was_copied_is_read_again(self, sink, name, monkeypatch):
-        """As a processor that orders nothing may show it: the newest sequence, and values from before."""
-        for number in range(3):
-            sink.write(make_result(number, press_counts=3000 + 100 * number), {})
-        memory, copies = attach(name), []
-        checks = zlib.crc32
-
-        def check(content):
-            copies.append(checks(content))
-            return copies[-1] ^ (len(copies) < 3)
-
-        monkeypatch.setattr("shm_read.zlib.crc32", check)
-        half = latest(memory, "4")
-        assert half is not None and fields(half)["scan"] == 2 and len(copies) == 3
-
-    def test_broken_memory_is_given_up(self, sink, name):
-        sink.write(make_result(), {})
-        with Path("/dev/shm", name).open("r+b") as file:
-            file.seek(192 + 64 + 13696 + 500)
-            file.write(b"\xff")
-        assert latest(attach(name), "4") is None
-
-    def test_a_half_that_is_being_written_hides_nothing(self, sink, name):
-        """A writer killed half-way leaves the newest whole value."""
-        sink.write(make_result(5), {})
-        with Path("/dev/shm", name).open("r+b") as file:  # of sequence 2
-            file.seek(192 + 64)
-            file.write(b"\xff" * 5000)
-        half = latest(attach(name), "4")
-        assert half is not None and fields(half)["scan"] == 5
-
-    def test_only_what_is_young_and_of_a_device_is_acted_on(self, sink, name):
-        memory, now_ns = attach(name), time.monotonic_ns()
-        result = replace(make_result(7, press_counts=3000, time_ns=now_ns), source="device")
-        young = {"oldest_s": 60.0}
-        sink.write(result, {})
-        half = shm_read.latest(memory, "4", **young)
-        assert half is not None and fields(half)["scan"] == 7
-        assert shm_read.latest(memory, "4", oldest_s=0.0) is None
-        for time_ns in (now_ns - 60_000_000_000, now_ns + 60_000_000_000):  # the latter is of another machine
-            sink.write(replace(result, scan=replace(result.scan, time_ns=time_ns)), {})
-            assert shm_read.latest(memory, "4", **young) is None
-        for source in ("emulated", "replay"):
-            sink.write(replace(result, source=source), {})
-            assert shm_read.latest(memory, "4", **young) is None
-            assert shm_read.latest(memory, "4", **young, pretend=True) is not None
-
-    @pytest.mark.parametrize(
-        ("words", "line"), [(["--pretend"], r"\d+ counts, [\d.]+ mm at most"), ([], "nothing to .*")]
-    )
-    def test_the_example_prints_what_it_acts_on_until_the_memory_is_gone(self, name, start_writer, words, line):
-        start_writer()
-        command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, "left/4", *words]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, **pipes)) as reader:
-            while not re.fullmatch(line, told := reader.stdout.readline().rstrip()):
-                assert told == "nothing to act on", "of the writer, which had no turn for 50 ms"
-            Path("/dev/shm", name).unlink()
-            _, errors = reader.communicate()
-        assert reader.returncode == 1
-        assert re.fullmatch(rf".*No such file .*: expected what edge-sr --sink shm:{name} writes\n", errors)
-
-    def test_the_example_says_how_it_is_called(self):
-        command = [sys.executable, str(ROOT / "examples" / "shm_read.py")]
-        for words in ([], ["skin"], ["skin", "4", "--now"]):
-            done = subprocess.run([*command, *words], env=ENVIRONMENT, capture_output=True, text=True)
-            assert done.returncode == 1 and done.stderr == f"{shm_read.USAGE}\n"
-
-
-class TestWriters:
-    def test_the_end_is_seen_and_the_name_is_free(self, name):
-        sink = SharedMemorySink(name, CONTRACT)
-        memory = attach(name)
-        assert writing(memory)
-        sink.close()
-        assert not writing(memory)
-        with pytest.raises(FileNotFoundError):
-            attach(name)
-        sink.close()
-
-    def test_a_name_that_another_took_meanwhile_stays(self, name):
-        sink = SharedMemorySink(name, CONTRACT)
-        Path("/dev/shm", name).unlink()
-        other = SharedMemorySink(name, CONTRACT)
-        sink.close()
-        assert writing(attach(name), within_s=60)
-        other.close()
-        with pytest.raises(FileNotFoundError):
-            attach(name)
-
-    def test_a_writer_that_waits_gives_signs_of_life(self, name):
-        now_ns = time.monotonic_ns()
-        sink = SharedMemorySink(name, CONTRACT, clock_ns=lambda: now_ns)
-        memory = attach(name)
-        for act in (
-            sink.wait,
-            lambda: sink.tell(Event(0, "lost", None, "gone"), {}),
-            lambda: sink.write(make_result(), {}),
-        ):
-            now_ns -= 1_000_000
-            act()
-            assert heartbeat_ns(memory) == now_ns
-        assert writing(memory, within_s=60)
-        now_ns -= 60_000_000_000
-        sink.wait()
-        assert not writing(memory, within_s=60)
-        sink.close()
-
-    def test_one_that_was_killed_is_seen_and_its_place_taken(self, name, start_writer):
-        writer = start_writer()
-        memory = attach(name)
-        assert writing(memory, within_s=5)
-        writer.send_signal(signal.SIGKILL)
-        writer.wait()
-        (last,) = unpack_from("<q", latest(memory, "left/4") or b"", 24)
-        stopped = heartbeat_ns(memory)
-        time.sleep(0.05)
-        assert heartbeat_ns(memory) == stopped and not writing(memory, within_s=0.05)
-        sink = SharedMemorySink(name, CONTRACT)
-        assert heartbeat_ns(memory) == 0, "who still looks at the old memory must see that it ended"
-        assert unpack_from("<q", latest(memory, "left/4") or b"", 24) == (last,)
-        assert latest(attach(name), "left/4") is None
-        sink.close()
-
-    def test_two_cannot_write_one(self, name, start_writer):
-        writer = start_writer()
-        with pytest.raises(
-            SinkError, match=rf"{name} is written by process {writer.pid}: end it, or choose another name"
-        ):
-            SharedMemorySink(name, CONTRACT)
-        assert writing(attach(name), within_s=5)
-        assert not list(Path("/dev/shm").glob(f".{name}*"))
-
-    def test_what_another_program_left_there_stays(self, name):
-        path = Path("/dev/shm", name)
-        path.write_bytes(b"mine" * 100)
-        with pytest.raises(SinkError, match=r"another program's shared memory"):
-            SharedMemorySink(name, CONTRACT)
-        assert path.read_bytes() == b"mine" * 100
-
-    @pytest.mark.parametrize("bad", ["a/b", "../x", ".x", "a b", "x" * 101])
-    def test_a_name_must_be_a_plain_one(self, bad):
-        with pytest.raises(SinkError, match=r"cannot be a name: expected letters"):
-            open_sink(f"shm:{bad}", CONTRACT)
-
-    def test_nobody_else_may_read_it(self, sink, name):
-        assert Path("/dev/shm", name).stat().st_mode & 0o777 == 0o600
-
-    def test_without_shared_memory_it_says_so(self, tmp_path):
-        with pytest.raises(SinkError, match=r"needs Linux"):
-            SharedMemorySink("x", CONTRACT, folder=tmp_path / "none")

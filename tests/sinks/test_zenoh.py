@@ -2,18 +2,12 @@
 
 import json
 import os
-import queue
-import re
-import select
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -21,131 +15,35 @@ import numpy as np
 import orjson
 import pytest
 from bridge_samples import write_recording
-from edge_samples import BASELINE, ROOT, FakeModel, ended, make_pad_contract, make_scan, write_model
+from edge_samples import ROOT, ended, make_scan, write_model
 from test_listening import reachable
-from zenoh_load import PacedLink
-from zenoh_load import _figures as figures_of
+from zenoh_samples import (
+    CONTRACT,
+    ENVIRONMENT,
+    consume,
+    endpoint,
+    free_endpoint,
+    hear_interrupts,
+    listening,
+    make_results,
+    wait_for,
+)
 
 from edge import api
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, Note
-from edge.perception.runtime import Runtime
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_record import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
-from edge.terminal.forced_end import EXIT_FORCED
 
 zenoh = pytest.importorskip("zenoh")
 
-CONTRACT = make_pad_contract(interval_factor=1.6)
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}", "PYTHONUNBUFFERED": ""}
-# Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
-CONSUME = """
-import json, sys, time, zenoh
-config = zenoh.Config()
-config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-def tell(*words):
-    print(json.dumps(words), flush=True)
-def take(sample):
-    writer, payload = str(sample.timestamp.get_id()), sample.payload.to_bytes().hex()
-    tell("got", str(sample.key_expr), str(sample.encoding), writer, payload)
-def follow(token):
-    tell("came" if token.kind == zenoh.SampleKind.PUT else "went", str(token.key_expr))
-here = lambda callback: zenoh.handlers.Callback(callback, indirect=False)
-with zenoh.open(config) as session:
-    session.liveliness().declare_subscriber("grip/alive/*", here(follow), history=True)
-    session.declare_subscriber("grip/**", here(take))
-    tell("listens")
-    time.sleep(100)
-"""
-
-
-def free_endpoint():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{one.getsockname()[1]}"
-
-
-@pytest.fixture
-def endpoint():
-    return free_endpoint()
-
-
-def listening(endpoint, *connect):
-    """A session of zenoh's own that listens there."""
-    config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
-    config.insert_json5("connect/endpoints", json.dumps(connect))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    return zenoh.open(config)
-
-
-class Consumer:
-    def __init__(self, endpoint):
-        self.process = subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE)
-        self.lines = queue.SimpleQueue()
-        self.reader = threading.Thread(target=self.read)  # at once: a full pipe would hold up the consumer
-        self.reader.start()
-        assert self.next() == ["listens"]
-
-    def read(self):
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.put(line)
-
-    def next(self):
-        return json.loads(self.lines.get(timeout=60))
-
-    def until_gone(self):
-        """Messages, each as key, encoding, writer, payload, until the writer has gone; and who that was."""
-        told = [self.next()]
-        while told[-1][0] != "went":
-            told.append(self.next())
-        with suppress(queue.Empty):  # that it goes may overtake what it sent
-            while True:
-                told.append(json.loads(self.lines.get(timeout=0.6)))
-        messages = [(*words[1:-1], bytes.fromhex(words[-1])) for words in told if words[0] == "got"]
-        return messages, [words for words in told if words[0] != "got"]
-
-    def stop(self):
-        self.process.kill()
-        self.process.wait()
-        self.reader.join()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-
-@pytest.fixture
-def consume():
-    consumers = []
-
-    def start(endpoint):
-        consumers.append(Consumer(endpoint))
-        return consumers[-1]
-
-    yield start
-    for consumer in consumers:
-        consumer.stop()
-
-
-def make_results(count, **of_the_scans):
-    """Contact from the second on; every other of those as the one before it."""
-    runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
-    presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
-    return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]
-
-
-def wait_for(condition, within_s=10):
-    end_s = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
+__all__ = ["consume", "endpoint"]
 
 
 def plain(said):
-    """As JSON says it."""
+    """Return a record as it is after JSON."""
     return orjson.loads(orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
@@ -354,7 +252,7 @@ class TestWhoComesAndGoes:
             assert listener.stdout is not None and listener.stdout.readline() == "listens\n"
             if reader_goes:
                 listener.stdout.close()
-                ZenohSink(f"grip/left?connect={endpoint}").close()  # that it came is what would be told
+                ZenohSink(f"grip/left?connect={endpoint}").close()  # its arrival is what would be reported
             else:
                 listener.send_signal(signal.SIGINT)
             assert listener.stderr is not None
@@ -369,57 +267,6 @@ class TestWhoComesAndGoes:
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py")]
         done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
         assert done.returncode == 1 and done.stderr == "usage: python zenoh_listen.py KEY [tcp/ADDRESS:7447]\n"
-
-
-def sending(*words, **settings):
-    """A program that puts every scan, and hears signals as from a terminal."""
-    command = [sys.executable, "-m", "edge.cli.main", *words, "--every-scan"]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE} | settings
-    return ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes))
-
-
-def until_quiet(pipe, quiet_s=1.0):
-    while select.select([pipe], [], [], quiet_s)[0] and os.read(pipe.fileno(), 1 << 20):
-        pass
-
-
-class TestEndOfTheProgram:
-    """Two seconds are promised; a busy machine may take longer."""
-
-    def test_a_peer_that_is_gone_holds_up_no_end(self, endpoint, consume):
-        consumer = consume(endpoint)
-        with sending("--source", "demo:loop", "--sink", f"zenoh:grip?connect={endpoint}") as program:
-            while consumer.next()[0] != "got":
-                pass
-            consumer.process.send_signal(signal.SIGSTOP)
-            time.sleep(3)
-            begin_s = time.monotonic()
-            program.send_signal(signal.SIGTERM)
-            words = program.communicate()[1].decode()
-        assert program.returncode == 0 and "EMULATED demo:" in words
-        assert time.monotonic() - begin_s < 9, "zenoh itself waits for ten seconds"
-
-    def test_a_replay_that_waits_for_a_peer_that_is_gone_is_ended_by_force(self, endpoint, consume, tmp_path):
-        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
-        press = np.where(np.arange(8000) < 110, 0, 2000 + 7 * np.arange(8000) % 997)
-        noise = np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
-        counts = make_scan(0).counts + noise
-        counts[:, 2] += press[:, None, None] // 16
-        recording = write_recording(tmp_path / "long.csv", counts)
-        consumer = consume(endpoint)
-        words = ["replay", str(recording), "--zero", "--rate-hz", "2000", "--model", str(model)]
-        sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
-        with sending(*words, *sinks, stdout=subprocess.PIPE) as program:
-            while consumer.next()[0] != "got":
-                pass
-            consumer.process.send_signal(signal.SIGSTOP)
-            until_quiet(program.stdout)  # what zenoh has no room for holds up everything, for five seconds at most
-            program.send_signal(signal.SIGTERM)
-            words = program.communicate()[1].decode()
-        assert program.returncode == EXIT_FORCED
-        assert re.fullmatch(
-            r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words
-        )
 
 
 class TestOpening:
@@ -458,7 +305,7 @@ class TestOpening:
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
 class TestListening:
     def opened(self, target):
-        """What such a sink opens to more than this machine."""
+        """Return the sockets that such a sink opens to more than this machine."""
         before = reachable(os.getpid())
         sink = ZenohSink(target)
         after = reachable(os.getpid())
@@ -481,7 +328,7 @@ class TestListening:
 
 @pytest.mark.parametrize("by_file", [False, True])
 def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
-    """A peer tells of the others that it knows."""
+    """Zenoh peers report others that they are connected to."""
     endpoint, others = free_endpoint(), free_endpoint()
     config = tmp_path / "zenoh.json5"
     config.write_text(json.dumps({"connect": {"endpoints": [endpoint]}}))
@@ -492,55 +339,6 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
         time.sleep(0.3)  # for a call to another, were there one
         assert [str(peer) for peer in sink._session.info.peers_zid()] == [str(known.zid())]
         sink.close()
-
-
-def test_the_bench_counts_what_comes():
-    wrote = [
-        {"written": 10, "patterns": 4, "dropped": 2, "cpu_s": 0.5},
-        {"written": 10, "patterns": 4, "dropped": 0, "cpu_s": 0.3},
-    ]
-    got = {"latencies_us": {"scan": [1000.0] * 15, "pattern": [2000.0] * 6}, "bytes": 4_000_000, "cpu_s": 0.1}
-    told = (10, 4, 2, 1, 1, 1, 2, 2, 2, 10, 25, 25, 40, 5)
-    assert figures_of(wrote, got, 2.0) == pytest.approx(told)
-
-
-def test_the_bench_gives_every_sensor_a_scan_a_tick():
-    sensors, given = ("4", "6"), []
-    link = PacedLink([make_scan(number) for number in range(150)], sensors, ticks=3)
-    while not link.ended:
-        given += link.read(1)
-    assert [(scan.sensor, scan.number) for scan in given] == [(name, tick) for tick in range(3) for name in sensors]
-    assert all(scan.time_ns <= later.time_ns for scan, later in pairwise(given))
-    assert given[0].counts.tolist() == make_scan(0).counts.tolist()
-
-
-def start_bench(*words, **settings):
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [sys.executable, str(ROOT / "tests/system/zenoh_load.py"), "--sensors", "1", "--processes", "1", *words]
-    return ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, start_new_session=True, **pipes, **settings))
-
-
-def hear_interrupts():
-    """As from a terminal: who started the tests may have SIGINT ignored."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def test_an_interrupted_bench_ends_with_all_its_processes_and_one_line(tmp_path):
-    with start_bench("--out", str(tmp_path), preexec_fn=hear_interrupts) as bench:
-        while not bench.stdout.readline().startswith("|---"):
-            assert bench.poll() is None
-        time.sleep(0.5)  # its processes are starting, or have started
-        os.killpg(bench.pid, signal.SIGINT)
-        _, errors = bench.communicate()  # which all of them hold open
-    assert (bench.returncode, errors) == (130, "edge-sr: zenoh stopped before its end\n")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_bench_that_cannot_write_says_so_before_it_measures(tmp_path):
-    (tmp_path / "taken").touch()
-    with start_bench("--out", str(tmp_path / "taken")) as bench:
-        out, errors = bench.communicate()
-    assert (bench.returncode, out) == (1, "") and re.fullmatch(r"zenoh: .*File exists: '.*/taken'\n", errors)
 
 
 def test_a_reader_that_stands_still_holds_up_no_end(endpoint, consume):

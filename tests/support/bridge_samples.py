@@ -1,4 +1,4 @@
-"""What the tests of the bridge share: recordings, and reading a link to its end."""
+"""Helpers of the bridge's tests: recordings, and reading a link to its end."""
 
 import csv
 import os
@@ -22,7 +22,7 @@ REST_COUNTS = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).
 
 
 def make_counts(scans: int, seed: int = 0) -> np.ndarray:
-    """Scans that all differ in every taxel, (scans, 3, 4, 4)."""
+    """Return counts of scans that all differ in every taxel, (scans, 3, 4, 4)."""
     noise = np.random.default_rng(seed).integers(0, 30, (scans, 3, 4, 4))
     return (REST_COUNTS + noise + 40 * (np.arange(scans) % 2)[:, None, None, None]).astype(np.int32)
 
@@ -32,7 +32,7 @@ def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recordi
 
 
 def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None) -> Path:
-    """A recording as a CSV file, its rate beside it."""
+    """Write a recording as a CSV file, with its rate in a file next to it."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_HEADER)
@@ -50,7 +50,7 @@ _P = TypeVar("_P", bound=_Played)
 
 
 def undisturbed(play: Callable[[], _P], tries: int = 4) -> _P:
-    """A play without a lost frame: where the machine stands still, the terminal overflows as a device's buffer does."""
+    """Return a play without a lost frame, since the terminal overflows where the machine stands still."""
     played = play()
     for _ in range(tries - 1):
         if not played.lost_frames:
@@ -60,7 +60,7 @@ def undisturbed(play: Callable[[], _P], tries: int = 4) -> _P:
 
 
 def read_until_lost(link: Link, timeout_s: float = 60.0) -> list[Scan]:
-    """All scans until the link is lost or ends."""
+    """Return all scans until the link is lost or ends."""
     scans: list[Scan] = []
     end_s = time.monotonic() + timeout_s
     while not link.ended:
@@ -73,7 +73,7 @@ def read_until_lost(link: Link, timeout_s: float = 60.0) -> list[Scan]:
 
 
 def read_scans(link: Link, count: int, timeout_s: float = 60.0) -> list[Scan]:
-    """The first scans, at least `count`."""
+    """Return the first scans, at least `count`."""
     scans: list[Scan] = []
     end_s = time.monotonic() + timeout_s
     while len(scans) < count:
@@ -83,5 +83,5 @@ def read_scans(link: Link, count: int, timeout_s: float = 60.0) -> list[Scan]:
 
 
 def stacked(scans: list[Scan], sensor: str = "4") -> np.ndarray:
-    """The counts of one sensor's scans, (n, 3, 4, 4)."""
+    """Return the counts of one sensor's scans, (n, 3, 4, 4)."""
     return np.stack([scan.counts for scan in scans if scan.sensor == sensor])

@@ -11,7 +11,7 @@ RADIUS = np.hypot(ALONG[:, None], ALONG)
 
 
 def make_sequences(count=6, taps=4, maps=1, seed=0) -> Sequences:
-    """Presses with closed forms: force k d^1.5, counts c d, patterns exp(-r^2) d, which widen with d if maps > 1."""
+    """Return presses in closed form: force k d^1.5, counts c d, patterns exp(-r^2) d, wider with d if maps > 1."""
     rng = np.random.default_rng(seed)
     end_mm = rng.uniform(0.2, 0.5, (count, taps))
     indentation_mm = end_mm[..., None] * SHARES

@@ -1,4 +1,4 @@
-"""What the doctor's tests share: sensors that are well, each fault by itself, and fingers on corners."""
+"""Samples for the doctor's tests: sensors that are well, each fault by itself, and fingers on corners."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ COUNTERS = {"received_bytes": 22 * 16 * 400, "frames": 16 * 400, "bad_lines": 0,
 
 
 def healthy_counts(scans: int = 400, seed: int = 0, sigma: float = 2.0) -> np.ndarray:
-    """A free, still pad, (scans, 3, 4, 4)."""
+    """Return counts of a free, still pad, (scans, 3, 4, 4)."""
     noise = np.random.default_rng(seed).normal(0, sigma, (scans, 3, 4, 4))
     return np.rint(REST + noise).astype(np.int32)
 
 
 def times_ns(scans: int = 400, rate_hz: float = 100.0, seed: int = 1) -> np.ndarray:
-    """On a grid, each up to a millisecond early or late."""
+    """Return times on a grid, each up to a millisecond early or late."""
     jitter_s = np.random.default_rng(seed).uniform(-0.001, 0.001, scans)
     return np.rint((np.arange(scans) / rate_hz + jitter_s + 1) * 1e9).astype(np.int64)
 
@@ -41,7 +41,7 @@ def watched(scans: list[Scan], duration_s: float = 4.0, **changes) -> Watched:
 
 
 def finger(place: int, force: float = 4000.0) -> np.ndarray:
-    """z of a finger on a corner as it is seen, (4, 4), in counts."""
+    """Return z of a finger on a corner as a person sees it, (4, 4), in counts."""
     rows, cols = np.indices((4, 4))
     at_row, at_col = divmod(place, 4)
     # A finger is wider than a taxel, and its middle lies a little inside.
@@ -53,14 +53,14 @@ PUSHES = {0: (1, 1), 3: (-1, 1), 15: (-1, -1), 12: (1, -1)}
 
 
 def visit(order: list[int], swap: bool, signs: tuple[int, int, int], *, rest: int = 20, hold: int = 45) -> np.ndarray:
-    """What a pad sends that a person presses as asked, noiseless and over its rest, (n, 3, 4, 4).
+    """Return the counts of a pad that a person presses as asked, noiseless and over its rest, (n, 3, 4, 4).
 
     Args:
-        order: of each place as the person sees it, the taxel of the id map that lies there.
-        swap: the wire's x is the pad's y.
-        signs: of the pad's x, y and z as the wire has them.
-        rest: scans between presses.
-        hold: scans of each press, and of each push.
+        order: taxel of the id map at each place as the person sees it.
+        swap: true where the wire's x is the pad's y.
+        signs: signs of the pad's x, y and z on the wire.
+        rest: number of scans between presses.
+        hold: number of scans of each press, and of each push.
     """
     seen = []
     for place in (0, 3, 15, 12):

@@ -1,4 +1,4 @@
-"""What the runtime's tests share: a tiny real model, a sensor at rest and under load, links that are scripts."""
+"""Samples for the runtime's tests: a tiny real model, a sensor at rest and under load, scripted links."""
 
 import subprocess
 import threading
@@ -65,13 +65,13 @@ def make_contract(**changes) -> Contract:
 
 
 def make_pad_contract(**changes) -> Contract:
-    """Of a model that takes a pad and gives traction."""
+    """Return the contract of a model that takes a pad and gives traction."""
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
     return make_contract(**({"pad_inputs": pad_inputs, "takes_gains": True, "traction_scale": 2} | changes))
 
 
 def make_wrench_result(number: int = 0, press_counts: float = 20_000, **settings):
-    """What a model with traction makes of a press on taxel 5: .44 N there, where nothing is known of the pad."""
+    """Return the result of a model with traction for a press on taxel 5: 0.44 N there, on a pad without data."""
     contract = make_pad_contract(interval_factor=1.6)
     runtime = Runtime(FakeModel(contract), **{"source": "device", "baselines": {"4": BASELINE}} | settings)
     return runtime.push(make_scan(number, press_counts=press_counts, time_ns=time.monotonic_ns()))
@@ -94,7 +94,7 @@ def write_model(
     with_traction: bool | None = None,
     traction_shape: tuple[int, ...] | None = None,
 ) -> Path:
-    """A real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
+    """Write a real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
     The deviation, there if the contract has a factor for it unless asked otherwise, is `tiny_deviation`. A pad,
     likewise, makes all stronger by `tiny_stiffness`; a traction, likewise, is the newest tap's x, y, z in squares.
@@ -167,23 +167,23 @@ def write_model(
 
 
 def tiny_stiffness(pad_row: np.ndarray) -> float:
-    """How much stronger the tiny model's outputs are for a pad."""
+    """Return the factor by which the tiny model's outputs are stronger for a pad."""
     return 1 + float(pad_row @ np.arange(1, len(pad_row) + 1))
 
 
 def tiny_traction(window_units: np.ndarray, scale: int) -> np.ndarray:
-    """What the tiny model makes of a window (taps, 3, rows, cols), as traction (3, h, w)."""
+    """Return the tiny model's traction (3, h, w) for a window (taps, 3, rows, cols)."""
     return np.kron(window_units[0], np.ones((1, scale, scale)))
 
 
 def tiny_pattern(window_units: np.ndarray, scale: int = 10) -> np.ndarray:
-    """What the tiny model makes of a window (taps, 3, rows, cols) in network units."""
+    """Return the tiny model's pattern for a window (taps, 3, rows, cols) in network units."""
     z = sum(window_units[tap, 2] * 10.0**-tap for tap in range(len(window_units)))
     return np.kron(z, np.ones((scale, scale)))
 
 
 def tiny_deviation(pattern: np.ndarray) -> np.ndarray:
-    """What the tiny model says of its pattern's deviation."""
+    """Return the tiny model's deviation for its pattern."""
     return TINY_DOUBT * (1 + np.abs(pattern))
 
 
@@ -198,7 +198,7 @@ def make_scan(
     time_ns: int | None = None,
     noise: int = 0,
 ) -> Scan:
-    """A scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
+    """Return a scan with one taxel pressed; `absent` taxels gave no reading, `stale` ones are not renewed."""
     counts = REST.copy()
     counts[2].flat[taxel] += int(press_counts)
     if noise:
@@ -214,7 +214,7 @@ def make_scan(
 
 @contextmanager
 def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subprocess.Popen]:
-    """Kills what is not over when the block is, or, so that nobody reads for ever, by then."""
+    """Yield a process, and kill it at the end of the block, or after a time so that no reader waits for ever."""
     alarm = threading.Timer(within_s, process.kill)
     alarm.start()
     with process:
@@ -226,7 +226,7 @@ def ended(process: subprocess.Popen, within_s: float = 60) -> Iterator[subproces
 
 
 class FakeModel:
-    """The tiny model without onnxruntime; `on_run` is called before each run."""
+    """Tiny model without onnxruntime; `on_run` is called before each run."""
 
     def __init__(self, contract: Contract | None = None, on_run=lambda: None) -> None:
         self.name = "fake"
@@ -261,7 +261,7 @@ class FakeModel:
 
 
 class FakeLink(Link):
-    """Gives one batch of scans at each read, waiting where a batch is an event; then ends, or fails."""
+    """Link with one batch of scans a read, which waits where a batch is an event, and then ends or fails."""
 
     def __init__(self, batches, *, error: Exception | None = None, kind="device", endless: bool = False) -> None:
         self.name = "fake"
@@ -303,7 +303,7 @@ class FakeLink(Link):
 
 
 class ListSink(Sink):
-    """Keeps what it gets."""
+    """Sink that keeps the results it gets."""
 
     def __init__(self, on_write=lambda result: None) -> None:
         self.results = []

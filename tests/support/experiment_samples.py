@@ -1,4 +1,4 @@
-"""What the experiments' tests share: one quick workbench, so that datasets and networks are made once a session."""
+"""Samples for the experiments' tests: one quick workbench, so that datasets and networks are made once a session."""
 
 import pytest
 

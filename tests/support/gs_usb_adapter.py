@@ -1,7 +1,7 @@
-"""A pretended gs_usb adapter: what a candleLight does with requests, frames and a client that dies.
+"""Emulated gs_usb adapter that treats requests, frames and a client that dies as a candleLight does.
 
-It is no kinder than the device. Its queue holds 64 frames, and what finds no room is lost and told by a flag on the
-next frame. It hears nothing without the right bit timing. A client's death does not stop it. And if the USB device is
+It is no kinder than the device. Its queue holds 64 frames; a frame without room is lost, and a flag on the next frame
+reports it. It receives nothing without the right bit timing. A client's death does not stop it. If the USB device is
 reset while a frame waits to be fetched, it is mute until it is unplugged (candleLight_fw issues 46, 165, up to 2026).
 """
 
@@ -33,18 +33,18 @@ _FRAME: Final = struct.Struct("<IIBBBB8s")
 
 
 class StalledError(Exception):
-    """The adapter refuses a request."""
+    """Refusal of a request by the adapter."""
 
 
 class GsUsbAdapter:
-    """One adapter, from one plugging-in to the next. Its methods may be called from any thread.
+    """Adapter from one plugging-in to the next. Its methods may be called from any thread.
 
     Attributes:
-        started: its channel is on the bus.
-        right_bitrate: the timing it was given makes 1 Mbit/s.
+        started: true while its channel is on the bus.
+        right_bitrate: true where its timing makes 1 Mbit/s.
         sent: frames that it put on the bus for the client.
-        lost_frames: frames that found no room.
-        mute: it will send nothing any more.
+        lost_frames: frames that had no room.
+        mute: true once it sends no more.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class GsUsbAdapter:
 
     @property
     def plugged(self) -> bool:
-        """Its cable is in."""
+        """True while its cable is in."""
         return self._plugged
 
     @property
@@ -81,7 +81,7 @@ class GsUsbAdapter:
         return len(self._queue)
 
     def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
-        """Frames come over the bus, at `stamp_us` of its clock, by default now."""
+        """Receive frames from the bus, at `stamp_us` of its clock, by default now."""
         self._receive(frames, 0, stamp_us, channel)
 
     def report(self, classes: int, data: bytes = bytes(8)) -> None:
@@ -89,7 +89,7 @@ class GsUsbAdapter:
         self._receive((CanFrame(classes, data),), gs_usb.ERROR, None, 0)
 
     def unplug(self) -> None:
-        """Pull the cable out: whoever waits for it is told."""
+        """Pull the cable out, and wake all who wait for it."""
         with self._changed:
             self._plugged = False
             self._changed.notify_all()
@@ -138,7 +138,7 @@ class GsUsbAdapter:
             return True
 
     def fetch(self, timeout_s: float | None) -> bytes | None:
-        """The next host frame, after waiting for it; None when there is none in time, or the cable is out."""
+        """Wait for the next host frame and return it; None when there is none in time, or the cable is out."""
         with self._changed:
             self._changed.wait_for(lambda: not self._plugged or (self._hand_over() and not self.mute), timeout_s)
             if not self._plugged or self.mute:
@@ -148,7 +148,7 @@ class GsUsbAdapter:
             return data
 
     def reset_usb(self) -> None:
-        """The host resets the USB device, which is not what restarts it."""
+        """Reset the USB device as the host does, which does not restart it."""
         with self._changed:
             self.mute = self.mute or self._waiting_for_host is not None
 
@@ -175,7 +175,7 @@ class GsUsbAdapter:
         self._changed.notify_all()
 
     def _hand_over(self) -> bool:
-        """One frame leaves the queue for the endpoint, and stays there until the host fetches it."""
+        """Move one frame from the queue to the endpoint, and stays there until the host fetches it."""
         if self._waiting_for_host is None and self._queue:
             self._waiting_for_host = self._queue.popleft()
         return self._waiting_for_host is not None
@@ -188,5 +188,5 @@ class GsUsbAdapter:
             and 1 <= timing.sjw <= limits.sjw_max
             and limits.brp_min <= timing.brp <= limits.brp_max
         ):
-            return  # it takes no notice, and says nothing
+            return  # it ignores the request without an error
         self.right_bitrate = limits.clock_hz == timing.quanta * timing.brp * gs_usb.BITRATE_BIT_S

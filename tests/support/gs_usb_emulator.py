@@ -1,6 +1,6 @@
-"""USB with pretended gs_usb adapters, as a backend of pyusb: what libusb would answer, its errors included."""
+"""USB with emulated gs_usb adapters, as a backend of pyusb that answers as libusb, errors included."""
 
-# What each method is for, pyusb says; and since it is untyped, pyright takes its empty methods to return None.
+# The documentation of pyusb explains each method. It is untyped, so pyright takes its empty methods to return None.
 # pyright: reportIncompatibleMethodOverride=false
 
 import errno
@@ -39,7 +39,7 @@ _DIRECTION_IN: Final = 0x80
 
 
 class GsUsbPort:
-    """A place on the bus where an adapter may be plugged in.
+    """Place on the bus where an adapter may be plugged in.
 
     Attributes:
         adapter: the one that is there, or was there last.
@@ -60,7 +60,7 @@ class GsUsbPort:
         usb_id: tuple[int, int] = (0x1D50, 0x606F),
         packet_bytes: int = 32,
     ) -> None:
-        """Plug one in; `adapter` makes it, each time anew."""
+        """Plug an adapter in; `adapter` makes a new one each time."""
         self.serial_number = serial_number
         self.product = product
         self.kernel_driver = False
@@ -75,14 +75,14 @@ class GsUsbPort:
         self.adapter = adapter()
 
     def plug(self) -> None:
-        """Plug it in again: it begins anew, under another address."""
+        """Plug it in again: a new adapter under another address."""
         self.address += 1
         self.claimed = False
         self.adapter = self._make()
 
 
 class _Plugged:
-    """What libusb knows a device by: gone for good once it was unplugged."""
+    """Handle by which libusb identifies a device: gone for good once it was unplugged."""
 
     def __init__(self, port: GsUsbPort) -> None:
         self.port = port
@@ -96,7 +96,7 @@ class _Plugged:
 
 
 class GsUsbBackend(usb.backend.IBackend):
-    """A bus with ports."""
+    """Bus with ports."""
 
     def __init__(self, *ports: GsUsbPort) -> None:
         """Set up a bus, by default with one adapter on it."""

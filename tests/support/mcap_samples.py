@@ -1,4 +1,4 @@
-"""What the tests of MCAP recordings share: a recording, and reading one with the public package."""
+"""Helpers for tests of MCAP recordings: a recording, and reading one with the public package."""
 
 from collections import defaultdict
 from dataclasses import replace
@@ -10,13 +10,16 @@ from mcap.reader import make_reader
 
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
 
 OFFSET_NS = 1_700_000_000_000_000_000
+SURE = make_contract(interval_factor=1.6)
+TURNED = Mounting(order=tuple(reversed(range(16))), swap_xy=True, signs=(1, -1, 1))
 
 
 def odd_scans(count: int = 12) -> list[Scan]:
-    """Scans of two sensors with all that scans may have: gaps, old readings, device times, a vendor's words."""
+    """Return scans of two sensors with all that scans may have: gaps, old readings, device times, a vendor's words."""
     scans = []
     for number in range(count):
         press = 3000 + 40 * number if number % 4 > 1 else 0
@@ -45,7 +48,7 @@ def record_into(path: Path, results, contract=None, **settings) -> Path:
 
 
 def messages_of(path: Path) -> dict[str, list]:
-    """(log time, data) by topic, as the public package reads a whole file, its sums checked."""
+    """Return (log time, data) by topic, as the public package reads a whole file, its sums checked."""
     by_topic = defaultdict(list)
     with path.open("rb") as file:
         for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
@@ -54,7 +57,7 @@ def messages_of(path: Path) -> dict[str, list]:
 
 
 def same_scan(got: Scan, scan: Scan, moved_ns: int = 0) -> bool:
-    """Bit for bit."""
+    """Return True where both scans are equal bit for bit."""
     arrays = [(getattr(got, name), getattr(scan, name)) for name in ("counts", "fresh", "renewed")]
     for one in ("newtons", "temperature_k", "ups_hz"):
         arrays.append((getattr(got.vendor, one, None), getattr(scan.vendor, one, None)))

@@ -1,4 +1,4 @@
-"""Sets of presses with closed forms, for whoever learns from them."""
+"""Sets of presses with closed forms, for tests of learning."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from train.physics.pad_draws import INPUTS
 
 
 def make_press_set(count=12, taps=2, seed=0, per_pad=4) -> PressSet:
-    """Readings and truths in proportion to the indentation, of as many pads as there are fours."""
+    """Return readings and truths in proportion to the indentation, of as many pads as there are fours."""
     rng = np.random.default_rng(seed)
     depth_mm = rng.uniform(0.1, 0.5, count).astype(np.float32)
     across = (np.arange(40) - 19.5) / 10

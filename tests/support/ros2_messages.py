@@ -29,7 +29,7 @@ NESTED, UNBOUNDED = 1, 144
 
 
 def fields(name):
-    """Name, type and whether it is a sequence, of each field; a type of the same package may stand without it."""
+    """Return name, type and True for a sequence, of each field; a type of the same package may stand without it."""
     found = []
     for line in DEFINITIONS[name].splitlines():
         kind, field = line.split()
@@ -42,7 +42,7 @@ def fields(name):
 
 
 def dds_type(name):
-    """As rmw_cyclonedds names it."""
+    """Return the DDS type of a message, named as by rmw_cyclonedds."""
     package, _, message = name.split("/")
     members = {}
     for field, kind, many in fields(name):
@@ -52,7 +52,7 @@ def dds_type(name):
 
 
 def type_hash(name):
-    """RIHS01, by REP-2011: the SHA-256 of the type's description and of all that it refers to."""
+    """Return the hash RIHS01, by REP-2011: the SHA-256 of the type's description and of all that it refers to."""
     below = set()
 
     def refer(one):
@@ -76,7 +76,7 @@ def type_hash(name):
 
 
 def decode(name, data):
-    """A message from plain little-endian CDR, by the rules alone; all of `data` is used."""
+    """Decode a message from plain little-endian CDR, by the rules alone; all of `data` is used."""
     assert data[:4] == b"\x00\x01\x00\x00"
     body, position = data[4:], 0
 

@@ -1,16 +1,20 @@
-"""Messages of a pretended server, made by hand."""
+"""Messages of a server made by hand, and helpers for the tests of its link."""
 
 import json
+import time
 
 import numpy as np
-from bridge_samples import REST_COUNTS
+from bridge_samples import REST_COUNTS, make_recording
+
+from firmware_bridge.emulation.xela_server_model import VendorServer
+from firmware_bridge.errors import LinkLostError
 
 UNIX_S = 1_768_365_606.25
 MS = 1_000_000
 
 
 def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, **changes) -> dict:
-    """What a server of 1.8.0 says of one sensor; a change to None leaves the key out."""
+    """Return the entry of a server 1.8.0 about one sensor; a change to None leaves the key out."""
     values = np.asarray(counts).reshape(3, 16).T.ravel().tolist()
     entry = {
         "time": time_s,
@@ -28,6 +32,39 @@ def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, 
 
 
 def message(sequence: object, *entries: dict, time_s: object = UNIX_S, **more) -> str:
-    """A message about sensors 1, 2, ..."""
+    """Return a message about sensors 1, 2, ..."""
     sensors = {str(number): entry for number, entry in enumerate(entries, 1)}
     return json.dumps({"message": sequence, "time": time_s, "version": "1.8.0b_208601", **sensors, **more})
+
+
+def looping(**options) -> VendorServer:
+    return VendorServer([make_recording(50)], loop=True, **options)
+
+
+def wait_for(condition, timeout_s=60.0):
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def lose(link):
+    """Read until the link is lost, and return its error's text."""
+    end_s = time.monotonic() + 60
+    while time.monotonic() < end_s:
+        try:
+            link.read(0.05)
+        except LinkLostError as lost:
+            return str(lost)
+    raise AssertionError("the link was never lost")
+
+
+def read_notices(link, count):
+    """Return the first notices, at least `count`."""
+    notices = []
+    end_s = time.monotonic() + 60
+    while len(notices) < count:
+        assert time.monotonic() < end_s, notices
+        link.read(0.05)
+        notices += link.notices()
+    return notices

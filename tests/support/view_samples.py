@@ -1,12 +1,15 @@
-"""What the live page's tests share: a run to look at, and viewers over loopback."""
+"""Samples for the live page's tests: a run to look at, and viewers over loopback."""
 
+import http.client
 import socket
 import threading
 import time
 from contextlib import contextmanager, suppress
 from functools import partial
 
+import pytest
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from edge.perception.options import RuntimeOptions
@@ -49,7 +52,7 @@ class Press:
 
 
 class Page:
-    """A live page over loopback, and who looks at it."""
+    """Live page over loopback, and its viewers."""
 
     def __init__(self, view, commands):
         self.view = view
@@ -60,12 +63,12 @@ class Page:
 
     def viewer(self, query="", *, host="127.0.0.1", origin=None, **settings):
         headers = {} if origin is None else {"Origin": origin}
-        # One that has not read everything cannot hear that the server closes.
+        # A viewer that has not read everything does not notice that the server closes.
         settings = {"compression": None, "additional_headers": headers, "close_timeout": 0.2} | settings
         return connect(f"ws://{host}:{self.port}/ws{query}", **settings)
 
     def stranger(self, data=b""):
-        """A plain connection, on which this much is sent."""
+        """Open a plain connection, and send this data on it."""
         connection = socket.create_connection(("127.0.0.1", self.port), TIMEOUT_S)
         connection.sendall(data)
         return connection
@@ -76,13 +79,13 @@ class Page:
                 sink.write(result, {"dropped": 0})
 
     def wait(self):
-        """As the loop does while nothing comes."""
+        """Call the sinks as the loop does while nothing comes."""
         for sink in self.view.sinks:
             sink.wait()
 
     @contextmanager
     def playing(self, rate_hz=100.0):
-        """Results at a rate, from a thread of its own as the loop's."""
+        """Play results at a rate, from a thread of its own as the loop's."""
         stop = threading.Event()
 
         def loop():
@@ -100,17 +103,17 @@ class Page:
             thread.join()
 
     def polled(self, count=1):
-        """Commands, once so many have come."""
+        """Return the commands once so many have come."""
         commands = []
         wait_for(lambda: commands.extend(self.asked.poll()) or len(commands) >= count)
         return commands
 
 
 class Swallowing:
-    """A network between a viewer and the page, which may come to swallow all.
+    """Network between a viewer and the page, which can start to swallow everything.
 
     Attributes:
-        port: that leads to the page while it lasts.
+        port: port that leads to the page until then.
     """
 
     def __init__(self, port):
@@ -134,7 +137,7 @@ class Swallowing:
         self._listening.close()
 
     def swallow(self):
-        """Hand on nothing from now on, and let both ends believe that the other is there."""
+        """Hand on nothing from now on, while both ends stay connected."""
         self._swallows.set()
 
     def _lead(self):
@@ -175,7 +178,7 @@ def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT)
 
 
 def frame(viewer, kind=None, sensor=None):
-    """The next frame, or the next of a kind: header and maps."""
+    """Return header and maps of the next frame, or of the next of a kind."""
     while True:
         header, maps = unpack(viewer.recv(TIMEOUT_S))
         if kind in (None, header["kind"]) and sensor in (None, header.get("sensor")):
@@ -187,3 +190,29 @@ def wait_for(condition):
     while not condition():
         assert time.monotonic() < end_s, "it did not come"
         time.sleep(0.005)
+
+
+@pytest.fixture
+def page(tmp_path):
+    with live_page(tmp_path) as page:
+        yield page
+
+
+def get(page, path="/", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=TIMEOUT_S)
+    try:
+        connection.request("GET", path, headers=headers)
+        response = connection.getresponse()
+        return response.status, dict(response.getheaders()), response.read()
+    finally:
+        connection.close()
+
+
+def refused_with(page, *arguments, **settings):
+    with pytest.raises(InvalidStatus) as caught, page.viewer(*arguments, **settings):
+        pass
+    return caught.value.response.status_code
+
+
+def viewers(page):
+    return page.view._server.viewers

@@ -1,4 +1,4 @@
-"""Commands, snippets and options that the pages give, found in their text."""
+"""Commands, snippets and options in the text of the pages."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import NamedTuple
 from edge_samples import ROOT
 
 PAGES = (ROOT / "README.md", *sorted(page for page in (ROOT / "docs").glob("*.md") if page.name != "log.md"))
-"""The log tells of commands as they were."""
+"""Pages whose commands must work; the log holds commands as they were."""
 LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c"}
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
@@ -42,17 +42,17 @@ def blocks() -> list[Block]:
 
 
 def unfenced(page: Path) -> str:
-    """The text beside the blocks."""
+    """Return the text outside the blocks."""
     return _FENCE.sub("", page.read_text())
 
 
 def inline(page: Path) -> list[str]:
-    """What stands between backticks."""
+    """Return the texts between backticks."""
     return [" ".join(text.replace("\\|", "|").split()) for text in _INLINE.findall(unfenced(page))]
 
 
 def commands() -> dict[str, list[str]]:
-    """Every command, and the pages that give it."""
+    """Return every command, and the pages that give it."""
     found: dict[str, list[str]] = {}
     for block in blocks():
         if block.language == "sh":
@@ -70,7 +70,7 @@ def commands() -> dict[str, list[str]]:
 
 
 def _without_comment(line: str) -> str:
-    """A line of shell up to a # that begins a word, outside quotes."""
+    """Return a line of shell up to a # that begins a word, outside quotes."""
     quoted = ""
     for at, letter in enumerate(line):
         if quoted:

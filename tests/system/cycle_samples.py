@@ -1,4 +1,4 @@
-"""Streams of which every reading names its cycle, readers of them, and what their scans are worth."""
+"""Streams of which every reading names its cycle, readers of them, and the evaluation of their scans."""
 
 import random
 import struct
@@ -20,7 +20,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 LINE_BYTES: Final = 4095
-"""What a pseudo-terminal holds for a reader that does not read."""
+"""Bytes that a pseudo-terminal holds for a reader that does not read."""
 ADAPTER_S: Final = 0.001
 FTDI_S: Final = 0.016
 _HOST_FRAME: Final = struct.Struct("<IIBBBB8sI")
@@ -30,10 +30,10 @@ Fault = Callable[[list[Timed]], list[Timed]]
 
 
 class Reader(NamedTuple):
-    """How a stream is read.
+    """Way in which a stream is read.
 
     Attributes:
-        name: of the way.
+        name: name of the way.
         stamped: the adapter stamps frames.
         usb: gs_usb, a frame a transfer; else slcan.
         latency_s: the adapter hands on what it has once in this time, in [s].
@@ -56,7 +56,7 @@ PLAIN, STAMPED, PLAIN_BURSTS, STAMPED_BURSTS, USB = READERS
 
 
 def numbered(cycles: int, first: int = 0) -> Recording:
-    """A recording in which every reading is the number of its cycle."""
+    """Return a recording in which every reading is the number of its cycle."""
     counts = np.broadcast_to(np.arange(first, first + cycles)[:, None, None, None], (cycles, 3, 4, 4)).astype(np.int32)
     return Recording(Path("numbered.csv"), (Track("4", counts, None),), 100.0)
 
@@ -70,7 +70,7 @@ def bus(
     frame_s: float = FRAME_S,
     first_frame: int = 0,
 ) -> list[Timed]:
-    """What sensors "4", "6", ... send, each at its rate."""
+    """Return the stream of sensors "4", "6", ..., each at its rate."""
     track = numbered(cycles, first=1000).tracks[0]
     controllers = [Controller(track, 4 + 2 * n, rate_hz) for n, rate_hz in enumerate(rates_hz)]
     timeline = bus_timeline(
@@ -80,20 +80,20 @@ def bus(
 
 
 def in_order(frames: Iterable[Timed], order: Sequence[int], model: ModelMap = USPA44_MAP) -> list[Timed]:
-    """The same of a sensor that sends its taxels in another order: `order` are places of the usual one."""
+    """Return the stream of a sensor that sends its taxels in another order: `order` are places of the usual one."""
     ids = [can_id for can_id, _ in model.wire_order("4")]
     renamed = {ids[place]: ids[other] for place, other in enumerate(order)}
     return [(time_s, frame._replace(can_id=renamed[frame.can_id])) for time_s, frame in frames]
 
 
 def losing(share: float, seed: int = 0) -> Fault:
-    """Each frame is lost with this probability."""
+    """Lose each frame with this probability."""
     draw = random.Random(seed)
     return lambda frames: [timed for timed in frames if draw.random() >= share]
 
 
 def pausing(pause_s: float, every_s: float, seed: int = 0) -> Fault:
-    """The bus is off for so long again and again, and what is sent meanwhile is lost."""
+    """Switch the bus off for so long again and again; what is sent meanwhile is lost."""
     draw = random.Random(seed)
 
     def fault(frames: list[Timed]) -> list[Timed]:
@@ -109,13 +109,13 @@ def _moments(frames: list[Timed], every_s: float, draw: random.Random) -> list[f
 
 
 def doubling(share: float, seed: int = 0) -> Fault:
-    """Frames come twice in a row."""
+    """Repeat frames."""
     draw = random.Random(seed)
     return lambda frames: [one for one in frames for _ in range(1 + (draw.random() < share))]
 
 
 def swapping(share: float, seed: int = 0) -> Fault:
-    """Frames change places with the next one."""
+    """Swap frames with the next one."""
     draw = random.Random(seed)
 
     def fault(frames: list[Timed]) -> list[Timed]:
@@ -143,7 +143,7 @@ def _handed_on(frames: Iterable[Timed], reader: Reader) -> Iterator[tuple[float,
 def _stalled(
     lots: Iterable[tuple[float, list[Timed]]], stalls: Sequence[tuple[float, float]], reader: Reader
 ) -> Iterator[tuple[float, list[Timed]]]:
-    """Nobody reads in the stalls; what waits is lost beyond the room that there is."""
+    """Stop reading in the stalls; what waits is lost beyond the room that there is."""
     room = 64 if reader.usb else LINE_BYTES // (26 if reader.stamped else 22)
     waiting: list[list[Timed]] = []
     until_s = 0.0
@@ -162,16 +162,16 @@ def _stalled(
 
 @dataclass
 class Worth:
-    """What the scans of a stream are worth.
+    """Scans of a stream, evaluated against the cycles that were sent.
 
     Attributes:
-        scans: given.
-        whole: of these, with sixteen new readings.
-        mixed: of these, of more than one cycle.
-        mixed_torn: of the others.
-        waits_ms: from the last frame of a cycle, as it was read, to its scan.
-        counters: of the reader.
-        numbers: of whole scans, by sensor, the cycle of each.
+        scans: number of scans.
+        whole: scans with sixteen new readings.
+        mixed: whole scans of more than one cycle.
+        mixed_torn: other scans of more than one cycle.
+        waits_ms: times from the last frame of a cycle, as it was read, to its scan.
+        counters: counters of the reader.
+        numbers: cycles of whole scans, by sensor.
     """
 
     scans: int = 0

@@ -15,7 +15,7 @@ CYCLES = 1000
 
 
 def cases(reader: Reader) -> Iterator[tuple[str, list[Worth]]]:
-    """Everything that goes wrong, by name, and what one reader made of it."""
+    """Yield everything that goes wrong, by name, and what one reader made of it."""
     yield "joining at each of 16 frames", [read(bus(30, first_frame=frame), reader) for frame in range(16)]
     yield "each single frame lost", [_without(16 * 10 + frame, reader) for frame in range(16)]
     for share in (0.0001, 0.0005, 0.005, 0.05):

@@ -1,4 +1,4 @@
-"""What was lost and what came in a run among faults, counted by the injector and by the program."""
+"""Accounts of a run among faults: losses and arrivals, counted by the injector and by the program."""
 
 import re
 from collections.abc import Mapping
@@ -15,16 +15,16 @@ class Account:
     """One count, by the injector and by the program.
 
     Attributes:
-        name: of what.
-        told: by the injector, or found in records.
-        counted: by the program.
-        fewer: by how much the first may be less where equality cannot be.
-        more: by how much it may be more.
-        why: of what may be fewer or more.
+        name: what is counted.
+        injected: count by the injector, or detected in records.
+        counted: count by the program.
+        fewer: by how much `injected` may be less where equality is impossible.
+        more: by how much `injected` may be more.
+        why: reason that it may be less or more.
     """
 
     name: str
-    told: int
+    injected: int
     counted: int
     fewer: int = 0
     more: int = 0
@@ -32,14 +32,14 @@ class Account:
 
     @property
     def verdict(self) -> str:
-        """Equal, consistent, or no."""
-        if self.told == self.counted:
+        """Verdict: equal, consistent within the tolerance, or no."""
+        if self.injected == self.counted:
             return EQUAL
-        return CONSISTENT if -self.fewer <= self.told - self.counted <= self.more else DIFFERENT
+        return CONSISTENT if -self.fewer <= self.injected - self.counted <= self.more else DIFFERENT
 
     @property
     def tolerance(self) -> str:
-        """By how much they may differ."""
+        """Difference that is allowed between both counts, with its reason."""
         return (
             f"{f'+{self.more}' if self.more else ''}{f'-{self.fewer}' if self.fewer else ''} {self.why}".strip() or "0"
         )
@@ -48,30 +48,30 @@ class Account:
 EQUAL, CONSISTENT, DIFFERENT = "equal", "consistent", "no"
 TAXELS: Final = 16
 LINE_BYTES: Final = 26
-"""Of a frame with a time stamp."""
+"""Length of a frame with a time stamp."""
 _RECEIVED = re.compile(r"^received: (.*)$", re.MULTILINE)
 
 
 def counted_at_the_end(said: str) -> dict[str, int]:
-    """The counters in the summary of a run: what came behind its last record is in them, too."""
+    """Return the counters in the summary of a run, which include what came after its last record."""
     lines = _RECEIVED.findall(said)
     pairs = (text.rpartition(" ") for text in lines[-1].split(", ")) if lines else ()
     return {name: int(count) for name, _, count in pairs if count.isdigit()}
 
 
 def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
-    """Return what was lost and what came, by both sides; `said` is the program's summary.
+    """Return the accounts of losses and arrivals by both sides; `said` is the program's summary.
 
-    A record that was left out held a reading or a missing taxel in each of its sixteen places. How many of which, the
-    program's own count of missing ones alone tells; so that account can be no more than consistent, and with it the
-    one of readings closes exactly.
+    A record that was left out held a reading or a missing taxel in each of its sixteen places. Only the program's own
+    count of missing taxels shows how many there were of each. So that account can be no more than consistent, and with
+    it the account of readings closes exactly.
 
     Lines of events that were left out are counted with those of scans. A scan that the program counted, and that is in
     no record and not left out, is missed all the same.
 
-    An opening drops what lies in the terminal. Where the injector did not run meanwhile, it finds nothing there and
-    takes it as read. How many bytes were dropped the program counts, how many of them the injector has as unread it
-    does: what lies between is frames that one side has and the other has not.
+    An opening drops what lies in the terminal. Where the injector did not run meanwhile, it detects nothing there and
+    takes those bytes as read. The program counts the bytes that were dropped, the injector those of them that it has as
+    unread; the difference is frames that only one side has.
     """
     truth: Mapping[str, Any] = told.accounts["counters"]
     counted = {**found.last_counters, **counted_at_the_end(said)}

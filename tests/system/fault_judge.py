@@ -1,4 +1,4 @@
-"""Holds the records of a run among faults against the injector's truth, reading by reading."""
+"""Evaluation of the records of a run among faults against the injector's truth, reading by reading."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -11,44 +11,44 @@ from fault_sent import FLIPPED, STUCK, SentTaxel, handed_on
 from firmware_bridge.emulation.fault_log import Told
 
 STALE_US: Final = 100_000
-"""What a record gives as one reading of the pad was on the bus within this time."""
+"""Longest time on the bus between the readings that a record gives as one scan of the pad."""
 HELD_US: Final = 150_000
-"""Of a taxel that did not come, the last reading is held for as long as that, by times of arrival."""
+"""Longest time for which the last reading of a missing taxel is held, by times of arrival."""
 ALL_FRESH: Final = 0xFFFF
-"""Of a whole scan: no taxel is missing."""
+"""Mask of a whole scan, in which no taxel is missing."""
 
 
 @dataclass
 class Found:
-    """What the records of a run are worth.
+    """Evaluated records of a run.
 
     Attributes:
-        records: of scans.
-        patterns: of these, with a pattern.
-        whole_patterns: of these, from sixteen readings of one press, all of them sent as they are.
-        told_patterns: of these, from fewer, and the record says which are missing, held, dead or not renewed.
-        false_patterns: neither; why, and of which record.
-        flipped_patterns: with a reading in it that a flipped digit changed, which no reader can know.
-        stuck_patterns: with a reading in it that a stuck taxel sends again, but that was lost when it sent it first.
+        records: records of scans.
+        patterns: records with a pattern.
+        whole_patterns: patterns from sixteen readings of one press, all of them sent as they are.
+        told_patterns: patterns from fewer, where the record states which are missing, held, dead or not renewed.
+        false_patterns: patterns that are neither; the reason and the record of each.
+        flipped_patterns: patterns with a reading that a flipped digit changed, which no reader can detect.
+        stuck_patterns: patterns with a reading that a stuck taxel sends again, but that was lost when it sent it first.
         whole: records of scans without a missing taxel.
-        mixed: of these, with readings of two cycles; which they are, and of which record.
-        flipped_whole: whole ones with a changed digit, judged by their other readings alone.
-        stuck_whole: the same with a reading that a stuck taxel sent more than once.
-        unstamped: whole ones without a time stamp of the adapter, by which a gap that was read late is seen.
-        unstamped_mixed: of these, with readings of two cycles; not among `mixed`.
+        mixed: whole records with readings of two cycles; the cycles and the record of each.
+        flipped_whole: whole records with a changed digit, evaluated by their other readings alone.
+        stuck_whole: whole records with a reading that a stuck taxel sent more than once.
+        unstamped: whole records without a time stamp of the adapter, which would show a gap that was read late.
+        unstamped_mixed: unstamped records with readings of two cycles; not among `mixed`.
         made_up: readings in records that were never sent, or sent before one that was shown already.
         shown: readings in records.
         unshown: readings handed on that are in no record, by sensor; open ones at the end are not among them.
         open_at_end: readings handed on after the last record.
-        missing: taxels that records say did not come.
-        spread_ms: of each pattern's fresh readings, from the first on the bus to the last, in [ms].
-        held_ms: how old held readings were, when a pattern was made of them, in [ms].
-        arrivals: of records with a fresh reading: when the newest one was handed on, and when the record says that it
-            arrived, in [ns].
-        latencies: of patterns: when the scan's last frame was handed on, in [ns]; and how much later its record was
-            read, in [us].
-        first_us, last_us: of each sensor, when the first and the last reading shown were on the bus, in [us].
-        last_counters: in the last record.
+        missing: taxels that records report as missing.
+        spread_ms: time from the first to the last of each pattern's fresh readings on the bus, in [ms].
+        held_ms: ages of held readings when a pattern was made of them, in [ms].
+        arrivals: times of records with a fresh reading: when the newest one was handed on, and its time of arrival by
+            the record, in [ns].
+        latencies: for each pattern, when the scan's last frame was handed on, in [ns], and how much later its record
+            was read, in [us].
+        first_us, last_us: times of the first and the last reading shown of each sensor on the bus, in [us].
+        last_counters: counters in the last record.
     """
 
     records: int = 0
@@ -79,7 +79,7 @@ class Found:
 
 
 def judge(seen: Sequence[Seen], told: Told) -> Found:
-    """What the records are worth, held against the truth."""
+    """Evaluate the records against the truth."""
     taxels = handed_on(told)
     found = Found()
     for one in seen:
@@ -172,7 +172,7 @@ def _count_cycles(one: Seen, shown: Mapping[int, SentTaxel], found: Found) -> No
 def _held(
     one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], newest_us: int, newest_ns: int, found: Found
 ) -> list[str]:
-    """What is wrong with readings that a pattern was made from although they did not come with its scan."""
+    """Return what is wrong with readings that a pattern was made from although they did not come with its scan."""
     trouble: list[str] = []
     for taxel in range(16):
         if one.head["fresh"] >> taxel & 1 or str(taxel) in one.head["dead"]:

@@ -1,4 +1,4 @@
-"""How long a run among faults took to go on after an outage."""
+"""Times that a run among faults took to go on after an outage."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -17,11 +17,11 @@ LONGEST_BACK_S: Final = 1.0
 
 
 def seconds_to_use(found: Found, told: Told, names: Sequence[str]) -> list[float]:
-    """From the end of each outage of these names to the first record of what came after it, in [s].
+    """Return the time from the end of each outage of these names to the first record of what came after it, in [s].
 
-    An adapter's reset is over at once. Where no record came any more it is inf. Left out are outages that did not end,
-    and those that another overlaps, or follows before the first record and before LONGEST_BACK_S are over; but where no
-    record came any more, only one that did not end either excuses it.
+    An adapter's reset is over at once. The time is inf where no further record came. Outages that did not end are left
+    out, and so are those that another one overlaps or follows before the first record and before LONGEST_BACK_S are
+    over; but where no further record came, only another outage that did not end excuses it.
     """
     outages = list(_outages(told))
     handed_ns, arrived_ns = np.array(found.arrivals, dtype=np.int64).reshape(-1, 2).T
@@ -40,7 +40,7 @@ def seconds_to_use(found: Found, told: Told, names: Sequence[str]) -> list[float
 
 
 def _outages(told: Told) -> Iterator[tuple[str, int, int]]:
-    """Stretches in which nothing comes from any sensor: which, from when, until when, in [ns]; NEVER_NS if no end."""
+    """Yield stretches without data of any sensor: name, begin and end in [ns]; NEVER_NS without an end."""
     begun: dict[str, tuple[str, int]] = {}
     for event in told.events:
         if event["fault"] not in OUTAGES and not event["stretch"].startswith("vanished=1@"):

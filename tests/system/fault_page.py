@@ -1,4 +1,4 @@
-"""What a run among faults showed, as a page."""
+"""Page about a run among faults: promises, accounts, losses and latencies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
 EXIT_SINK: Final = 5
 MEMORY_MB_PER_MINUTE: Final = 0.2
 FEWEST_SIZES: Final = 60
-"""A minute's: in less, what a start allocates is not told from growth."""
+"""Sizes of a minute: in less time, allocations of the start look like growth."""
 SINKS_GIVEN_UP: Final = 4
 _GIVEN_UP: Final = "the other sinks go on"
-"""As stderr says of each; a record of it may be left out where its reader is slow."""
+"""Words on stderr about each sink given up; a record of it may be left out where its reader is slow."""
 
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """What was promised and what was seen."""
+    """Promise of the program, and what the run showed of it."""
 
     text: str
     seen: str
@@ -36,7 +36,7 @@ class Promise:
 
 
 def promises(ran: Ran, found: Found, told: Told) -> list[Promise]:
-    """All of them, in order of weight."""
+    """Return all promises, in order of weight."""
     books = accounts(found, told, ran.said)
     wrong = [book.name for book in books if book.verdict == DIFFERENT]
     back_s = seconds_to_use(found, told, LINK_FAULTS)
@@ -94,7 +94,7 @@ def promises(ran: Ran, found: Found, told: Told) -> list[Promise]:
 
 
 def show(ran: Ran, found: Found, told: Told, say: Callable[[str], object]) -> bool:
-    """Show all there is to show; whether every promise was kept."""
+    """Show the whole run; return True where every promise was kept."""
     kept = promises(ran, found, told)
     say("\n## Promises\n\n" + head(("promise", "seen", "kept")))
     for promise in kept:
@@ -117,7 +117,7 @@ def show(ran: Ran, found: Found, told: Told, say: Callable[[str], object]) -> bo
 
 
 def show_server(ran: ServerRan, found: ServerFound, say: Callable[[str], object]) -> bool:
-    """Show how it went with the server; whether every promise was kept."""
+    """Show the run against the server; return True where every promise was kept."""
     kept = [
         Promise("the process ends well", f"exit code {ran.exit_code}", ran.exit_code == 0),
         Promise(
@@ -179,7 +179,7 @@ def _faults(found: Found, told: Told) -> list[tuple[str, ...]]:
 
 
 def _book_line(book: Account) -> str:
-    return line((book.name, str(book.told), str(book.counted), book.tolerance, book.verdict))
+    return line((book.name, str(book.injected), str(book.counted), book.tolerance, book.verdict))
 
 
 def _agreement(books: Sequence[Account]) -> str:
@@ -200,7 +200,7 @@ def _losses(found: Found, told: Told) -> str:
 
 
 def vanished_scans(found: Found, told: Told) -> int:
-    """Cycles of all sensors from their first record to the last, less the records."""
+    """Return the cycles of all sensors from their first record to the last, less the records."""
     total = 0
     for sensor in found.first_us:
         inside = (told.frames["bus_us"] >= found.first_us[sensor]) & (told.frames["bus_us"] <= found.last_us[sensor])
@@ -218,7 +218,7 @@ def _latencies(found: Found, told: Told) -> list[tuple[str, list[float]]]:
 
 
 def _steps_back(ran: Ran) -> int:
-    """Records that are older than the one before of their sensor."""
+    """Return the number of records that are older than the one before of their sensor."""
     newest_ns: dict[str, int] = {}
     back = 0
     for one in ran.seen:

@@ -1,4 +1,4 @@
-"""What two fingers send in a run among faults: readings that each tell when they were taken."""
+"""Scans that two fingers send in a run among faults: each reading encodes when it was taken."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,11 +12,11 @@ from edge.bench.program import CONTROLLERS, PRESS_COUNTS, REST_COUNTS, emulating
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 
 TELLING: Final = 70
-"""Steps of x, and of y: a reading tells its cycle of TELLING**2, 49 s at 100 Hz."""
+"""Steps of x, and of y: a reading encodes its cycle modulo TELLING**2, 49 s at 100 Hz."""
 
 
 def telling_counts(sensor: int) -> NDArray[np.int32]:
-    """Scans (n, 3, 4, 4) of a pad pressed every other 2.5 s; each reading tells its cycle by x and y."""
+    """Return scans (n, 3, 4, 4) of a pad pressed every other 2.5 s; x and y of each reading encode its cycle."""
     cycles = np.arange(TELLING**2)
     taxels = np.arange(16).reshape(4, 4)
     counts = np.asarray(REST_COUNTS)[None, :, None, None] + np.zeros((len(cycles), 3, 4, 4), dtype=int)
@@ -33,7 +33,7 @@ def telling_counts(sensor: int) -> NDArray[np.int32]:
 
 @contextmanager
 def playing_emulator(folder: Path, faults: str, seed: int) -> Iterator[str]:
-    """An emulator that plays them over and over; its port, and in folder/truth what it knows."""
+    """Yield the port of an emulator that plays them over and over, and logs the truth in folder/truth."""
     files: list[str] = []
     for sensor, name in enumerate(CONTROLLERS):
         counts = telling_counts(sensor)

@@ -1,4 +1,4 @@
-"""What a run among faults leaves: the records as they were read, and how they are fetched."""
+"""Records of a run among faults as they were read, and how they are fetched."""
 
 import os
 import threading
@@ -32,7 +32,7 @@ class Seen(NamedTuple):
 
 
 class Size(NamedTuple):
-    """What the program holds at a time, in [s] since it was started."""
+    """Memory, threads and descriptors of the program at a time, in [s] since it was started."""
 
     time_s: float
     resident_mb: float
@@ -42,18 +42,18 @@ class Size(NamedTuple):
 
 @dataclass
 class Ran:
-    """What a run left.
+    """Outcome of a run.
 
     Attributes:
-        exit_code: of edge-sr.
-        said: on stderr.
+        exit_code: exit code of edge-sr.
+        said: text on stderr.
         seen: its records, in order.
         sizes: its memory, threads and descriptors, now and then.
         told: the injector's truth.
-        slow: records that a consumer got which did not read for a while.
-        unwritten: records that were left out for it, as the last it got says.
-        broken: what sinks left that could not go on, or consumers got, and is not whole records; nothing is expected.
-        clock_steps_s: by how much the age of a baseline jumped from one record to the next, in [s].
+        slow: number of records that a consumer received which did not read for a while.
+        unwritten: number of records that were left out for it, by the last that it received.
+        broken: output of failed sinks, or to consumers, that is not whole records; empty is expected.
+        clock_steps_s: steps by which the age of a baseline jumped from one record to the next, in [s].
     """
 
     exit_code: int = -1
@@ -68,7 +68,7 @@ class Ran:
 
 
 def in_thread(work: Any, *arguments: Any) -> threading.Thread:
-    """Begin something beside."""
+    """Start work in a thread of its own."""
     thread = threading.Thread(target=work, args=arguments, daemon=True)
     thread.start()
     return thread
@@ -95,7 +95,7 @@ def _parse_records(fetched: "SimpleQueue[tuple[bytes, int]]", seen: list[Seen]) 
 
 
 def read_record(line: bytes, read_ns: int) -> Seen:
-    """A line of records."""
+    """Decode a line of records."""
     head = orjson.loads(line)
     counts, drawn = head.pop("counts", None), head.pop("pattern", None) is not None
     head.pop("deviation", None)

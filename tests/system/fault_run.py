@@ -1,4 +1,4 @@
-"""`edge-sr` among faults: two fingers on one bus, sinks and consumers that fail, everything kept for the judge."""
+"""`edge-sr` among faults: two fingers on one bus, sinks and consumers that fail, everything kept for evaluation."""
 
 import os
 import signal
@@ -24,10 +24,10 @@ from firmware_bridge.emulation.faults.stretches import parse_stretches
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 CALM_S: Final = 4.0
-"""Before the first fault: what a run without faults is like."""
+"""Time before the first fault, which shows a run without faults."""
 WATCH_S: Final = 1.0
 QUIET_S: Final = 0.4
-"""Without a record, so that everything is read."""
+"""Time without a record after which everything has been read."""
 END_TIMEOUT_S: Final = 20.0
 CLOCK_STEP_S: Final = 3600.0
 _CLOCK: Final = f"""
@@ -42,13 +42,13 @@ time.time = _stepping
 
 
 def run_among_faults(faults: str, seed: int, folder: Path, *, options: Sequence[str] = ()) -> Ran:
-    """Run the program and keep all there is to judge it by.
+    """Run the program and keep all that its evaluation needs.
 
     Args:
-        faults: as the emulator takes them; when the last has begun, and silenced all, the program is ended.
-        seed: of faults.
-        folder: for everything that is written.
-        options: more of edge-sr's.
+        faults: faults as the emulator takes them; the program is ended when the last one has begun and silenced all.
+        seed: seed of the faults.
+        folder: folder for everything that is written.
+        options: further options of edge-sr.
 
     Raises:
         BenchError: the emulator or edge-sr did not start.
@@ -78,7 +78,7 @@ def run_among_faults(faults: str, seed: int, folder: Path, *, options: Sequence[
 
 
 def _clock_steps_s(seen: Sequence[Seen]) -> list[float]:
-    taken_s = [  # by the wall clock: what the record says of the age, less the time by the clock that is not stepped
+    taken_s = [  # by the wall clock: the age in the record, less the time by the clock that is not stepped
         one.head["baseline_age_s"] - one.head["time_ns"] / 1e9
         for one in seen
         if one.head.get("baseline_age_s") is not None

@@ -1,4 +1,4 @@
-"""What each taxel sent that reached the reader of a run among faults, by the injector's truth."""
+"""Readings of each taxel that reached the reader of a run among faults, by the injector's truth."""
 
 from bisect import bisect_left
 from collections import defaultdict
@@ -25,7 +25,7 @@ class SentTaxel:
     """
 
     def __init__(self) -> None:
-        """Begin without any."""
+        """Begin without readings."""
         self.rows: list[tuple[int, int, int]] = []
         self._cycles: list[int] = []
         self._readings: list[tuple[int, int, int]] = []
@@ -50,22 +50,22 @@ class SentTaxel:
         return True
 
     def catch_up(self, bus_us: int) -> None:
-        """A stuck taxel's readings are all alike, and one that an outage swallowed is not told from the next.
+        """Skip readings of a stuck taxel that are alike, since one that an outage lost looks like the next.
 
         Args:
-            bus_us: go on, as far as it sent the same again, to the first that was not on the bus before, in [us].
+            bus_us: time up to which equal readings are skipped: the next one was not on the bus before, in [us].
         """
         while self.rows[self.shown][1] < bus_us and self._sent_again:
             self.shown, self.next = self.next, self.next + 1
 
     @property
     def flipped(self) -> bool:
-        """A digit was changed of what is shown, so that it may read as another cycle's."""
+        """True where a digit of the shown reading was changed, so that it may look like another cycle's."""
         return self.rows[self.shown][0] == FLIPPED
 
     @property
     def stuck(self) -> bool:
-        """It sent what is shown in more than one cycle, so that which one's it is cannot be known."""
+        """True where the taxel sent the shown reading in more than one cycle, so that its cycle is unknown."""
         if self.rows[self.shown][0] == STUCK:
             return True
         # A stuck frame may have been repeated or held back as well, and then that is its fate.
@@ -75,7 +75,7 @@ class SentTaxel:
 
     @property
     def cycle(self) -> int | None:
-        """Number of the sensor's cycle that is shown; None where that cannot be known."""
+        """Number of the sensor's cycle that is shown; None where it is unknown."""
         return None if self.flipped or self.stuck else self._cycles[self.shown]
 
     @property

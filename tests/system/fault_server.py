@@ -1,4 +1,4 @@
-"""`edge-sr` reads a server that is killed, frozen and talks nonsense; every record is held against what it played."""
+"""`edge-sr` reads a server that is killed, frozen and sends garbage; every record is compared with what it played."""
 
 import random
 import signal
@@ -22,19 +22,19 @@ SENSOR: Final = "1"
 RATE_HZ: Final = 100.0
 GARBAGE_EVERY: Final = 50
 MOST_CYCLES: Final = 10
-"""By which the taxels of a pattern may be apart: 100 ms, as on the wire."""
+"""Cycles by which the taxels of a pattern may be apart: 100 ms, as on the wire."""
 
 
 @dataclass
 class ServerRan:
-    """What a run against a failing server left.
+    """Outcome of a run against a failing server.
 
     Attributes:
-        exit_code: of edge-sr.
-        said: on stderr.
+        exit_code: exit code of edge-sr.
+        said: text on stderr.
         seen: its records.
         down: when the server was away or hung, from and until, in [ns], and which of both.
-        told_ns: when each cycle, by its number modulo TELLING**2, was first told of, in [ns].
+        told_ns: when each cycle, by its number modulo TELLING**2, was first sent, in [ns].
     """
 
     exit_code: int = -1
@@ -46,14 +46,14 @@ class ServerRan:
 
 @dataclass
 class ServerFound:
-    """What its records are worth.
+    """Evaluated records of such a run.
 
     Attributes:
-        records: of scans.
-        patterns: of these, with a pattern.
-        made_up: readings that the server never told of.
-        apart: patterns whose taxels lie more than MOST_CYCLES apart, and the record does not say so.
-        back_s: from the server's coming back to the first record, in [s].
+        records: records of scans.
+        patterns: records with a pattern.
+        made_up: readings that the server never sent.
+        apart: patterns whose taxels lie more than MOST_CYCLES apart although the record does not state it.
+        back_s: time from the server's return to the first record, in [s].
     """
 
     records: int = 0
@@ -69,10 +69,10 @@ def run_against_server(seconds: float, seed: int, folder: Path) -> ServerRan:
     from firmware_bridge.emulation.xela_server_model import VendorServer
 
     class Telling(VendorServer):
-        """Keeps when it first said what."""
+        """Server that keeps when it first sent each cycle."""
 
         def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
-            """What it says, on the way."""
+            """Note the cycles of a message, and pass it on."""
             ran.told_ns.setdefault(self.cycle(0, elapsed_s) % TELLING**2, time.monotonic_ns())
             return super().message(sequence, elapsed_s, unix_s)
 
@@ -117,7 +117,7 @@ def run_against_server(seconds: float, seed: int, folder: Path) -> ServerRan:
 
 
 def judge_server(ran: ServerRan) -> ServerFound:
-    """What the records are worth."""
+    """Evaluate the records."""
     found = ServerFound()
     played = telling_counts(0).reshape(-1, 3, 16).transpose(0, 2, 1)
     places = [{tuple(reading): cycle for cycle, reading in enumerate(played[:, taxel].tolist())} for taxel in range(16)]

@@ -18,7 +18,7 @@ SLOW_AFTER_S: Final = 3.0
 SLOW_FOR_S: Final = 4.0
 GONE_AFTER_S: Final = 6.0
 ROOM_BYTES: Final = 6_000_000
-"""Of the file system that fills: a few hundred records."""
+"""Size of the file system that fills: a few hundred records."""
 _PERIOD_S: Final = 20.0
 
 
@@ -61,7 +61,7 @@ def read_and_go(path: Path) -> None:
 
 
 def look_into_files(folder: Path, ran: Ran) -> None:
-    """What failing sinks left: whole records, the last of them perhaps cut off."""
+    """Read what failing sinks left: whole records, the last of them perhaps cut off."""
     lines = (folder / "full.jsonl").read_bytes().split(b"\n")
     numbers: dict[str, int] = {}
     for at, line in enumerate(lines[:-1]):

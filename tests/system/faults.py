@@ -1,4 +1,4 @@
-"""`edge-sr` among all faults for minutes, held against what the injector knows.
+"""`edge-sr` among all faults for minutes, evaluated against the truth of the injector.
 
     python tests/system/faults.py MINUTES --seed N [--out DIR]
 
@@ -34,7 +34,7 @@ grow to 6 MB. The wall clock of edge-sr's Python is stepped an hour on and two b
 
 
 def schedule(seconds: float) -> str:
-    """Faults for a run of so long: calm, then the mixture, then a pause and whole scans, so that accounts close."""
+    """Return faults for a run of so long: calm, the mixture, then a pause and whole scans, so that accounts close."""
     end_s = seconds - SETTLE_S
     pause, rest = f"vanished=1@{end_s:.2f}+.3", f"vanished=1@{end_s + 1:.2f}+60"
     return f"mixed@{CALM_S}+{end_s - CALM_S:.2f},{pause},{rest}"

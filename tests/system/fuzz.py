@@ -32,7 +32,7 @@ TOKENS = (
 
 
 def mutants(seeds: list[bytes], longest: int, seed: int) -> Iterator[bytes]:
-    """Seeds changed in one to eight places, without end."""
+    """Yield seeds changed in one to eight places, without end."""
     rng = np.random.default_rng(seed)
     while True:
         data = bytearray(seeds[rng.integers(len(seeds))])
@@ -54,7 +54,7 @@ def mutants(seeds: list[bytes], longest: int, seed: int) -> Iterator[bytes]:
 
 
 def run_blind(name: str, inputs: int, seed: int) -> dict[str, object]:
-    """So many mutants; raises what the first one raises that breaks a promise."""
+    """Run so many mutants; raise the error of the first one that breaks a promise."""
     from fuzz_targets import TARGETS
 
     warnings.simplefilter("error")
@@ -70,7 +70,7 @@ def run_blind(name: str, inputs: int, seed: int) -> dict[str, object]:
 
 
 def run_guided(name: str, inputs: int, seed: int, folder: Path, most_s: int) -> dict[str, object]:
-    """The same in a process of its own, under atheris."""
+    """Run mutants in a process of its own, under atheris."""
     corpus = folder / name.replace(" ", "-")
     corpus.mkdir(parents=True, exist_ok=True)
     limits = {"timeout": INPUT_LIMIT_S, "rss_limit_mb": MEMORY_LIMIT_MB, "artifact_prefix": f"{corpus}-"}
@@ -93,7 +93,7 @@ def run_guided(name: str, inputs: int, seed: int, folder: Path, most_s: int) -> 
 
 
 def child(name: str, options: list[str]) -> None:
-    """What atheris runs: the parsers' own code is instrumented, that of libraries is not."""
+    """Run atheris: the parsers' own code is instrumented, that of libraries is not."""
     import atheris
 
     with atheris.instrument_imports(include=PACKAGES):
@@ -109,7 +109,7 @@ def child(name: str, options: list[str]) -> None:
 
 
 def page(rows: list[dict[str, object]], seed: int) -> str:
-    """Figures as a page."""
+    """Return the figures as a page."""
     from edge.bench.provenance import provenance
 
     columns = list(rows[0])

@@ -1,6 +1,6 @@
-"""How much of a recording `kill -9` costs: `python tests/system/kill_loss.py [RUNS]`; what docs/recordings.md tells.
+"""Loss of a recording by `kill -9`, for docs/recordings.md: `python tests/system/kill_loss.py [RUNS]`.
 
-Beside the recording goes `jsonl:`, which writes each record at once: what it has and the file has not was lost.
+The sink `jsonl:` writes each record at once: records that it has and the recording has not were lost.
 """
 
 import json

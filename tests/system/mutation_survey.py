@@ -64,7 +64,7 @@ class Subject:
 
 
 SUBJECTS = {
-    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
+    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py", "tests/bridge/test_slcan_damage.py")),
     "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
     "assembler": Subject(
         "firmware_bridge.scans.scan_assembler",
@@ -109,7 +109,7 @@ EQUIVALENT: dict[str, dict[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What became of one module's mutants."""
+    """Outcome of one module's mutants."""
 
     subject: str
     possible: int
@@ -124,7 +124,7 @@ class Score:
 
 
 class _InPlaceOf(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Import a module with other code than its file's."""
+    """Importer of a module with other code than its file's."""
 
     def __init__(self, subject: Subject, code: CodeType) -> None:
         self._subject, self._code = subject, code
@@ -144,7 +144,7 @@ class _InPlaceOf(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def passes(subject: Subject, code: CodeType, limit_s: int) -> tuple[bool, float]:
-    """Whether the module's tests pass with this code in so much processor time, and how much they took in [s]."""
+    """Return if the module's tests pass with this code in so much processor time, and the time they took in [s]."""
     gc.freeze()
     child = os.fork()
     if child == 0:

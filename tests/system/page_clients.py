@@ -26,7 +26,7 @@ from edge.terminal.argument_types import whole
 
 WARM_UP_S: Final = 20.0
 SETTLE_S: Final = 12.0
-"""As long as the server may take to tidy up."""
+"""Time that the server may take to tidy up."""
 TOGETHER: Final = 4
 TIMEOUT_S: Final = 60.0
 PLAY: Final = Play(pressed=500, moving=True)
@@ -46,7 +46,7 @@ _AT_ONCE: Final = 100
 
 
 def _connect(connection: socket.socket, left: int) -> int:
-    """Say nothing, and go when the server has seen that."""
+    """Send nothing, and go when the server has noticed it."""
     connection.shutdown(socket.SHUT_WR)
     connection.recv(1)
     return 1
@@ -61,7 +61,7 @@ def _get(connection: socket.socket, left: int) -> int:
 
 
 def _handshake(connection: socket.socket, left: int) -> int:
-    """Ask for what is refused, of as many kinds."""
+    """Ask for handshakes of all kinds that are refused."""
     with contextlib.suppress(ConnectionError):
         connection.sendall(_REFUSED[left % len(_REFUSED)])
         while connection.recv(1 << 16):
@@ -105,7 +105,7 @@ def _crowd(port: int, kind: str, count: int) -> None:
 
 
 def _measured(program: Program, port: int, kind: str, count: int) -> tuple[str, ...]:
-    """A row: what one kind of client leaves."""
+    """Return a row: the memory that one kind of client leaves."""
     before_mb, begun_s = program.resident_mb(), time.monotonic()
     with ThreadPoolExecutor(TOGETHER) as executor:
         crowds = [executor.submit(_crowd, port, kind, count // TOGETHER) for _ in range(TOGETHER)]

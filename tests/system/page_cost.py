@@ -1,9 +1,9 @@
-"""What the live page costs the loop: the whole program with nobody, one and three who look, in turn.
+"""Cost of the live page to the loop: the whole program without, with one and with three viewers, in turn.
 
     python tests/system/page_cost.py [--rounds 5] [--seconds 10]
 
 Every scan is in contact and new, so that every scan takes an inference. In each round one program runs without a page,
-and one with it, on which viewers come and go; ratios are to the first, of blocks measured beside each other.
+and one with it, on which viewers come and go; ratios are to the first, of blocks measured next to each other.
 """
 
 import argparse
@@ -37,7 +37,7 @@ _LOOK: Final = "--look"
 
 @dataclass
 class Blocks:
-    """What was measured with as many viewers.
+    """Measurements with one number of viewers.
 
     Attributes:
         p50_us: medians of latencies, from a scan's last byte to its pattern, one a block, in [us].
@@ -68,7 +68,7 @@ class Blocks:
 
 
 def measured(rounds: int, seconds: float) -> dict[str, Blocks]:
-    """Blocks by who looked."""
+    """Return the blocks by number of viewers."""
     names = [WITHOUT, *map(_name, VIEWERS)]
     blocks = {name: Blocks() for name in names}
     with Progress("the live page", rounds * len(names), "block") as bar:
@@ -87,7 +87,7 @@ def measured(rounds: int, seconds: float) -> dict[str, Blocks]:
 
 
 def table(blocks: dict[str, Blocks]) -> str:
-    """Medians of blocks, and ratios to no page with 95 % intervals."""
+    """Return medians of blocks, and ratios to no page with 95 % intervals."""
     lines = [
         "| page | latency p50 us | p99 us | run time p50 us | CPU % | late | frames /s | p50, ratio | p99, ratio |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -122,14 +122,14 @@ def _running(*options: str) -> Iterator[Program]:
 
 
 def free_port() -> int:
-    """A port that nobody listens at."""
+    """Return a port without a listener."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         return free.getsockname()[1]
 
 
 @contextlib.contextmanager
 def _looking(port: int, viewers: int, block: Blocks, seconds: float) -> Iterator[None]:
-    """Viewers in a process of their own, for as long as this lasts."""
+    """Run viewers in a process of their own for the length of the block."""
     if not viewers:
         yield
         return

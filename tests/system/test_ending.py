@@ -89,7 +89,7 @@ with stop_on_signals() as stop:
 
 @contextmanager
 def running(*command, **settings):
-    """A process that hears signals as from a terminal."""
+    """Yield a process that receives signals as from a terminal."""
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | settings
     with subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes) as process:
         try:
@@ -110,7 +110,7 @@ def page_port(process):
 
 
 def end(process, number):
-    """Ask it to end; returns its exit code and its last words."""
+    """Ask it to end; return its exit code and its last lines."""
     process.send_signal(number)
     words = process.communicate(timeout=LONG_S)[1]
     return process.returncode, words.decode()

@@ -1,7 +1,7 @@
-"""The whole program for a minute, or EDGE_SOAK_MINUTES; `make test` runs it beside the other tests.
+"""Whole program for a minute, or EDGE_SOAK_MINUTES; `make test` runs it next to the other tests.
 
-So nothing is asserted that these can do to it: no time, and of latency only that its quiet quarter has not grown beyond
-what they may take.
+Therefore nothing is asserted that these can do to it: no time, and of latency only that its quiet quarter has not
+grown beyond what they may take.
 """
 
 import json

@@ -17,7 +17,7 @@ NOT_IN_THE_RUNTIME = {"torch", "onnx", "onnxscript", "trimesh", "scipy", "shapel
 
 @pytest.fixture(scope="module")
 def fresh(tmp_path_factory):
-    """bin folder of a new environment with the wheel and what it asks for."""
+    """Folder bin of a new environment with the wheel and its dependencies."""
     folder = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     environment = {"PIP_CONSTRAINT": str(ROOT / "constraints.txt")}

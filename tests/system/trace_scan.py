@@ -4,7 +4,7 @@
 
 An emulated adapter, in a process of its own, plays a press that goes on; `edge-sr` runs in this one, with Python's
 profiling hook in every thread. A call is one that enters a function, a generator or a comprehension of the project; of
-scans that got a pattern, and of what the reader did between two of them, the median is told.
+scans that got a pattern, and of what the reader did between two of them, the median is printed.
 """
 
 import os
@@ -81,7 +81,7 @@ def _name(code: Any) -> str:
 
 @contextmanager
 def emulated(recording: Path) -> Iterator[str]:
-    """An emulated adapter in a process of its own that plays this; gives its port."""
+    """Yield the port of an emulated adapter that plays this in a process of its own."""
     command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop"]
     command += ["--rate-hz", f"{RATE_HZ:g}", "--jitter-ms", "0", str(recording)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
@@ -92,7 +92,7 @@ def emulated(recording: Path) -> Iterator[str]:
 
 
 def write_press(path: Path) -> Path:
-    """A recording of a free pad, then of a press that never holds still, as a CSV."""
+    """Write a recording of a free pad, then of a press that never holds still, as a CSV."""
     noise = np.random.default_rng(0)
     counts = np.full((REST_SCANS + PRESS_SCANS, 16, 3), (16_000, 16_400, 38_600))
     counts[:, :, 2] += np.arange(16) * 37
@@ -125,7 +125,7 @@ def trace_run(links: int = 1) -> Trace:
 
 
 def threads_of(links: int) -> list[str]:
-    """Names of the threads of a source of so many emulated adapters, that of its user included."""
+    """Return the names of the threads of a source of so many emulated adapters, that of its user included."""
     before = set(threading.enumerate()) - {threading.current_thread()}
     with ExitStack() as closing:
         folder = Path(closing.enter_context(tempfile.TemporaryDirectory()))
@@ -139,7 +139,7 @@ def threads_of(links: int) -> list[str]:
 
 
 def _median(calls: Sequence[Counter[str]]) -> Counter[str]:
-    """The calls of the scan that had the median number of them."""
+    """Return the calls of the scan that had the median number of them."""
     middle = statistics.median_low(one.total() for one in calls)
     return next(one for one in calls if one.total() == middle)
 

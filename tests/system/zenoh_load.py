@@ -49,7 +49,7 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 PERIOD_NS: Final = 10_000_000
 APART_SCANS: Final = 97
-"""By which each sensor is ahead of the one before it in the same stream."""
+"""Scans by which each sensor is ahead of the one before it in the same stream."""
 SETTLE_S: Final = 1.0
 PATIENCE_S: Final = 60.0
 KEY: Final = "bench"
@@ -79,10 +79,10 @@ brackets; CPU in % of one core."""
 
 
 class PacedLink(Link):
-    """Gives a scan of each of its sensors every 10 ms, taken from a stream in a circle."""
+    """Link with a scan of each of its sensors every 10 ms, taken from a stream in a circle."""
 
     def __init__(self, scans: Sequence[Scan], sensors: Sequence[str], ticks: int) -> None:
-        """Begin when it is first read; each sensor is elsewhere in the stream."""
+        """Set up the link; it begins at its first read, and each sensor is elsewhere in the stream."""
         self.name, self.kind, self.ended = "bench", "emulated", False
         self._scans, self._sensors, self._ticks = scans, sensors, ticks
         self._tick = 0
@@ -95,7 +95,7 @@ class PacedLink(Link):
         pass
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """The next tick's."""
+        """Return the scans of the next tick."""
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns()
         due_ns = self._start_ns + self._tick * PERIOD_NS
@@ -112,12 +112,12 @@ class PacedLink(Link):
         return given
 
     def counters(self) -> dict[str, int]:
-        """How many were given."""
+        """Return the number of scans."""
         return {"scans": self._tick * len(self._sensors)}
 
 
 def write(pipe: Connection, setup: str, endpoint: str, sensors: list[str], ticks: int) -> None:
-    """A process that writes; says when it is ready, waits for a word, and tells what it wrote."""
+    """Write in a process of its own: report when it is ready, wait for a word, and report what was written."""
     model = ModelSession(find_model(DEFAULT_MODEL))
     scans, _ = stream(load_frozen_set(FROZEN_FILE), 1)
     rest, now_s = REST.astype(np.float32), time.time()
@@ -159,7 +159,7 @@ def _paced(made: Sequence[Result], sensors: Sequence[str], ticks: int) -> Iterat
 
 
 def consume(pipe: Connection, endpoint: str) -> None:
-    """A process that reads everything; tells what came when it is asked."""
+    """Read everything in a process of its own, and report what came on demand."""
     import zenoh
 
     config = zenoh.Config()
@@ -186,7 +186,7 @@ def consume(pipe: Connection, endpoint: str) -> None:
 
 
 def run(setup: str, sensors: int, processes: int, seconds: float) -> tuple[float, ...]:
-    """Measure once; figures in the order of the table.
+    """Measure once, and return the figures in the order of the table.
 
     Raises:
         BenchError: a process ended before its time.
@@ -227,7 +227,7 @@ def run(setup: str, sensors: int, processes: int, seconds: float) -> tuple[float
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """A process that begins now never hears Ctrl-C: it ends when it is told to, or killed."""
+    """Hold Ctrl-C back from processes that begin now; they end on a command, or when they are killed."""
     resource_tracker.ensure_running()  # where the first process starts it, it lets signals through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -284,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = " ".join(f"--{name} {asked[name]:g}" for name in ("sensors", "processes", "seconds", "runs"))
     try:
         zenoh_version = version("eclipse-zenoh")
-        if options.out is not None:  # found out before minutes are spent
+        if options.out is not None:  # detected before minutes are spent
             options.out.mkdir(parents=True, exist_ok=True)
         command = f"python tests/system/zenoh_load.py {command}"
         made = provenance(command, [__file__], [find_model(DEFAULT_MODEL), FROZEN_FILE])

@@ -28,7 +28,7 @@ def test_a_batch_follows_from_its_number_alone(data):
 
 
 def test_an_epoch_takes_every_sequence_once(data):
-    """Truth tells the sequence: unit patterns of the epoch's batches are those of the data, each once."""
+    """Truth identifies the sequence: unit patterns of the epoch's batches are those of the data, each once."""
     batches = WindowBatches(data, CLEAN, (1.0,), 8, seed=1)
     for first in (0, 3):
         drawn = torch.cat([batches(number).pattern for number in range(first, first + 3)]).numpy()

@@ -9,7 +9,7 @@ LEVELS = [0.1, 0.5, 0.8, 0.9, 0.99]
 
 
 def laplace(seed=0, shape=(60, 40, 40)):
-    """Patterns with errors whose standard deviation is known: half of the pixels are four times as far off."""
+    """Return patterns with errors of a given standard deviation: half of the pixels are four times as far off."""
     rng = np.random.default_rng(seed)
     truth = rng.uniform(0, 0.5, shape)
     deviation = np.where(rng.random(shape) < 0.5, 0.01, 0.04)

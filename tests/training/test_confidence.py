@@ -1,4 +1,4 @@
-"""What a pattern's doubt says of its error, and the table that says it."""
+"""Error of a pattern by its doubt, and the table of both."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_other_values_are_no_table(value):
 
 
 class Oracle:
-    """Gives a truth that is off by a share that its deviation tells, less with each tap."""
+    """Model of a truth that is off by a share equal to its deviation, less with each tap."""
 
     name, contract = "oracle", make_contract(taps=2, interval_factor=1.6, counts_per_unit=(1.0, 1.0, 1.0))
 
@@ -97,7 +97,7 @@ def test_the_table_finds_error_and_gain_by_doubt():
 
 
 def expected_and_true(path, test_set):
-    """RMS errors (n,) that a bundled model's table tells and that it makes, with one tap."""
+    """Return RMS errors (n,) by a bundled model's table and its true ones, with one tap."""
     session = ModelSession(path)
     about, error, size = doubts_and_errors(session, 1, test_set)
     told = session.contract.confidence["1"]
@@ -106,9 +106,9 @@ def expected_and_true(path, test_set):
 
 @pytest.mark.parametrize("path", bundled_models(), ids=lambda path: path.stem)
 def test_of_the_wide_test_set_the_expected_error_is_near_the_true_one(path):
-    """The table was found on other presses of the wide world; measured 1.05 to 1.09 of the true error, small ones 1.20.
+    """The table is of other presses of the wide world; measured 1.05 to 1.09 of the true error, small ones 1.20.
 
-    By quarters .91 to 1.18, small ones to 1.38; correlation .66 to .72.
+    Quarters have .91 to 1.18, small ones to 1.38; correlation .66 to .72.
     """
     expected, error = expected_and_true(path, load_frozen_presses().as_frozen_set())
     of_all, of_quarter = (0.25, 0.45) if "small" in path.stem else (0.1, 0.25)

@@ -24,7 +24,7 @@ def pad():
 
 @pytest.fixture
 def level(monkeypatch):
-    """Shapes that lie level, so that what is highest of them is known."""
+    """Lay shapes level, so that their highest part is fixed."""
     monkeypatch.setattr(catalogue, "_LEVEL", 1.0)
 
 
@@ -72,7 +72,7 @@ def test_all_families_are_drawn_and_figures_are_half_of_what_is_rigid():
 
 
 def test_a_shape_turns_from_tap_to_tap_as_a_figure_does(pad, level, tmp_path):
-    """A bump beside the pad's centre goes round it: the same way and as far, drawn as a mesh and as a function."""
+    """A bump off the pad's centre goes round it: the same way and as far, drawn as a mesh and as a function."""
     bump = trimesh.creation.icosphere(subdivisions=4, radius=6.0)
     plate = trimesh.creation.box([40, 40, 1])
     bump.apply_translation([3.0, 2.0, 0])
@@ -84,7 +84,7 @@ def test_a_shape_turns_from_tap_to_tap_as_a_figure_does(pad, level, tmp_path):
             places = [highest(pad, heights) for heights in tapped.heights_mm]
             away_mm = [np.hypot(*place) for place in places]
             if min(away_mm) < 3 or max(np.abs(places).ravel()) > 9:
-                continue  # too near to its centre to tell an angle, or beside the pad
+                continue  # too near to its centre for an angle, or outside the pad
             turned = [angle_deg(*place) - angle_deg(*places[0]) for place in places]
             turned = [(turn + 180) % 360 - 180 for turn in turned]
             assert turned == pytest.approx([0, -5, -10], abs=2), family

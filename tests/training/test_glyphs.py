@@ -77,7 +77,7 @@ def test_seeds_and_kinds_differ(drawn):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_seeds_mean_the_same_figures_as_when_models_were_trained(drawn, kind):
-    # Other versions of the libraries may place a round corner's points anew, but not change the figure.
+    # Other versions of the libraries may place a round corner's points elsewhere, but not change the figure.
     known = GLYPHS_MM if kind == "glyph" else POLYGONS_MM
     for seed, (area_mm2, x_mm, y_mm) in enumerate(known):
         centre = drawn[kind][seed].centroid

@@ -62,7 +62,7 @@ def test_under_a_flat_face_pressure_is_even_inside_and_rises_towards_the_edge(pa
 
 
 def test_a_flat_face_on_a_thin_compressible_pad_sinks_as_under_an_even_load():
-    """There depth over the layer's compliance at wave number 0; a pad that keeps its volume gives way to the sides."""
+    """The load is depth over the layer's compliance at wave number 0; incompressible pads give way to the sides."""
     shares = []
     for thickness_mm, poisson in ((3.2, 0.3), (3.6, 0.4), (4.5, 0.45)):
         pad = GrippedPad(replace(NOMINAL, thickness_mm=thickness_mm, poisson=poisson))

@@ -86,7 +86,7 @@ def test_several_psfs_are_nearer_to_the_layer_than_one():
     solver = ContactSolver(Layer(), SIDE, PIXEL_MM)
 
     def errors(name, radius_mm):
-        """Of the tactile PSF, of one plane, and of several, as a share of the indentation."""
+        """Return errors of the tactile PSF, of one plane, and of several, as a share of the indentation."""
         each = []
         for indentation_mm in (0.2, 0.4):
             depth = round_surface(name, radius_mm)[None].astype(np.float32)

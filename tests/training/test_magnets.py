@@ -112,7 +112,7 @@ def test_a_pressed_magnet_talks_across_to_its_neighbours_with_the_dipoles_sign()
     square = rho**2 + d**2
     z_beside = -k * d * (9 * rho**2 - 6 * d**2) / square**3.5
     x_beside = 3 * k * rho * (rho**2 - 4 * d**2) / square**3.5
-    assert slope[5, 2] > 0 > z_beside  # its own chip rises, those beside fall
+    assert slope[5, 2] > 0 > z_beside  # its own chip rises, its neighbours fall
     for right_of, sign in ((6, 1), (4, -1)):
         assert slope[right_of, 2] == pytest.approx(z_beside, rel=1e-3)
         assert slope[right_of, 0] == pytest.approx(sign * x_beside, rel=1e-3)

@@ -169,7 +169,7 @@ def test_slopes_are_finite_and_no_steeper_than_the_error(deviation_mm, error_mm)
 
 
 def test_deviations_learn_where_errors_are():
-    # Two kinds of windows: one tells its pattern, the other leaves a coin to be thrown for a third of the pixels.
+    # Two kinds of windows: one determines its pattern, the other leaves a third of the pixels to chance.
     torch.manual_seed(3)
     generator = torch.Generator().manual_seed(4)
     net, objective = CompactNet(1, 2, 16, 1, group="p1").train(), HeteroscedasticError()

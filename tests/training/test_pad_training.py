@@ -81,7 +81,7 @@ def test_bytes_of_24_taxels_become_a_pattern_that_beats_a_flat_guess(model, unse
     truth = unseen.patterns()[last]
     patterns = np.array([made[tap] for tap in sorted(made)])
     assert patterns.shape == truth.shape == (5, *USPA46.pattern_shape(SCALE)) == (5, 16, 24)
-    flat = np.broadcast_to(truth.mean(axis=(1, 2), keepdims=True), truth.shape)  # even told the right mean
+    flat = np.broadcast_to(truth.mean(axis=(1, 2), keepdims=True), truth.shape)  # even with the right mean
     error, guess = (float(np.sqrt(np.square(one - truth).mean())) for one in (patterns, flat))
     assert error < 0.6 * guess, f"{error:.4f} mm, a flat guess {guess:.4f} mm"
 

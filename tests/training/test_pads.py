@@ -1,4 +1,4 @@
-"""Pads: drawn within their ranges, the same for one seed, and known to a network as the runtime tells them."""
+"""Pads: drawn within their ranges, the same for one seed, and passed to a network as by the runtime."""
 
 from math import inf
 
@@ -90,7 +90,7 @@ def contract() -> Contract:
 
 @pytest.mark.parametrize("gains", [None, (1.0,) * 48])
 def test_training_and_runtime_tell_a_network_the_same_of_a_pad(gains):
-    """What is drawn for training is what the runtime makes of a sensor's file."""
+    """Pads drawn for training equal those that the runtime makes of a sensor's file."""
     takes = contract()
     assert takes.pad_width == KNOWN
     for pad in DRAWN[:20]:

@@ -1,4 +1,4 @@
-"""Batches of presses: one number is one batch, and what is said to be known is what was done."""
+"""Batches of presses: one number is one batch, and the gains given are those applied."""
 
 from dataclasses import replace
 
@@ -75,7 +75,7 @@ def test_known_constants_are_near_the_pads_own(presses):
 
 
 def test_readings_of_known_gains_are_evened_out(presses):
-    """One clean press read by many sensors: where gains are known, what is left of their spread is small."""
+    """One clean press is read by many sensors: where gains are given, the spread that is left is small."""
     one = replace(presses, counts=np.broadcast_to(np.float32(4000), presses.counts.shape).copy())
     batch = PressBatches(one, (1.0,), 64, seed=5, nuisances=GAINS_ALONE, mirror=False)(0)
     spread = counts_of(batch).std(axis=(1, 2, 3)) / 4000
@@ -102,7 +102,7 @@ def test_no_window_of_several_taps_is_mirrored(presses):
 
 
 def test_windows_of_one_tap_come_from_presses_of_one(presses):
-    """Of 64 presses 16 have two taps: .25 of a batch is of the other 48, and all the rest has both."""
+    """Sixteen of 64 presses have two taps: a quarter of a batch is of the other 48, and all the rest has both."""
     counts = presses.counts.copy()
     counts[16:, 1] = 0
     mixed = replace(presses, counts=counts)

@@ -204,7 +204,7 @@ def test_wrong_input_is_refused():
     with pytest.raises(ValueError, match="'S' lies under the pad at Pose"):
         SENSOR.tap(["S"], [Pose(50, 0, 0)], 1.0)
     flat = SimulatedSensor(SensorGeometry("flat", 1, 6, 4.7, 28.2, 4.7))
-    with pytest.raises(ValueError, match="lies under the pad at a pose"):  # but beside it, within the square
+    with pytest.raises(ValueError, match="lies under the pad at a pose"):  # but next to it, within the square
         flat.tap(["small square"], [Pose(0, 18, 0)], 1.0)
 
 

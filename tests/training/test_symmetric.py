@@ -89,7 +89,7 @@ def test_what_points_to_the_right_points_up_after_a_quarter_turn_and_to_the_left
 
 @pytest.mark.parametrize(("taps", "group"), [(1, "p4m"), (1, "p4"), (4, "p4"), (2, "p1")])
 def test_the_whole_network_keeps_every_symmetry(taps, group):
-    """Pattern and deviation move as they are, the traction's vectors turn; whatever is known of the pad."""
+    """Pattern and deviation move as they are, the traction's vectors turn, for any input about the pad."""
     torch.manual_seed(0)
     net = CompactNet(taps, 10, channels=16, blocks=2, known=5, group=group).eval()
     assert_network_keeps(net)

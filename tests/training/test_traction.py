@@ -319,7 +319,7 @@ class TestMagnets:
             wave_x = np.exp(1j * q_x.T * (x_mm - cells_mm(size, cell_mm)))
             wave_y = np.exp(1j * q_y * (y_mm - cells_mm(size, cell_mm)))
             expected = (wave_y.T @ transfers @ wave_x).real / (4 * size) ** 2
-            # They differ in the one highest wave of both axes, whose phase no grid tells.
+            # They differ in the one highest wave of both axes, whose phase no grid shows.
             assert np.allclose(response[taxel], expected, atol=1e-5 * np.abs(expected).max())
 
     def test_readings_follow_the_traction_and_are_as_before_without(self):

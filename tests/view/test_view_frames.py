@@ -1,4 +1,4 @@
-"""What viewers are sent: sampled, bounded, and the newest."""
+"""Frames to viewers: sampled, bounded, and the newest."""
 
 import os
 from dataclasses import replace
@@ -295,7 +295,7 @@ def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(h
         return [(header["event"], header["sensor"]) for header, _ in look(viewer, heard, clock)[:-1]]
 
     four.runtime.zero()
-    assert told() == [("refused", None)]  # no sensor was heard yet
+    assert told() == [("refused", None)]  # no sensor has sent yet
     four.runtime.zero("4")
     assert told() == [("in_contact", "4")]
     four.runtime.zero("6")
@@ -305,11 +305,11 @@ def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(h
     four.runtime.lose_touch()
     assert told() == [("given_up", "4")]
     four.runtime.reset()
-    assert told() == [("reset", None)]  # of all sensors, though this one's result tells it
+    assert told() == [("reset", None)]  # of all sensors, though this one's result carries it
 
 
 class TestSink:
-    """When those who look are woken."""
+    """Tests of the times at which viewers are woken."""
 
     def sink(self, clock, watched=True):
         woken = []

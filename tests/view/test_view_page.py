@@ -1,58 +1,45 @@
-"""The live page as a person sees it: headless Chromium before a real `edge-sr` that reads an emulated sensor."""
+"""The live page as a person sees it: headless Chromium with a real `edge-sr` that reads an emulated sensor."""
 
-import contextlib
-import importlib.util
-import json
 import os
 import re
-import shutil
-import signal
-import struct
-import subprocess
-import sys
-import threading
 from dataclasses import replace
-from importlib import import_module
 from itertools import count
 from pathlib import Path
-from queue import Empty, Queue
 
 import numpy as np
 import pytest
-from edge_samples import ROOT, make_pad_contract
+from browser_samples import (
+    PERIOD_NS,
+    browser,
+    demo,
+    emulated,
+    folder,
+    likeness,
+    live,
+    logged,
+    noise,
+    number,
+    open_page,
+    part,
+    playwright,
+    pressed,
+    shares,
+    word,
+)
+from edge_samples import make_pad_contract
 from view_samples import Press, live_page, wait_for
-from websockets.sync.client import connect
 
-from edge.inference.bundled import demo_recording
 from edge.perception.wrench import Wrench
 from edge.sinks.binary_message import unpack
-from edge.terminal.heatmap import colours
-from edge.terminal.progress_bar import Progress
-from edge.view.server import MOST_VIEWERS
 from edge.view.static_page import page_script
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.scans.scan import ScanSeries
-from firmware_bridge.zeroing.baseline import BaselineEstimator, save_baselines
 
-CHROMIUM = shutil.which("chromium")
-if os.environ.get("EDGE_BROWSER") != "1":  # whoever says 1 has both, and that one is missing is no reason to skip
-    if CHROMIUM is None:
-        pytest.skip("no chromium here: apt-get install chromium", allow_module_level=True)
-    pytest.importorskip("playwright.sync_api")
-playwright = import_module("playwright.sync_api")
-
-TIMEOUT_MS = 60_000
-PERIOD_NS = 10_000_000
-TOKEN = "of-twelve-letters"
+__all__ = ["browser", "demo", "folder", "open_page"]
 RECONNECTS = 200
 FIRST_RECONNECTS = 30
-"""Until all that is made once is there."""
-NOISE_COUNTS = 3
-"""Of a pad that is pressed and held: a taxel that repeats itself would be taken for a stuck one."""
+"""Reconnects after which all that is made once exists."""
 
-# What the page's own program is not told of: its sockets are counted and none is held, and its waits are shortened.
+# Unknown to the page's own program, its sockets are counted but not kept, and its waits are shortened.
 WATCH_SOCKETS = """
   const Socket = window.WebSocket;
   window.sockets = [];
@@ -63,130 +50,6 @@ WATCH_SOCKETS = """
   const wait = window.setTimeout;
   window.setTimeout = (act, ms, ...given) => wait(act, ms / 50, ...given);
 """
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright.expect.set_options(timeout=TIMEOUT_MS)  # as all that is waited for: the machine may be busy
-    with playwright.sync_playwright() as engine:
-        chromium = engine.chromium.launch(executable_path=CHROMIUM, args=["--js-flags=--expose-gc"])
-        yield chromium
-        chromium.close()
-
-
-@pytest.fixture
-def open_page(browser):
-    """Opens pages; in none of them may a request leave the server, or an error come."""
-    asked, wrong, contexts = [], [], []
-
-    def open_page(url, **settings):
-        script = settings.pop("script", None)
-        context = browser.new_context(**{"viewport": {"width": 1280, "height": 800}} | settings)
-        contexts.append(context)
-        context.set_default_timeout(TIMEOUT_MS)
-        if script is not None:
-            context.add_init_script(script)
-        page = context.new_page()
-        page.on("request", lambda request: asked.append(request.url))
-        page.on("websocket", lambda socket: asked.append(socket.url))
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
-        page.goto(url)
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    strangers = [url for url in asked if not re.match(r"(http|ws)://127\.0\.0\.1:\d+/|data:", url)]
-    assert asked and strangers == []
-    # That nobody answers, or not as wanted, is Chromium's to tell, and what some of these tests are about.
-    told = ("ERR_CONNECTION_REFUSED", "403 (Forbidden)", "Unexpected response code: 403", "503")
-    assert [text for text in wrong if not any(words in text for words in told)] == []
-
-
-@contextlib.contextmanager
-def edge_sr(*arguments):
-    """`edge-sr --view 0`, and the address that it tells."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "edge.cli.main", "--view", "0", *map(str, arguments)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    lines: Queue[str] = Queue()
-    reader = threading.Thread(target=lambda: [lines.put(line) for line in process.stderr])
-    reader.start()
-    try:
-        said = []
-        while True:
-            try:
-                said.append(lines.get(timeout=TIMEOUT_MS / 1000))
-            except Empty:
-                raise AssertionError(f"no address in {said}") from None
-            if said[-1].startswith("live page: "):
-                break
-        process.url = said[-1].split(": ", 1)[1].strip()
-        yield process
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        process.wait(timeout=TIMEOUT_MS / 1000)
-        reader.join()
-        process.stderr.close()
-
-
-@pytest.fixture(scope="module")
-def demo():
-    with np.load(demo_recording()) as data:
-        return dict(data)
-
-
-@pytest.fixture(scope="module")
-def folder(demo, tmp_path_factory):
-    """With stored baselines of the demo's sensor under two names."""
-    folder = tmp_path_factory.mktemp("view")
-    save_baselines(folder / "zero.json", [zeroed(demo, sensor) for sensor in ("4", "6")])
-    return folder
-
-
-def zeroed(demo, sensor):
-    scans, taken = ScanSeries(sensor, USPA44), BaselineEstimator()
-    for number, counts in enumerate(demo["counts"]):
-        baseline = taken.push(scans.close(counts.astype(np.int32), number * PERIOD_NS))
-        if baseline is not None:
-            return baseline
-    raise AssertionError("the demo does not begin at rest")
-
-
-@contextlib.contextmanager
-def emulated(folder, *tracks, options=()):
-    """A run on an emulated bus that plays counts (n, 3, 4, 4) of one or more sensors again and again."""
-    recordings = []
-    for counts in tracks:
-        path = folder / f"{len(list(folder.glob('*.npz')))}.npz"
-        facts = {"format": "tactile-recording", "version": 1, "sensor": ["4"] * len(counts)}
-        times_ns = np.arange(len(counts)) * PERIOD_NS
-        np.savez(path, **facts, scan=np.arange(len(counts)), time_ns=times_ns, counts=counts.astype(np.int32))
-        recordings.append(load_recording(path))
-    with Emulator(recordings, loop=True) as emulator:
-        stored = ["--baseline", folder / "zero.json", "--model", "stsr-int8", "--every-scan"]
-        with edge_sr("--source", f"slcan:{emulator.port}", *stored, *options) as run:
-            run.emulator = emulator
-            yield run
-
-
-def noise(count, seed=1):
-    return np.random.default_rng(seed).integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (count, 3, 4, 4))
-
-
-def pressed(demo):
-    """Counts of the demo's first tap at its deepest, and the true pattern."""
-    taps = np.flatnonzero(demo["tap"] == 0)
-    peak = taps[np.argmax(demo["indentation_mm"][taps])]
-    return demo["counts"][peak], demo["unit_patterns"][0].astype(float) * float(demo["indentation_mm"][peak])
 
 
 @pytest.fixture(scope="module")
@@ -206,36 +69,10 @@ def page(held, open_page):
     return page
 
 
-# What a person sees of a page.
-
-
-def part(page, name, sensor="4"):
-    return page.locator(f'[data-sensor="{sensor}"] [data-part="{name}"]')
-
-
-def number(page, name, sensor="4"):
-    return page.locator(f'[data-sensor="{sensor}"] [data-number="{name}"]')
-
-
-def live(page, sensor="4"):
-    page.wait_for_selector(f'[data-sensor="{sensor}"] [data-part="field"][data-live="yes"]')
-
-
-def word(page, text, sensor="4"):
-    playwright.expect(part(page, "word", sensor)).to_contain_text(text)
-
-
-def logged(page, text):
-    playwright.expect(page.locator("#log li").filter(has_text=text).first).to_be_visible()
-
-
 PIXELS = """canvas => {
   const image = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
   return [canvas.height, canvas.width, ...image.data];
 }"""
-
-SIDES = """all => all.map(one => one.getBoundingClientRect())
-  .map(({left, top, right, bottom}) => [left, top, right, bottom])"""
 PAINTED = """canvas => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height)
   .data.filter((value, at) => at % 4 === 3 && value).length"""
 
@@ -258,97 +95,10 @@ WATCH_REFUSAL = """() => {
 
 
 def frames_of(page):
-    """Headers of what the page's next sockets hear, while they do."""
+    """Return a growing list of the headers that the page's next sockets receive."""
     heard = []
     page.on("websocket", lambda socket: socket.on("framereceived", lambda data: heard.append(unpack(data)[0])))
     return heard
-
-
-def sent_by(page):
-    """What the page's next sockets are sent."""
-    sent = []
-    page.on("websocket", lambda socket: socket.on("framesent", lambda text: sent.append(json.loads(text))))
-    return sent
-
-
-def shares(pixels):
-    """Shares of the scale that colours on a canvas stand for, by the terminal's own table of the same colours."""
-    height, width, *data = pixels
-    rgba = np.array(data, dtype=float).reshape(height, width, 4)
-    assert (rgba[..., 3] == 255).all()
-    steps = np.linspace(0, 1, 256)
-    return steps[np.abs(rgba[..., None, :3] - colours(steps)).sum(axis=-1).argmin(axis=-1)]
-
-
-def likeness(shown, truth):
-    return float(np.corrcoef(shown.ravel(), truth.ravel())[0, 1])
-
-
-class TestDemo:
-    # The deepest pattern of a tap, as it was painted, and all that the force read until the tap was over.
-    FOLLOW = """() => {
-      const seen = (window.seen ??= { forces: new Set(), deepest: 0, pixels: null });
-      const card = document.querySelector(".sensor");
-      if (card === null) return false;
-      const text = (name) => card.querySelector(`[data-part="${name}"]`).textContent;
-      seen.forces.add(text("force-now"));
-      const most = parseFloat(text("pattern-most").replace("deepest ", ""));
-      if (most > seen.deepest) {
-        const canvas = card.querySelector('[data-part="pattern"]');
-        const image = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-        [seen.deepest, seen.pixels] = [most, [canvas.height, canvas.width, ...image.data]];
-      }
-      return seen.forces.size > 20 && seen.deepest > 0.1 && text("word") === "idle";
-    }"""
-
-    def test_the_letter_is_seen_the_numbers_move_and_the_end_is_no_live_picture(self, open_page, demo):
-        with edge_sr("--source", "demo:loop") as run:
-            page = open_page(run.url)
-            page.wait_for_function(self.FOLLOW)
-            playwright.expect(page.locator("#origin").filter(has_text="EMULATED")).to_be_visible()
-            assert page.title().startswith("EMULATED")
-            shown = shares(page.evaluate("seen.pixels"))
-            fits = [likeness(shown, truth.astype(float)) for truth in demo["unit_patterns"]]
-            best = demo["unit_patterns"][int(np.argmax(fits))].astype(float)
-            others = [best[::-1], best[:, ::-1], best.T, best[::-1].T]
-            assert max(fits) > 0.95 and max(likeness(shown, turned) for turned in others) < 0.8, fits
-            run.send_signal(signal.SIGINT)
-            word(page, "run ended")
-            playwright.expect(page.locator("#trouble")).to_contain_text(
-                re.compile(r"^the run has ended \(.*\): what is shown is old; ")
-            )
-            assert part(page, "field").get_attribute("data-live") == "no"
-            playwright.expect(part(page, "stamp")).to_contain_text("last contact")
-            page.keyboard.press("r")
-            logged(page, "not done: there is no connection")
-            assert page.locator("#log").get_by_text("earlier taps forgotten").count() == 0
-
-    def test_the_next_run_is_found_and_nothing_of_the_one_before_kept(self, open_page):
-        with edge_sr("--source", "demo:loop", "--view-token", TOKEN) as run:
-            page = open_page(run.url)
-            page.wait_for_selector(".sensor")
-            page.eval_on_selector(".sensor", "card => { card.id = 'first'; }")
-            page.keyboard.press("Space")
-        port = re.search(r":(\d+)/", run.url)[1]
-        with edge_sr("--source", "demo:loop", "--view", port, "--view-token", TOKEN):
-            logged(page, "another run has begun")
-            page.wait_for_selector(".sensor:not(#first)")
-            assert page.locator("#first").count() == 0
-            playwright.expect(page.locator("#pause")).to_have_attribute("aria-pressed", "false")
-
-    def test_why_nobody_is_let_in_is_told(self, open_page):
-        with edge_sr("--source", "demo:loop", "--view-token", TOKEN) as run, contextlib.ExitStack() as full:
-            page = open_page(run.url.replace(TOKEN, "another-one-of-it"))
-            trouble = page.locator("#trouble")
-            playwright.expect(trouble).to_contain_text("the token is missing or wrong: open the address that edge-sr")
-            for _ in range(MOST_VIEWERS):
-                socket = full.enter_context(connect(f"ws{run.url[4:].replace('?', 'ws?')}", max_queue=None))
-                socket.send('{"cmd": "pause", "on": true}')
-            page.goto(run.url)
-            playwright.expect(trouble).to_contain_text(f"{MOST_VIEWERS} look already")
-            socket.close()
-            page.wait_for_selector(".sensor")
-            playwright.expect(trouble).to_be_hidden()
 
 
 class TestHeld:
@@ -385,7 +135,7 @@ class TestHeld:
         part(page, "field").focus()
         page.keyboard.press("ArrowLeft")
         page.keyboard.press("Shift+ArrowDown")
-        playwright.expect(part(page, "readout")).to_contain_text(", y 2.6")  # said with the next frame
+        playwright.expect(part(page, "readout")).to_contain_text(", y 2.6")  # shown with the next frame
         text = part(page, "readout").inner_text()
         x, y, value, doubt = re.fullmatch(
             r"x (\S+), y (\S+)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm", text
@@ -409,7 +159,7 @@ class TestHeld:
         playwright.expect(part(other, "force-now")).not_to_have_text(before)
         page.wait_for_timeout(1200)
         self.reconnect(page, 1)
-        self.ask(page, "is it held?")  # answered behind the pause that the page asked for again
+        self.ask(page, "is it held?")  # answered after the pause that the page asked for again
         del heard[:]
         before = part(other, "force-now").inner_text()
         playwright.expect(part(other, "force-now")).not_to_have_text(before)
@@ -421,7 +171,7 @@ class TestHeld:
         page.locator("#pause").click()
         live(page)
         playwright.expect(part(page, "force-now")).not_to_have_text(frozen[-1])
-        # A pad that is held draws a line: what was missed meanwhile is no hole of .7 s in it, as none is for the other.
+        # A held pad draws a line: frames missed meanwhile leave no hole of 0.7 s in it, nor in the other page's.
         here, there = (max(np.diff(np.flatnonzero(part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
         assert here < there + 0.07 * part(page, "force-plot").evaluate("canvas => canvas.width")
 
@@ -458,7 +208,7 @@ class TestHeld:
         other.evaluate(WATCH_REFUSAL)
         self.reconnect(other, 1)
         page.keyboard.press("r")
-        logged(other, "earlier taps forgotten")  # behind all that is told to a newcomer
+        logged(other, "earlier taps forgotten")  # after all that a newcomer is sent
         assert other.evaluate(TOLD, ["zeroing refused", 2])
         assert other.evaluate("refusals") == 0
 
@@ -548,7 +298,7 @@ class TestHeld:
         logged(page, question)
 
     def kept(self, devtools):
-        """What Chromium counts, after collecting what nobody holds; frames come meanwhile, so the least of a few."""
+        """Return Chromium's counts after garbage collection: the least of a few, as frames come meanwhile."""
         counted = []
         for _ in range(4):
             devtools.send("HeapProfiler.collectGarbage")
@@ -559,98 +309,6 @@ class TestHeld:
 
 def open_files(run):
     return len(os.listdir(f"/proc/{run.pid}/fd"))  # noqa: PTH208
-
-
-def test_zero_by_button_and_by_key_with_a_token_that_is_not_left_in_the_address(demo, folder, open_page):
-    with emulated(folder, demo["counts"][:100], options=["--view-token", TOKEN]) as run:
-        assert TOKEN in run.url
-        page = open_page(run.url)
-        word(page, "idle")
-        assert page.url == run.url.partition("?")[0]
-        stored = number(page, "baseline").inner_text()
-        page.locator("#zero").click()
-        playwright.expect(number(page, "baseline")).not_to_have_text(stored)
-        playwright.expect(number(page, "baseline_origin")).to_have_text("on demand")
-        first = number(page, "baseline").inner_text()
-        page.keyboard.press("z")
-        playwright.expect(number(page, "baseline")).not_to_have_text(first)
-
-
-def test_zero_in_contact_is_refused_and_forced_by_another_button_alone(demo, folder, open_page):
-    with emulated(folder, pressed(demo)[0] + noise(200)) as run:
-        page = open_page(run.url)
-        live(page)
-        stored = number(page, "baseline").inner_text()
-        playwright.expect(page.locator("#force")).to_be_hidden()
-        page.keyboard.press("Shift+Z")  # nothing was refused yet
-        page.keyboard.press("z")
-        playwright.expect(page.locator("#refusal")).to_contain_text("sensor 4 is in contact")
-        logged(page, "zeroing refused")
-        page.keyboard.press("z")
-        playwright.expect(page.locator("#force")).to_be_visible()
-        assert number(page, "baseline").inner_text() == stored
-        page.get_by_role("button", name="Zero despite contact").click()
-        playwright.expect(page.locator("#refusal")).to_be_hidden()
-        playwright.expect(number(page, "baseline")).not_to_have_text(stored)
-        word(page, "idle")
-        for pressed_key, text in (("s", "idle"), ("Space", "paused")):  # a pause makes no old pattern look new
-            page.keyboard.press(pressed_key)
-            word(page, text)
-            playwright.expect(part(page, "field")).to_have_class("field old")
-            playwright.expect(part(page, "stamp")).to_contain_text("last contact")
-
-
-def test_who_asked_may_force_and_only_what_was_refused(demo, folder, open_page):
-    with emulated(folder, pressed(demo)[0] + noise(200), demo["counts"][:1] + noise(200, seed=2)) as run:
-        page, other = open_page(run.url), open_page(run.url)
-        sent = sent_by(page)
-        page.reload()
-        for one in (page, other):
-            live(one)
-            word(one, "idle", "6")
-        part(page, "zero", "6").click()
-        part(other, "zero").click()
-        playwright.expect(other.locator("#force")).to_be_visible()
-        logged(page, "zeroing refused")
-        playwright.expect(page.locator("#refusal")).to_contain_text("sensor 4 is in contact")
-        playwright.expect(page.locator("#force")).to_be_hidden()
-        page.keyboard.press("Shift+Z")
-        page.keyboard.press("z")
-        playwright.expect(page.locator("#force")).to_be_visible()
-        playwright.expect(page.locator("#refusal")).not_to_contain_text("sensor 6")
-        page.keyboard.press("Shift+Z")
-        playwright.expect(number(page, "baseline_origin")).to_have_text("on demand")
-        page.keyboard.press("Shift+Z")  # once
-        page.keyboard.press("r")
-        logged(other, "earlier taps forgotten")
-        assert sent == [
-            {"cmd": "zero", "sensor": "6"},
-            {"cmd": "zero"},
-            {"cmd": "zero", "sensor": "4", "force": True},
-            {"cmd": "reset"},
-        ]
-
-
-def test_two_sensors_a_dead_taxel_and_a_cable_that_is_out(demo, folder, open_page):
-    counts = pressed(demo)[0]
-    broken = counts + noise(200, seed=2)
-    broken[:, :, 1, 2] = 65_535
-    with emulated(folder, counts + noise(200), broken) as run:
-        page = open_page(run.url)
-        live(page)
-        live(page, "6")
-        playwright.expect(part(page, "dead", "6").filter(has_text="taxel 6 saturated")).to_be_visible()
-        playwright.expect(part(page, "dead", "4")).to_be_hidden()
-        (left, top, right, _), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
-        assert top == other_top and right < other_left
-        page.set_viewport_size({"width": 390, "height": 844})
-        (left, _, _, bottom), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
-        assert left == other_left and bottom < other_top
-        run.emulator.hang_up()
-        for sensor in "46":
-            word(page, "no scan for", sensor)
-            playwright.expect(part(page, "field", sensor)).to_have_attribute("data-live", "no")
-        logged(page, "link lost")
 
 
 # Alpha of what is drawn over a pattern, at a share of its width and height.
@@ -689,21 +347,3 @@ def test_force_and_torque_are_told_and_drawn_where_the_model_gives_them(open_pag
         page = open_page(shown.view.url)
         live(page)
         assert number(page, "wrench_force").count() == 0
-
-
-def test_the_pictures_of_the_pages_can_still_be_taken(browser, tmp_path, monkeypatch, capsys):
-    """One of those of docs/live_pictures.py, without its waiting for the last tap."""
-    spec = importlib.util.spec_from_file_location("live_pictures", ROOT / "docs" / "live_pictures.py")
-    pictures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(pictures)
-    monkeypatch.setattr(pictures, "PICTURES", tmp_path)
-    counts = pictures.held_demo()
-    with pictures.emulator(tmp_path, counts) as bus, pictures.live_page(bus.port) as (_, url):
-        page = pictures.look(browser, url, pictures.PHONE, "dark")
-        page.locator('[data-number="taps_used"]').first.wait_for()
-        with Progress("pictures", 1, "picture") as bar:
-            pictures.keep(page, "phone", bar)
-        page.close()
-    taken = (tmp_path / "live-phone.png").read_bytes()
-    assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
-    assert capsys.readouterr().out.startswith(f"{tmp_path}/live-phone.png: ")

@@ -90,7 +90,7 @@ def test_ctrl_c_ends_it_cleanly_with_viewers_attached(watched_run):
 
 
 def test_what_viewers_ask_is_done(watched_run):
-    """In either order: the file is opened beside the run."""
+    """Either may come first, as the file is opened in a thread of its own."""
     told = [note for note in watched_run["notes"] if note.startswith(("recording", "zeroing"))]
     begun, refused = sorted(told)
     assert begun.startswith("recording into ")

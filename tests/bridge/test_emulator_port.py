@@ -1,0 +1,246 @@
+"""Emulated adapter on a pseudo-terminal, in this process and as a command."""
+
+import contextlib
+import os
+import select
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+import serial
+from bridge_samples import make_counts, make_recording, read_until_lost, stacked, write_recording
+
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.slcan_main import main
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.scans.slcan_scans import SlcanScans
+
+# The pseudo-terminal.
+
+
+def open_raw(port: str, baudrate: int = 3_000_000) -> serial.Serial:
+    return serial.Serial(port, baudrate, rtscts=True, timeout=0.2)
+
+
+def read_to_the_end(port: serial.Serial) -> bytes:
+    """All until the emulator hangs up, or falls silent."""
+    data = b""
+    with contextlib.suppress(serial.SerialException):
+        while more := port.read(port.in_waiting or 1):
+            data += more
+    return data
+
+
+def test_silence_before_bitrate_and_open():
+    with Emulator([make_recording(5)]) as emulator, open_raw(emulator.port) as port:
+        assert port.read(100) == b""
+        port.write(b"O\r")
+        assert port.read(100) == b"\a"
+        port.write(b"S8\r")
+        assert port.read(100) == b"\r"
+        port.write(b"O\r")
+        assert port.read(23).startswith(b"\rt0048")
+    assert emulator.adapter.refused == 1
+
+
+def test_close_stops_the_stream():
+    with Emulator([make_recording(50)], loop=True) as emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        assert len(port.read(1000)) == 1000
+        port.write(b"C\r")
+        while port.read(1000):
+            pass
+        assert not emulator.adapter.channel_open
+        port.write(b"O\r")
+        assert len(port.read(1000)) == 1000
+
+
+@pytest.mark.parametrize("left_open", [False, True])
+def test_the_wrong_line_speed_is_noise(left_open):
+    recording = make_recording(30)
+    with Emulator([recording], left_open=left_open) as emulator, open_raw(emulator.port, 115_200) as port:
+        port.write(b"S8\rO\r" * 20)
+        scans = SlcanScans()
+        data = read_to_the_end(port)
+        assert scans.feed(data, 0) == []
+        assert emulator.adapter.hears_the_bus == left_open
+        assert scans.counters()["frames"] == 0
+        if left_open:
+            # Noise, and less of it: bytes run into each other.
+            assert 0 < len(data) < 30 * 16 * 22 / 10
+
+
+def test_usb_adapters_ignore_the_line_speed():
+    with Emulator([make_recording(3)], ignores_line_speed=True) as emulator, open_raw(emulator.port, 115_200) as port:
+        port.write(b"S8\rO\r")
+        assert len(port.read(3 * 16 * 22)) == 3 * 16 * 22
+
+
+def test_a_slow_reader_loses_frames_and_stops_nobody():
+    """The kernel keeps some twenty thousand bytes for a reader; the device keeps none beyond."""
+    with Emulator([make_recording(400, rate_hz=480.0)]) as emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        end_s = time.monotonic() + 60
+        while emulator.lost_frames < 100:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        decoder = SlcanScans()
+        while emulator.sent_frames + emulator.lost_frames < 400 * 16:
+            decoder.feed(port.read(port.in_waiting), 0)  # not for one byte more: it may hang up meanwhile
+            time.sleep(0.001)
+        decoder.feed(read_to_the_end(port), 0)
+        told = decoder.counters()
+        # A frame of which only a part had room is lost as well: its head is skipped before the next.
+        assert told["frames"] == emulator.sent_frames
+        assert told["frames"] + emulator.lost_frames == 400 * 16
+
+
+def test_it_hangs_up_when_all_is_played_and_fetched():
+    recording = make_recording(20)
+    with Emulator([recording]) as emulator, SlcanSerialLink(emulator.port) as link:
+        time.sleep(0.4)  # all is played, nothing is fetched
+        assert not emulator.wait(0)
+        scans = read_until_lost(link)
+        assert emulator.wait(5)
+    assert (stacked(scans) == recording.tracks[0].counts).all()
+
+
+def test_the_cable_out():
+    with Emulator([make_recording(50)], loop=True) as emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        port.read(500)
+        emulator.hang_up()
+        assert emulator.wait(0)
+        with pytest.raises(serial.SerialException):
+            for _ in range(100):
+                port.read(1000)
+        emulator.hang_up()
+
+
+def test_a_link_replaces_links_alone(tmp_path):
+    """The user's files at its place and next to it are left alone."""
+    link, beside = tmp_path / "skin", tmp_path / "skin.new"
+    beside.write_text("mine")
+    for make in (lambda: link.write_text("mine"), link.mkdir):
+        make()
+        with pytest.raises(ValueError, match=r"link is .*skin, expected a path that is free or a link: a file"):
+            Emulator([make_recording(3)], link=link)
+        assert link.exists() and not link.is_symlink()
+        link.unlink() if link.is_file() else link.rmdir()
+    link.symlink_to("/nowhere")  # as one that was killed leaves it
+    with Emulator([make_recording(3)], link=link) as emulator:
+        assert emulator.port == str(link) and link.resolve() != Path("/nowhere")
+        link.unlink()
+        link.write_text("mine by now")
+    assert sorted(tmp_path.iterdir()) == [link, beside]
+    assert (link.read_text(), beside.read_text()) == ("mine by now", "mine")
+
+
+def test_nothing_stays_open():
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    with Emulator([make_recording(1)]) as emulator:
+        assert len(list(Path("/proc/self/fd").iterdir())) == before + 2
+    assert emulator.wait(0)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize(("latency_s", "fewest", "most"), [(0.001, 20, 10_000), (0.05, 2, 14)])
+def test_latency_bunches_what_arrives(latency_s, fewest, most):
+    emulator = Emulator([make_recording(40)], latency_s=latency_s, loop=True)
+    with emulator, open_raw(emulator.port) as port:
+        port.write(b"S8\rO\r")
+        port.timeout = 0.003
+        chunks, received = 0, 0
+        while received < 40 * 16 * 22:
+            data = port.read(1_000_000)
+            chunks, received = chunks + bool(data), received + len(data)
+    assert fewest <= chunks <= most
+
+
+# The command.
+
+
+def start(*arguments: object) -> subprocess.Popen:
+    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", *map(str, arguments)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_the_command_plays_and_ends(tmp_path):
+    path = write_recording(tmp_path / "a.csv", make_counts(8))
+    with start(path, path, "--controller", "3,5", "--rate-hz", 200, "--no-acks", "--seed", 4) as process:
+        with SlcanSerialLink(process.stdout.readline().strip()) as link:
+            scans = read_until_lost(link)
+        assert {scan.sensor for scan in scans} == {"3", "5"} and len(scans) == 16
+        assert link.counters()["replies"] == 0
+        assert process.wait(10) == 0
+
+
+def test_the_command_ends_with_who_started_it(tmp_path):
+    path = write_recording(tmp_path / "a.csv", make_counts(8))
+    with start(path, "--rate-hz", 100, "--loop", "--until-stdin-closes") as process:
+        assert process.stdout.readline().startswith("/dev/pts/")
+        assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(10) == 0
+
+
+def test_the_command_says_what_is_wrong(tmp_path, capsys):
+    path = write_recording(tmp_path / "a.csv", make_counts(1))
+    for arguments, words in (
+        ([str(tmp_path / "gone.csv")], "cannot be read"),
+        ([str(path)], "--rate-hz"),
+        ([str(path), "--controller", "x"], "'x' are no controller ids, such as 4,6"),
+        ([str(path), "--rate-hz", "9", "--link", "/nonexist/x"], "link is /nonexist/x, expected a path in a folder"),
+        ([str(path), "--rate-hz", "9", "--link", str(path)], "a.csv, expected a path that is free or a link"),
+        ([str(path), "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),
+        ([str(path), "--rate-hz", "9", "--truth", "/proc/x"], "/proc/x: cannot be written: No such file"),
+        ([str(path), "--rate-hz", "9", "--stamps", "/nonexist/x"], "/nonexist/x: cannot be written: No such file"),
+        ([str(path), "--rate-hz", "0"], "positive"),
+        ([str(path), "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 2
+        assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):
+    def interrupt(emulator, timeout_s):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Emulator, "wait", interrupt)
+    path, link = write_recording(tmp_path / "a.csv", make_counts(1)), tmp_path / "skin"
+    assert main([str(path), "--rate-hz", "100", "--link", str(link)]) == 130
+    assert capsys.readouterr() == (f"{link}\n", "") and not link.is_symlink()
+
+
+def test_the_terminal_is_left_for_the_client_to_set_up():
+    """A serial port comes up cooked and slow; a client that relies on more would fail on a real one."""
+    with Emulator([make_recording(1)]) as emulator:
+        client = os.open(emulator.port, os.O_RDWR | os.O_NOCTTY)
+        flags = termios.tcgetattr(client)
+        assert flags[3] & termios.ICANON and flags[5] != termios.B3000000
+        os.write(client, b"S8\nO\n")
+        assert select.select([client], [], [], 0.2)[0] == []
+        os.close(client)
+
+
+def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():
+    stamps = []
+    emulator = Emulator(
+        [make_recording(10), make_recording(10, seed=1)],
+        frame_s=2e-4,
+        on_scan=lambda controller, time_ns: stamps.append((controller, time_ns, emulator.sent_frames)),
+    )
+    begun_ns = time.monotonic_ns()
+    with emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+    assert all(sent >= 16 * (number + 1) for number, (_, _, sent) in enumerate(stamps))
+    for controller in (4, 6):
+        told_ns = [time_ns for name, time_ns, _ in stamps if name == controller]
+        came_ns = [scan.time_ns for scan in scans if scan.sensor == str(controller)]
+        assert len(told_ns) == len(came_ns) == 10
+        assert all(begun_ns < before < after for before, after in zip(told_ns, came_ns, strict=True))

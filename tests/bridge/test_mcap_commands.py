@@ -1,0 +1,260 @@
+"""MCAP recordings of `edge-sr record`: whole whatever ended it, and replayed offline."""
+
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bridge_samples import write_recording
+from edge_samples import BASELINE, ROOT, make_scan, write_model
+from mcap.exceptions import EndOfFile
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap_samples import SURE, TURNED, make_results, messages_of, odd_scans, record_into
+
+from edge.cli import main as cli
+from edge.doctor.watch import Watch
+from edge.sinks.registry import open_sink
+from edge.sinks.ros2 import cdr_messages as ros_messages
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.scan_messages import decode_scan
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.sensor_file.model import SensorFile
+from firmware_bridge.zeroing.baseline import save_baselines
+
+EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
+
+
+def edge_sr(*arguments, **settings):
+    settings = {"capture_output": True, "text": True, "timeout": 60, "stdin": subprocess.DEVNULL} | settings
+    return subprocess.run([*EDGE_SR, *map(str, arguments)], cwd=ROOT, env=environment(), **settings)
+
+
+def environment():
+    return os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def scans_on_disk(path):
+    """Return the scans that the public package reads, front to back, from a file that has no end yet."""
+    seen = []
+    with suppress(FileNotFoundError, EndOfFile), path.open("rb") as file:
+        for record in StreamReader(file).records:
+            if isinstance(record, Message) and record.channel_id == 1:
+                seen.append(decode_scan(record.data))
+    return seen
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A tiny model and a pressed pad: recorded by `edge-sr record`, without a baseline of its own."""
+    folder = tmp_path_factory.mktemp("made")
+    write_model(folder / "tiny.onnx", SURE)
+    counts = np.stack([make_scan(number, noise=3).counts for number in range(160)])
+    for start in (120, 140):
+        counts[start : start + 10, 2, 1, 1] += 3000
+    write_recording(folder / "finger.csv", counts)
+    for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
+        done = edge_sr(
+            *("record", folder / "press.mcap", "--model", folder / "tiny.onnx", "--rate-hz", 200),
+            *("--source", f"replay:{folder}/finger.csv"),
+        )
+        assert done.returncode == 0, done.stderr
+        assert f"recorded {folder}/press.mcap: 160 scans, 0.8 s, " in done.stderr.splitlines()[-1]
+        if any(own for own, _ in patterns(folder / "press.mcap").values()):
+            return folder
+        (folder / "press.mcap").unlink()
+    raise AssertionError("no scan of the contact got its pattern in any of ten recordings")
+
+
+def replayed(made, name, *options, file="press.mcap"):
+    arguments = ["replay", made / file, "--model", made / "tiny.onnx", "--sink", f"jsonl:{name}", *options]
+    assert cli.main([str(one) for one in arguments]) == 0
+    return [json.loads(line) for line in name.read_text().splitlines()]
+
+
+def patterns(path):
+    """Each scan's pattern by its number, and whether it was made for that scan."""
+    by_topic = messages_of(path)
+    said = {at: ros_messages.RESULT.decode(data) for at, data in by_topic["/finger/result"]}
+    made_for = {at: json.loads(one["record"])["reused_from"] is None for at, one in said.items()}
+    return {
+        said[at]["scan"]: (made_for[at], ros_messages.image_map(data).tobytes())
+        for at, data in by_topic["/finger/pattern"]
+    }
+
+
+class TestOffline:
+    def test_the_same_again_is_the_same_and_every_scan_has_its_result(self, made, tmp_path):
+        first = replayed(made, tmp_path / "a.jsonl", "--sink", f"mcap:{tmp_path}/a.mcap")
+        second = replayed(made, tmp_path / "b.jsonl", "--sink", f"mcap:{tmp_path}/b.mcap")
+        assert len(first) == 160 and {one["state"] for one in first} == {"zeroing", "idle", "contact"}
+        for one in (*first, *second):
+            assert one["latency_us"] is None and (one["pattern"] is None) == (one["state"] != "contact")
+            del one["run_time_us"]
+        assert first == second
+        recorded = messages_of(made / "press.mcap")
+        again, other = messages_of(tmp_path / "a.mcap"), messages_of(tmp_path / "b.mcap")
+        for topic in ("scan", "baseline", "pattern", "deviation"):
+            assert again[f"/finger/{topic}"] == other[f"/finger/{topic}"] != []
+        assert again["/finger/scan"] == recorded["/finger/scan"], "and at their times on the wall"
+
+    def test_patterns_are_those_that_were_recorded(self, made, tmp_path):
+        replayed(made, tmp_path / "a.jsonl", "--sink", f"mcap:{tmp_path}/a.mcap", "--every-scan")
+        again = patterns(tmp_path / "a.mcap")
+        made_then = {scan: pattern for scan, (own, pattern) in patterns(made / "press.mcap").items() if own}
+        assert made_then
+        assert [scan for scan, pattern in made_then.items() if again[scan][1] != pattern] == []
+
+    @pytest.mark.parametrize("suffix", ["mcap", "npz"])
+    def test_it_begins_with_the_baseline_of_its_first_scan_unless_told_otherwise(self, made, tmp_path, suffix):
+        """The recording begins in contact: zeroed again, the press would be gone."""
+        path = tmp_path / f"press.{suffix}"
+        scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
+        sink = open_sink(f"{suffix}:{path}", SURE, unix_offset_ns=1_012_400_000_000)
+        for result in make_results(scans, unix_time_s=lambda: 1012.4):
+            sink.write(result, {})
+        sink.close()
+        for options, age_s in (((), 12.4), (("--paced", "--rate-hz", 2000), 12.4 if suffix == "npz" else None)):
+            got = replayed(made, tmp_path / "a.jsonl", *options, file=path)
+            assert {one["baseline"] for one in got} == {BASELINE.id}
+            # Longer than that nobody believes a taxel that is pressed alone.
+            assert {one["state"] for one in got[:18]} <= {"contact", "dropped"}
+            # Played at its pace it is of now, and so is its age, where the file holds its date.
+            assert got[0]["baseline_age_s"] > 1e9 if age_s is None else abs(got[0]["baseline_age_s"] - age_s) < 60
+        got = replayed(made, tmp_path / "a.jsonl", "--zero", file=path)
+        assert [one["state"] for one in got] == ["zeroing"] * 99 + ["idle"] * 31
+
+    @pytest.mark.parametrize("age_s", [3000.0, None])
+    def test_a_baseline_older_than_the_machine_is_so_in_every_generation(self, made, tmp_path, age_s):
+        """An npz holds its age, and its times are those since the machine was started."""
+        path = tmp_path / "press.npz"
+        sink = open_sink(f"npz:{path}", SURE)
+        for result in make_results([make_scan(number, press_counts=3000, noise=1) for number in range(5)]):
+            sink.write(replace(result, baseline_age_s=age_s), {})
+        sink.close()
+        assert age_s is None or load_recording(path).tracks[0].time_ns[-1] < age_s * 1e9
+        for generation in range(3):
+            again = tmp_path / f"{generation}.mcap"
+            got = replayed(made, tmp_path / f"{generation}.jsonl", "--sink", f"mcap:{again}", file=path)
+            assert [one["state"] for one in got] == ["contact"] * 5
+            ages_s = [one["baseline_age_s"] for one in got]
+            assert ages_s[0] == age_s and {one["baseline"] for one in got} == {BASELINE.id}
+            path = again
+
+    def test_another_baseline_and_a_sensor_that_sits_turned(self, made, tmp_path):
+        scans = [make_scan(number, press_counts=3000, noise=1) for number in range(5)]
+        results = make_results(scans, mountings={"4": TURNED, "left/6": TURNED})
+        path = record_into(tmp_path / "turned.mcap", results, mountings={"4": TURNED})
+        other = type(BASELINE).of("4", BASELINE.counts - 1, 1500.0, 100, "file")
+        save_baselines(tmp_path / "other.json", [other], {"4": TURNED.order})
+        got = replayed(made, tmp_path / "a.jsonl", file=path)
+        assert [one["force_counts"] for one in got] == [round(result.force_counts, 1) for result in results]
+        assert [one["centroid_mm"] for one in got] == [
+            [round(value, 4) for value in result.centroid_mm] for result in results
+        ]
+        got = replayed(made, tmp_path / "a.jsonl", "--baseline", tmp_path / "other.json", file=path)
+        assert {one["baseline"] for one in got} == {other.id}
+        assert [one["force_counts"] for one in got] == [round(result.force_counts + 16, 1) for result in results]
+
+
+class TestRecord:
+    def test_a_file_that_exists_is_left_alone_and_one_without_an_ending_is_an_mcap(self, made, tmp_path, capsys):
+        source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
+        (tmp_path / "old.npz").write_text("old")
+        assert cli.main(["record", f"{tmp_path}/old.npz", *source]) == 5
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and "exists: give another name" in error
+        assert (tmp_path / "old.npz").read_text() == "old"
+        assert cli.main(["record", f"{tmp_path}/run.1", *source]) == 0
+        assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
+        capsys.readouterr()
+        assert cli.main(["record", f"{tmp_path}/none/x", *source]) == 5
+        assert "No such file or directory" in capsys.readouterr().err.splitlines()[-1]
+
+    def test_what_is_no_name_of_a_recording_is_refused_before_anything_is_opened(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "taken").mkdir()
+        for name, code, words in (
+            ("taken", 5, "cannot record into taken: it is a directory"),
+            ("x.csv", 2, "no .csv is recorded: expected x.mcap or x.npz"),
+            ("x.JSONL", 2, "no .JSONL is recorded"),
+        ):
+            assert cli.main(["record", name, "--source", "slcan:/dev/none"]) == code
+            error = capsys.readouterr().err
+            assert error.count("\n") == 1 and words in error
+        assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+    def test_a_killed_recorder_leaves_all_that_was_on_the_disk(self, made, tmp_path):
+        """The amount depends on the machine; docs/recordings.md gives a measured one."""
+        path = tmp_path / "killed.mcap"
+        process = subprocess.Popen(
+            [
+                *(*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "20"),
+                *("--source", f"replay:{made}/finger.csv"),
+            ],
+            cwd=ROOT,
+            env=environment(),
+            stderr=subprocess.DEVNULL,
+        )
+        while len(written := scans_on_disk(path)) < 12:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.kill()
+        process.wait()
+        seen = scans_on_disk(path)
+        assert [scan.number for scan in seen] == list(range(len(seen))) and len(seen) >= len(written)
+        recording = load_recording(path)
+        assert (recording.tracks[0].counts == np.stack([scan.counts for scan in seen])).all()
+        assert "breaks off (without an end" in recording.notes[0] or "within a record" in recording.notes[0]
+        done = edge_sr("replay", path, "--model", made / "tiny.onnx")
+        assert done.returncode == 0 and "breaks off" in done.stderr and f"{len(seen)} scans" in done.stderr
+
+    def test_a_full_disk_ends_it_in_one_line_and_what_was_written_can_be_played(self, made, tmp_path):
+        limit = 20_000
+
+        def small_disk():
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+        path = tmp_path / "full.mcap"
+        done = edge_sr(
+            *("record", path, "--model", made / "tiny.onnx", "--rate-hz", 60),
+            *("--source", f"replay:{made}/finger.csv"),
+            preexec_fn=small_disk,
+        )
+        assert done.returncode == 5
+        recording = load_recording(path)
+        scans = len(recording.tracks[0].counts)
+        assert done.stderr.splitlines()[-1] == (
+            f"edge-sr: recording into {path} stopped: File too large; its {scans} scans can be played"
+        )
+        assert f"recorded {path}: at most " in done.stderr
+        assert 0 < len(recording.tracks[0].counts) < 160 and path.stat().st_size <= limit
+        assert recording.notes == (recording.notes[0],) and "without an end" in recording.notes[0]
+
+
+def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):
+    (script,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "recordings.md").read_text(), re.DOTALL)
+    results = make_results(odd_scans())
+    record_into(tmp_path / "press.mcap", results)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(script, "recordings.md", "exec"), {})
+    shown = [one.pattern for one in results if one.scan.sensor == "4" and one.pattern is not None]
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(shown) > 0 and lines[0].endswith(f"(40, 40) {shown[0].max()!s}")
+
+
+def test_the_doctor_goes_by_how_the_recorded_sensors_sat(tmp_path):
+    sat = Mounting(signs=(1, 1, -1))
+    path = record_into(tmp_path / "a.mcap", make_results(odd_scans()), mountings={"4": sat})
+    watch = Watch([f"replay:{path}"], SensorFile(), references={}, rate_hz=None, stop=threading.Event())
+    assert watch.known.mountings["4"] == sat

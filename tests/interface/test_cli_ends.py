@@ -1,0 +1,170 @@
+"""Ends of `edge-sr`: signals, closed pipes and the terminal that it leaves."""
+
+import fcntl
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+
+import pytest
+from cli_samples import TIMEOUT_S, base_options, files, records, run, start, wait_for
+from edge_samples import ROOT
+
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.recording.formats import load_recording
+
+__all__ = ["files"]
+
+
+class TestEnds:
+    @pytest.fixture
+    def emulator(self, files):
+        with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
+            yield emulator
+
+    def follow(self, emulator, files, *more):
+        """Return a run on the emulator and its first records."""
+        process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
+        assert process.stdout is not None
+        first = [process.stdout.readline() for _ in range(10)]
+        return process, first
+
+    def rest(self, process):
+        """Return the unread rest; not by communicate(), which ignores the text that readline() has read ahead."""
+        assert process.stdout is not None and process.stderr is not None
+        rest, errors = process.stdout.read(), process.stderr.read()  # of errors there are too few to fill a pipe
+        process.wait(TIMEOUT_S)
+        return rest, errors
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+    def test_signals_end_it_cleanly_with_the_summary(self, emulator, files, tmp_path, number):
+        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz")
+        process.send_signal(number)
+        rest, errors = self.rest(process)
+        assert process.returncode == 0
+        got = records("".join(first) + rest)
+        assert [record["scan"] for record in got] == list(range(len(got)))
+        assert {record["source"] for record in got} == {"emulated"}
+        assert errors.startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans") and "Traceback" not in errors
+        assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got)
+
+    def test_a_closed_pipe_ends_it_cleanly_with_the_summary(self, emulator, files):
+        process, _ = self.follow(emulator, files)
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.wait(TIMEOUT_S) == 0
+        errors = process.stderr.read()
+        assert errors.startswith("EMULATED ") and "Traceback" not in errors and "Exception" not in errors
+
+    def test_the_cable_out_keeps_the_records_and_is_3(self, emulator, files, tmp_path):
+        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz", "--give-up-s", "0")
+        emulator.hang_up()
+        rest, errors = self.rest(process)
+        assert process.returncode == 3
+        got = records("".join(first) + rest)
+        assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got) >= 10
+        *summary, last = errors.splitlines()
+        assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
+        assert last.startswith(f"edge-sr: {emulator.port}: link lost")
+
+    def test_the_cable_back_under_another_name_goes_on_and_records_tell_of_it(self, files, tmp_path):
+        """A link named by its adapter, as udev does, that leads to a new port each time."""
+        port, out = tmp_path / "by-id", tmp_path / "out.jsonl"
+        process = None
+        for _ in range(2):
+            with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
+                port.unlink(missing_ok=True)
+                port.symlink_to(emulator.port)
+                if process is None:
+                    process = start(*base_options(files), "--source", f"slcan:{port}", "--sink", f"jsonl:{out}")
+                    wait_for(lambda: out.exists() and out.read_text().count("\n") > 10)
+                else:
+                    wait_for(lambda: '"back"' in out.read_text().rpartition("lost")[2])
+                    wait_for(lambda: out.read_text().rpartition('"back"')[2].count("\n") > 10)
+        process.send_signal(signal.SIGINT)
+        _, errors = self.rest(process)
+        assert process.returncode == 0
+        got = records(out.read_text())
+        kinds = [record.get("event") for record in got if record["state"] == "event"]
+        assert kinds[:2] == ["lost", "back"]
+        assert "trying again until it is back" in errors and "is back after" in errors
+        back = got.index(next(record for record in got if record.get("event") == "back"))
+        scans = [record for record in got if record["state"] != "event"]
+        assert [record["scan"] for record in scans] == list(range(len(scans)))
+        assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
+        assert scans[-1]["counters"]["missed"] > 0
+
+    def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
+        leader, follower = pty.openpty()
+        name = f"slcan:{os.ttyname(follower)}"
+        done = run(*base_options(files), "--source", name, "--duration-s", "6")
+        os.close(leader), os.close(follower)
+        assert done.returncode == 3 and done.stdout == ""
+        doctor = f"edge-sr doctor --source {name} says what is wrong"
+        lines = done.stderr.splitlines()
+        assert re.match(rf"edge-sr: no scan in [56] s: is the sensor powered .*{doctor}$", lines[1])
+        assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
+
+    def test_models_into_a_closed_pipe_stay_quiet(self, files):
+        script = "import sys; from edge.cli.main import main; from edge.inference import bundled\n"
+        script += f"bundled.BUNDLE_DIR = bundled.Path({str(files)!r})\nsys.exit(main(['models']))"
+        reader, writer = os.pipe()
+        os.close(reader)
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=ROOT,
+            stdout=writer,
+            stderr=subprocess.PIPE,
+            timeout=TIMEOUT_S,
+            env=environment,
+        )
+        os.close(writer)
+        assert (done.returncode, done.stderr) == (0, b"")
+
+
+class TestTerminal:
+    def on_terminal(self, folder, *arguments, columns):
+        """Return the text of stderr on a terminal of that width, and of stdout."""
+        leader, follower = pty.openpty()
+        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        with (folder / "stdout").open("w") as output:
+            process = start(
+                *arguments, stderr=follower, stdin=follower, stdout=output, env=environment | {"TERM": "xterm"}
+            )
+        os.close(follower)
+        shown = b""
+        while select.select([leader], [], [], TIMEOUT_S)[0]:
+            try:
+                shown += os.read(leader, 65536)
+            except OSError:  # the process has ended
+                break
+        os.close(leader)
+        assert process.wait(TIMEOUT_S) == 0
+        return shown.decode(), (folder / "stdout").read_text()
+
+    def test_the_live_line_is_there_without_asking(self, files, tmp_path):
+        replay = ["--source", f"replay:{files}/taps.npz"]
+        shown, output = self.on_terminal(tmp_path, *base_options(files), *replay, columns=120)
+        live = re.findall(r"\r([^\r\n]*)\x1b\[K", shown)
+        assert live and live[-1].startswith("REPLAY | 4 contact tap 4 ") and output == ""
+        assert max(map(len, live)) <= 119
+
+    @pytest.mark.parametrize("words", ["--source replay:taps.npz", "replay taps.npz"])
+    def test_asked_for_it_is_there_once(self, files, tmp_path, words):
+        """The same holds for a file at full speed, which otherwise has a bar."""
+        replay = words.replace("taps.npz", f"{files}/taps.npz").split(" ")
+        model = ["--model", str(files / "tiny.onnx")]
+        shown, _ = self.on_terminal(tmp_path, *replay, *model, "--sink", "status", columns=80)
+        assert len(re.findall(r"\rREPLAY [^\r\n]*\x1b\[K\r\n", shown)) == 1
+
+    def test_it_gives_way_to_records_on_stdout(self, files, tmp_path):
+        replay = ["--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
+        shown, output = self.on_terminal(tmp_path, *base_options(files), *replay, columns=80)
+        assert "\x1b" not in shown and len(records(output)) == 40

@@ -1,0 +1,246 @@
+"""JSON Lines: one record per scan, and what becomes of them on pipes and full disks."""
+
+import fcntl
+import json
+import os
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sink_samples import RUN, make_results, make_sure_results
+
+from edge.errors import SinkClosedError, SinkError
+from edge.perception.event import Event
+from edge.perception.runtime import Runtime
+from edge.sinks.jsonl import JsonLinesSink, record_line
+from edge.sinks.pipe_capacity import has_room
+from firmware_bridge.scans.scan import ABSENT, VendorReading
+
+
+class TestJsonLines:
+    def test_what_is_written_is_each_result_in_itself_however_patterns_are_given_again(self, tmp_path):
+        """A repeated pattern is the same array, of one sensor; others, and scans without one, come between."""
+        baselines = {name: replace(BASELINE, sensor=name) for name in ("4", "6")}
+        runtime = Runtime(FakeModel(make_contract(interval_factor=1.6)), source="device", baselines=baselines)
+        presses = [(3000, "4"), (5000, "6"), (3000, "4"), (5000, "6"), (0, "4"), (3000, "4"), (7000, "4"), (7000, "4")]
+        results = [runtime.push(make_scan(n, press_counts=z, sensor=name)) for n, (z, name) in enumerate(presses)]
+        assert [result.reused_from for result in results] == [None, None, 0, 1, None, None, None, 6]
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"))
+        for result in results:
+            sink.write(result, RUN)
+        sink.close()
+        counters = RUN | {"unwritten": 0}
+        assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, counters) for result in results)
+
+    def test_a_record_says_all_of_a_contact(self):
+        ticks = iter([0, 123_456])
+        runtime = Runtime(
+            FakeModel(),
+            source="emulated",
+            baselines={"4": BASELINE},
+            counts_per_newton=1200,
+            clock_ns=lambda: next(ticks),
+            unix_time_s=lambda: 1012.34,
+        )
+        result = runtime.push(make_scan(7, press_counts=3000, stale=(0, 15)))
+        record = json.loads(record_line(result, RUN))
+        pattern = record.pop("pattern")
+        assert np.shape(pattern) == (40, 40)
+        np.testing.assert_allclose(pattern, result.pattern, rtol=1e-5)
+        assert record.pop("counts") == result.scan.counts.tolist()
+        assert record.pop("centroid_mm") == pytest.approx([-2.35, -2.35])
+        assert record.pop("deviation") is record.pop("traction") is None
+        assert record.pop("wrench") is record.pop("wrench_origin") is record.pop("shear_ratio") is None
+        assert record == {
+            "time_ns": 8 * PERIOD_NS,
+            "device_time_ns": None,
+            "sensor": "4",
+            "scan": 7,
+            "source": "emulated",
+            "state": "contact",
+            "fresh": 0xFFFF,
+            "renewed": 0x7FFE,
+            "contact": True,
+            "taps_used": 1,
+            "force_counts": 3000.0,
+            "force_n": 2.5,
+            "area_mm2": 22.09,
+            "interval_mm": None,
+            "expected_rmse_mm": None,
+            "another_tap": None,
+            "reused_from": None,
+            "run_time_us": 123.5,
+            "latency_us": None,
+            "baseline": BASELINE.id,
+            "baseline_origin": "file",
+            "baseline_age_s": 12.3,
+            "drift_counts": {"common": [0.0, 0.0, 0.0], "own": 0.0, "step": 0.0},
+            "model": "fake",
+            "dead": {},
+            "filled": None,
+            "note": None,
+            "event": None,
+            "counters": RUN,
+            "pattern_unit": "mm",
+        }
+
+    def test_absent_is_null(self):
+        runtime = Runtime(FakeModel(), source="device")
+        record = json.loads(record_line(runtime.push(make_scan(absent=(2,))), {}))
+        absent = "contact force_counts force_n area_mm2 centroid_mm interval_mm run_time_us pattern deviation"
+        for name in absent.split():
+            assert record[name] is None
+        assert (
+            record["baseline"]
+            is record["baseline_age_s"]
+            is record["baseline_origin"]
+            is record["drift_counts"]
+            is None
+        )
+        assert record["state"] == "zeroing" and record["fresh"] == 0xFFFF - 4
+        assert [axis[0][2] for axis in record["counts"]] == [None] * 3
+        assert ABSENT not in np.array(record["counts"]).ravel().tolist()
+
+    def test_a_deviation_stands_beside_its_pattern_in_the_same_digits(self):
+        result = make_sure_results(3)[4]
+        record = json.loads(record_line(result, {}))
+        for name in ("pattern", "deviation"):
+            np.testing.assert_allclose(record[name], getattr(result, name), rtol=2e-7, atol=0.51e-7)
+        assert record["pattern"] != record["deviation"]
+        assert record["interval_mm"] == pytest.approx(1.6 * 0.04, abs=1e-3)
+        assert record["interval_mm"] == round(result.interval_mm, 5)
+
+    def test_what_the_vendor_says_is_told_where_it_does(self):
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        newtons = np.full((3, 4, 4), 0.125, dtype=np.float32)
+        vendor = VendorReading(newtons, np.array([[300.0, np.nan] * 2] * 4, dtype=np.float32))
+        record = json.loads(record_line(runtime.push(replace(make_scan(), vendor=vendor)), {}))
+        assert (record["vendor_force_n"], record["temperature_k"], record["force_n"]) == ([2.0, 2.0, 2.0], 300.0, 2.0)
+        record = json.loads(record_line(runtime.push(replace(make_scan(1, absent=(2,)), vendor=vendor)), {}))
+        assert "vendor_force_n" not in record and record["force_n"] is None
+        record = json.loads(record_line(runtime.push(make_scan(2)), {}))
+        assert not {"vendor_force_n", "temperature_k"} & set(record)
+        calibrated = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, counts_per_newton=100.0)
+        assert calibrated.push(replace(make_scan(press_counts=50), vendor=vendor)).force_n == 0.5  # the user's own wins
+
+    @settings(max_examples=50, deadline=None)
+    @given(st.lists(st.floats(-(2.0**99), 2.0**99, width=32, allow_subnormal=False), min_size=4, max_size=4))
+    def test_patterns_keep_seven_decimals_and_are_json(self, values):
+        result = make_results(3)[4]
+        pattern = np.array(values, dtype=np.float32).reshape(2, 2)
+        object.__setattr__(result, "pattern", pattern)
+        line = record_line(result, {})
+        got = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))["pattern"]
+        np.testing.assert_allclose(got, pattern, rtol=2e-7, atol=0.51e-7)
+        assert line.endswith(b"}\n") and line.count(b"\n") == 1
+
+    def test_a_file_holds_a_record_a_line_there_as_soon_as_written(self, tmp_path):
+        path = tmp_path / "out.jsonl"
+        path.write_text("old\n")
+        sink = JsonLinesSink(str(path))
+        results = make_results()
+        for count, result in enumerate(results, 1):
+            sink.write(result, RUN)
+            assert len(path.read_text().splitlines()) == count
+        sink.close()
+        assert [json.loads(line)["scan"] for line in path.read_text().splitlines()] == [r.scan.number for r in results]
+
+    def test_what_cannot_be_opened_is_told(self, tmp_path):
+        with pytest.raises(SinkError, match=r"none/out.jsonl: No such file"):
+            JsonLinesSink(str(tmp_path / "none" / "out.jsonl"))
+
+    def test_a_full_disk_is_told_and_closing_stays_quiet(self):
+        sink = JsonLinesSink("/dev/full")
+        with pytest.raises(SinkError, match="/dev/full: No space left") as raised:
+            sink.write(make_results(1)[0], {})
+        assert not isinstance(raised.value, SinkClosedError)
+        sink.close()
+
+    def test_a_reader_that_has_gone_is_an_ordinary_end(self, tmp_path):
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+        sink = JsonLinesSink(str(fifo))
+        sink.write(make_results(1)[0], {})
+        os.close(reader)
+        with pytest.raises(SinkClosedError, match="has gone"):
+            sink.write(make_results(1)[0], {})
+        sink.close()
+
+    def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), source="replay")
+        sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
+        sink.close()
+        assert json.loads((tmp_path / "out.jsonl").read_text()) == {
+            "time_ns": 5,
+            "sensor": None,
+            "source": "replay",
+            "state": "event",
+            "event": "lost",
+            "note": "the cable is out",
+            "counters": {"scans": 3, "unwritten": 0},
+        }
+
+    def test_a_slow_reader_holds_up_nothing_and_what_it_missed_is_counted(self, tmp_path):
+        """Every record is written or counted, and each that is written is whole."""
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+        sink = JsonLinesSink(str(fifo), patient=False)
+        result, written = make_results(3)[4], 300
+        for _ in range(written):
+            sink.write(result, {})  # would wait for ever
+        os.set_blocking(reader, False)
+        lines = b"".join(iter(lambda: _read(reader), b"")).splitlines()
+        assert 10 < len(lines) < written and all(json.loads(line)["scan"] == result.scan.number for line in lines)
+        assert sink.unwritten == written - len(lines)
+        sink.write(result, {"unwritten": 10**6})  # of other readers
+        assert json.loads(os.read(reader, 1 << 20))["counters"]["unwritten"] == written - len(lines)
+        sink.close()
+        os.close(reader)
+
+    def test_a_pipe_that_is_smaller_than_a_record_still_takes_it_from_a_reader_that_keeps_up(self, tmp_path):
+        read_end, write_end = os.pipe()
+        fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
+        assert has_room(write_end, 25_000)
+        os.write(write_end, b"1")
+        assert not has_room(write_end, 25_000)
+        os.close(read_end)
+        os.close(write_end)
+
+    def test_a_fifo_that_nobody_reads_is_refused_rather_than_waited_for(self, tmp_path):
+        os.mkfifo(tmp_path / "fifo")
+        with pytest.raises(SinkError, match=r"nobody reads \S+/fifo: start its reader first"):
+            JsonLinesSink(str(tmp_path / "fifo"))
+
+    def test_a_recording_is_waited_for(self, tmp_path):
+        fifo = tmp_path / "fifo"
+        os.mkfifo(fifo)
+        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+        sink, result = JsonLinesSink(str(fifo)), make_results(3)[4]
+        got, lines = [], 300
+
+        def read():
+            os.set_blocking(reader, True)
+            while data := os.read(reader, 1 << 16):
+                got.append(data)
+
+        thread = threading.Thread(target=read)
+        thread.start()
+        for _ in range(lines):
+            sink.write(result, {})
+        sink.close()
+        thread.join()
+        os.close(reader)
+        assert b"".join(got).count(b"\n") == lines
+
+
+def _read(descriptor):
+    try:
+        return os.read(descriptor, 1 << 20)
+    except BlockingIOError:
+        return b""

@@ -1,0 +1,91 @@
+"""Diagnostics of the ROS 2 sink: once a second, and true about silence and recordings."""
+
+import time
+from dataclasses import replace
+
+import pytest
+from ros2_samples import ENVIRONMENT, contact, sink
+
+pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+
+from edge_samples import BASELINE, make_contract, make_scan
+
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.sinks.registry import open_sink
+from edge.sinks.ros2.dds_types import DiagnosticArray
+from edge.sinks.ros2.diagnostics import Level
+from edge.sinks.ros2.sink import Ros2Sink
+
+__all__ = ["sink"]
+
+
+class Clock:
+    def __init__(self):
+        self.now_ns = 10**12
+
+    def __call__(self):
+        return self.now_ns
+
+
+def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
+    clock, published = Clock(), []
+    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock, unix_ns=lambda: 1_700_000_000_123_456_789)
+    sink._publish = lambda writer, message: published.append(message)
+
+    def statuses():
+        taken = [message for message in published if isinstance(message, DiagnosticArray)]
+        published.clear()
+        return [(status.level, status.message) for array in taken for status in array.status]
+
+    scan = make_scan(1, time_ns=clock.now_ns)
+    idle = Result(scan, "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
+    for _ in range(250):
+        clock.now_ns += 10_000_000
+        sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns)), {"dropped": 2})
+    assert statuses() == [(Level.WARN, "2 dropped"), (Level.OK, "idle")]
+    sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
+    clock.now_ns += 1_500_000_000
+    sink.wait()
+    sink.wait()
+    assert statuses() == [(Level.STALE, "no scan for 2 s; bus-off")]
+    sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
+    sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
+    clock.now_ns += 1_000_000_000
+    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), dead={3: "stuck"}), {"dropped": 2})
+    assert statuses() == [(Level.WARN, "without taxel 3 (stuck)")]
+    assert sink._header(10**12 + 5, "4").stamp.nanosec == 123_456_794, "wall time, from the start's on"
+    sink.close()
+
+
+DAYS_NS = 3 * 86_400 * 10**9
+
+
+def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_silent():
+    """Recorded on a machine that was up for three days more than this one."""
+    recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
+    published, later_ns = [], time.monotonic_ns() + 60 * 10**9
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in ENVIRONMENT.items():
+            patch.setenv(name, value)
+        sink = open_sink("ros2:skin", make_contract(), unix_offset_ns=offset_ns, source="replay")
+    sink._clock_ns = lambda: later_ns
+    sink._publish = lambda writer, message: published.append(message)
+    result = contact(1, source="replay", force_n=1.0)
+    sink.write(replace(result, scan=replace(result.scan, time_ns=recorded_ns)), {})
+    sink.close()
+    stamps = {one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in published}
+    assert stamps == {recorded_ns + offset_ns}
+    said = [status for one in published if isinstance(one, DiagnosticArray) for status in one.status]
+    assert [status.message for status in said] == ["REPLAY, not a sensor", "ended"]
+    assert "scan_age_s" not in {pair.key for status in said for pair in status.values}
+
+
+def test_what_a_link_said_of_an_outage_holds_until_the_next_scan(sink):
+    sink.write(contact(1), {})
+    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
+    assert sink._sensors["4"].trouble == {"lost": "the plug is out"}
+    sink.write(contact(2), {})
+    assert not sink._sensors["4"].trouble
+    sink.tell(Event(time.monotonic_ns(), "silent", "5", "another one is silent"), {})
+    assert not sink._sensors["4"].trouble and sink._sensors["4"].shown, "what 4 shows is as true as before"

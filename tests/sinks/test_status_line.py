@@ -1,0 +1,161 @@
+"""Status line on a terminal."""
+
+import contextlib
+import io
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, FakeModel, make_scan
+from sink_samples import RUN, Terminal, make_results, make_sure_results
+
+from edge.perception.event import Event
+from edge.perception.runtime import Runtime
+from edge.sinks.event_printer import MessageSink
+from edge.sinks.status_line import StatusSink
+
+
+def test_what_others_wrote_does_nothing_to_the_terminal():
+    stream = io.StringIO()
+    MessageSink(stream).tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
+    assert stream.getvalue() == "edge-sr: \\x1b[2J\\x9b\\rpad\\n\\ud800 in µm\n"
+
+
+def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
+    stream, now_s = io.StringIO(), [0.0]
+    messages = MessageSink(stream, hint="is it powered?", clock_s=lambda: now_s[0])
+    for now_s[0] in np.arange(0, 60, 0.5):
+        messages.wait()
+    hints = [f"edge-sr: no scan in {silent_s} s: is it powered?" for silent_s in (5, 10, 20, 40)]
+    assert stream.getvalue().splitlines() == hints
+    messages.write(make_results(1)[0], RUN)
+    now_s[0] = 1000.0
+    messages.wait()
+    assert stream.getvalue().splitlines() == hints
+
+
+class TestStatus:
+    def test_a_finger_that_is_silent_does_not_stand_there_as_if_it_were_not(self):
+        now_s = [0.0]
+        sink = StatusSink(Terminal(), clock_s=lambda: now_s[0], columns=lambda: 200)
+        for result in make_results(1):
+            sink.write(result, {})
+        now_s[0] = 2.0
+        sink.write(make_results(2)[2], {})
+        assert "6 no scan for 2 s" in sink.line() and "4 no scan" not in sink.line()
+
+    def make(self, columns=200, **settings):
+        self.now_s = 0.0
+        self.stream = Terminal()
+        return StatusSink(self.stream, clock_s=lambda: self.now_s, columns=lambda: columns, **settings)
+
+    def shown(self):
+        return [line.removesuffix("\x1b[K") for line in self.stream.getvalue().split("\r")[1:]]
+
+    def test_the_line_says_source_state_taps_force_area_time_rate_and_losses(self):
+        sink = self.make()
+        ticks = iter(range(0, 10**9, 250_000))
+        for result in make_results(4, clock_ns=lambda: next(ticks)):
+            sink.write(result, RUN)
+        assert sink.line() == (
+            "EMULATED | 4 contact tap 1 3002 counts 22 mm2 250 us 100 Hz"
+            " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overrun | 3 torn"
+            f" | baseline {BASELINE.id} 12 s old"
+        )
+
+    def test_newtons_where_calibrated_and_no_source_for_a_device(self):
+        sink = self.make()
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, counts_per_newton=1000)
+        sink.write(runtime.push(make_scan(0, press_counts=3000)), {})
+        assert sink.line().startswith("4 contact tap 1 3.00 N 22 mm2 ")
+
+    def test_a_model_that_gives_deviations_says_how_far_off_it_may_be(self):
+        sink = self.make()
+        ticks = iter(range(0, 10**9, 250_000))
+        for result in make_sure_results(4, clock_ns=lambda: next(ticks)):
+            sink.write(result, {})
+        assert " counts 22 mm2 +-0.064 mm 250 us 100 Hz" in sink.line() and sink.line().isascii()
+
+    def test_dead_taxels_are_named(self):
+        sink = self.make()
+        result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan())
+        sink.write(replace(result, dead={3: "stuck", 7: "silent"}, filled="neighbours"), RUN)
+        assert "4 idle without taxel 3,7 " in sink.line() + " "
+
+    def test_a_note_while_zeroing_is_shown(self):
+        sink = self.make()
+        runtime = Runtime(FakeModel(), source="replay", baselines={"9": BASELINE})
+        sink.write(runtime.push(make_scan()), {})
+        assert sink.line() == "REPLAY | 4 no stored baseline for sensor 4, only for 9: zeroing"
+
+    def test_it_is_rewritten_at_most_ten_times_a_second(self):
+        sink = self.make()
+        result = make_results(1)[0]
+        for _ in range(101):
+            sink.write(result, {})
+            self.now_s += 1 / 64
+        assert len(self.shown()) == 1 + 100 // 7  # every 7/64 s
+
+    def test_the_rate_follows_the_sensor(self):
+        sink = self.make()
+        runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+        time_ns = 0
+        for period_ns, rate in ((10_000_000, "100 Hz"), (20_000_000, "50 Hz"), (0, "50 Hz"), (-5_000_000, "50 Hz")):
+            for _ in range(200):
+                time_ns += period_ns
+                sink.write(runtime.push(make_scan(time_ns=time_ns)), {})
+            assert f" {rate} |" in sink.line()
+        sink.write(runtime.push(make_scan(time_ns=time_ns + 10_000_000)), {})
+        sink.write(runtime.push(make_scan(time_ns=time_ns + 20_000_000)), {})
+        assert " 53 Hz |" in sink.line(), "a single scan moves it little"
+
+    def test_silence_is_shown(self):
+        sink = self.make()
+        sink.wait()
+        assert self.shown()[-1] == "no scan for 0 s"
+        sink.write(make_results(1)[0], {})
+        self.now_s = 0.99
+        sink.wait()
+        assert "no scan" not in self.shown()[-1]
+        self.now_s = 3.2
+        sink.wait()
+        assert self.shown()[-1].startswith("EMULATED | no scan for 3 s | 4 idle")
+
+    @pytest.mark.parametrize("columns", [1, 2, 10, 40, 80])
+    def test_it_never_wraps(self, columns):
+        sink = self.make(columns)
+        for result in make_results(8):
+            sink.write(result, RUN)
+            self.now_s += 1
+        assert max(len(line) for line in self.shown()) == columns - 1
+
+    def test_the_last_line_stands_at_the_end(self):
+        sink = self.make()
+        first, last = make_results(1)
+        sink.write(first, {})
+        sink.write(last, {})
+        sink.close()
+        assert "| 6 no stored" in self.stream.getvalue().rsplit("\r", 1)[1]
+        assert self.stream.getvalue().endswith("\n")
+
+    def test_a_window_that_was_closed_ends_nothing(self):
+        self.now_s = 0.0
+        leader, follower = os.openpty()
+        stream = os.fdopen(follower, "w")
+        sink = StatusSink(stream, clock_s=lambda: self.now_s, columns=lambda: 80)
+        sink.write(make_results(1)[0], {})
+        os.close(leader)
+        self.now_s = 1.0
+        sink.write(make_results(1)[0], {})
+        sink.close()
+        with contextlib.suppress(OSError):  # it still has what nobody took
+            stream.close()
+
+    def test_nothing_where_there_is_no_terminal(self):
+        stream = io.StringIO()
+        sink = StatusSink(stream)
+        sink.write(make_results(1)[0], {})
+        sink.wait()
+        sink.close()
+        assert stream.getvalue() == ""

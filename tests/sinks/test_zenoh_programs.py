@@ -1,0 +1,119 @@
+"""Programs that put results over zenoh: their end, and the bench."""
+
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from bridge_samples import write_recording
+from edge_samples import ROOT, ended, make_scan, write_model
+from zenoh_load import PacedLink
+from zenoh_load import _figures as figures_of
+from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts
+
+from edge.terminal.forced_end import EXIT_FORCED
+
+zenoh = pytest.importorskip("zenoh")
+
+__all__ = ["consume", "endpoint"]
+
+
+def sending(*words, **settings):
+    """A program that puts every scan, and hears signals as from a terminal."""
+    command = [sys.executable, "-m", "edge.cli.main", *words, "--every-scan"]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE} | settings
+    return ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes))
+
+
+def until_quiet(pipe, quiet_s=1.0):
+    while select.select([pipe], [], [], quiet_s)[0] and os.read(pipe.fileno(), 1 << 20):
+        pass
+
+
+class TestEndOfTheProgram:
+    """Two seconds are promised; a busy machine may take longer."""
+
+    def test_a_peer_that_is_gone_holds_up_no_end(self, endpoint, consume):
+        consumer = consume(endpoint)
+        with sending("--source", "demo:loop", "--sink", f"zenoh:grip?connect={endpoint}") as program:
+            while consumer.next()[0] != "got":
+                pass
+            consumer.process.send_signal(signal.SIGSTOP)
+            time.sleep(3)
+            begin_s = time.monotonic()
+            program.send_signal(signal.SIGTERM)
+            words = program.communicate()[1].decode()
+        assert program.returncode == 0 and "EMULATED demo:" in words
+        assert time.monotonic() - begin_s < 9, "zenoh itself waits for ten seconds"
+
+    def test_a_replay_that_waits_for_a_peer_that_is_gone_is_ended_by_force(self, endpoint, consume, tmp_path):
+        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
+        press = np.where(np.arange(8000) < 110, 0, 2000 + 7 * np.arange(8000) % 997)
+        noise = np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
+        counts = make_scan(0).counts + noise
+        counts[:, 2] += press[:, None, None] // 16
+        recording = write_recording(tmp_path / "long.csv", counts)
+        consumer = consume(endpoint)
+        words = ["replay", str(recording), "--zero", "--rate-hz", "2000", "--model", str(model)]
+        sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
+        with sending(*words, *sinks, stdout=subprocess.PIPE) as program:
+            while consumer.next()[0] != "got":
+                pass
+            consumer.process.send_signal(signal.SIGSTOP)
+            until_quiet(program.stdout)  # what zenoh has no room for holds up everything, for five seconds at most
+            program.send_signal(signal.SIGTERM)
+            words = program.communicate()[1].decode()
+        assert program.returncode == EXIT_FORCED
+        assert re.fullmatch(
+            r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words
+        )
+
+
+def test_the_bench_counts_what_comes():
+    wrote = [
+        {"written": 10, "patterns": 4, "dropped": 2, "cpu_s": 0.5},
+        {"written": 10, "patterns": 4, "dropped": 0, "cpu_s": 0.3},
+    ]
+    got = {"latencies_us": {"scan": [1000.0] * 15, "pattern": [2000.0] * 6}, "bytes": 4_000_000, "cpu_s": 0.1}
+    told = (10, 4, 2, 1, 1, 1, 2, 2, 2, 10, 25, 25, 40, 5)
+    assert figures_of(wrote, got, 2.0) == pytest.approx(told)
+
+
+def test_the_bench_gives_every_sensor_a_scan_a_tick():
+    sensors, given = ("4", "6"), []
+    link = PacedLink([make_scan(number) for number in range(150)], sensors, ticks=3)
+    while not link.ended:
+        given += link.read(1)
+    assert [(scan.sensor, scan.number) for scan in given] == [(name, tick) for tick in range(3) for name in sensors]
+    assert all(scan.time_ns <= later.time_ns for scan, later in pairwise(given))
+    assert given[0].counts.tolist() == make_scan(0).counts.tolist()
+
+
+def start_bench(*words, **settings):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [sys.executable, str(ROOT / "tests/system/zenoh_load.py"), "--sensors", "1", "--processes", "1", *words]
+    return ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, start_new_session=True, **pipes, **settings))
+
+
+def test_an_interrupted_bench_ends_with_all_its_processes_and_one_line(tmp_path):
+    with start_bench("--out", str(tmp_path), preexec_fn=hear_interrupts) as bench:
+        while not bench.stdout.readline().startswith("|---"):
+            assert bench.poll() is None
+        time.sleep(0.5)  # its processes are starting, or have started
+        os.killpg(bench.pid, signal.SIGINT)
+        _, errors = bench.communicate()  # which all of them hold open
+    assert (bench.returncode, errors) == (130, "edge-sr: zenoh stopped before its end\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bench_that_cannot_write_says_so_before_it_measures(tmp_path):
+    (tmp_path / "taken").touch()
+    with start_bench("--out", str(tmp_path / "taken")) as bench:
+        out, errors = bench.communicate()
+    assert (bench.returncode, out) == (1, "") and re.fullmatch(r"zenoh: .*File exists: '.*/taken'\n", errors)

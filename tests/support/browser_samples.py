@@ -1,0 +1,197 @@
+"""Live page in headless Chromium: runs to look at, and what a person sees of them."""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from importlib import import_module
+from queue import Empty, Queue
+
+import numpy as np
+import pytest
+from edge_samples import ROOT
+
+from edge.inference.bundled import demo_recording
+from edge.terminal.heatmap import colours
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.geometry import USPA44
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.scan import ScanSeries
+from firmware_bridge.zeroing.baseline import BaselineEstimator, save_baselines
+
+CHROMIUM = shutil.which("chromium")
+if os.environ.get("EDGE_BROWSER") != "1":  # a machine with 1 must have both, so that a missing one fails
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium", allow_module_level=True)
+    pytest.importorskip("playwright.sync_api")
+playwright = import_module("playwright.sync_api")
+
+TIMEOUT_MS = 60_000
+PERIOD_NS = 10_000_000
+TOKEN = "of-twelve-letters"
+NOISE_COUNTS = 3
+"""Noise of a pad that is pressed and held, since a taxel that repeats itself is taken for a stuck one."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright.expect.set_options(timeout=TIMEOUT_MS)  # as all that is waited for: the machine may be busy
+    with playwright.sync_playwright() as engine:
+        chromium = engine.chromium.launch(executable_path=CHROMIUM, args=["--js-flags=--expose-gc"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def open_page(browser):
+    """Function that opens pages; in none of them may a request leave the server, or an error come."""
+    asked, wrong, contexts = [], [], []
+
+    def open_page(url, **settings):
+        script = settings.pop("script", None)
+        context = browser.new_context(**{"viewport": {"width": 1280, "height": 800}} | settings)
+        contexts.append(context)
+        context.set_default_timeout(TIMEOUT_MS)
+        if script is not None:
+            context.add_init_script(script)
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("websocket", lambda socket: asked.append(socket.url))
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
+        page.goto(url)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    strangers = [url for url in asked if not re.match(r"(http|ws)://127\.0\.0\.1:\d+/|data:", url)]
+    assert asked and strangers == []
+    # That nobody answers, or not as wanted, is Chromium's to tell, and what some of these tests are about.
+    told = ("ERR_CONNECTION_REFUSED", "403 (Forbidden)", "Unexpected response code: 403", "503")
+    assert [text for text in wrong if not any(words in text for words in told)] == []
+
+
+@contextlib.contextmanager
+def edge_sr(*arguments):
+    """Run `edge-sr --view 0` and yield it with the address that it reports."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "edge.cli.main", "--view", "0", *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    lines: Queue[str] = Queue()
+    reader = threading.Thread(target=lambda: [lines.put(line) for line in process.stderr])
+    reader.start()
+    try:
+        said = []
+        while True:
+            try:
+                said.append(lines.get(timeout=TIMEOUT_MS / 1000))
+            except Empty:
+                raise AssertionError(f"no address in {said}") from None
+            if said[-1].startswith("live page: "):
+                break
+        process.url = said[-1].split(": ", 1)[1].strip()
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.wait(timeout=TIMEOUT_MS / 1000)
+        reader.join()
+        process.stderr.close()
+
+
+@pytest.fixture(scope="module")
+def demo():
+    with np.load(demo_recording()) as data:
+        return dict(data)
+
+
+@pytest.fixture(scope="module")
+def folder(demo, tmp_path_factory):
+    """Folder with stored baselines of the demo's sensor under two names."""
+    folder = tmp_path_factory.mktemp("view")
+    save_baselines(folder / "zero.json", [zeroed(demo, sensor) for sensor in ("4", "6")])
+    return folder
+
+
+def zeroed(demo, sensor):
+    scans, taken = ScanSeries(sensor, USPA44), BaselineEstimator()
+    for number, counts in enumerate(demo["counts"]):
+        baseline = taken.push(scans.close(counts.astype(np.int32), number * PERIOD_NS))
+        if baseline is not None:
+            return baseline
+    raise AssertionError("the demo does not begin at rest")
+
+
+@contextlib.contextmanager
+def emulated(folder, *tracks, options=()):
+    """Yield a run on an emulated bus that plays counts (n, 3, 4, 4) of one or more sensors again and again."""
+    recordings = []
+    for counts in tracks:
+        path = folder / f"{len(list(folder.glob('*.npz')))}.npz"
+        facts = {"format": "tactile-recording", "version": 1, "sensor": ["4"] * len(counts)}
+        times_ns = np.arange(len(counts)) * PERIOD_NS
+        np.savez(path, **facts, scan=np.arange(len(counts)), time_ns=times_ns, counts=counts.astype(np.int32))
+        recordings.append(load_recording(path))
+    with Emulator(recordings, loop=True) as emulator:
+        stored = ["--baseline", folder / "zero.json", "--model", "stsr-int8", "--every-scan"]
+        with edge_sr("--source", f"slcan:{emulator.port}", *stored, *options) as run:
+            run.emulator = emulator
+            yield run
+
+
+def noise(count, seed=1):
+    return np.random.default_rng(seed).integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (count, 3, 4, 4))
+
+
+def pressed(demo):
+    """Return counts of the demo's first tap at its deepest, and the true pattern."""
+    taps = np.flatnonzero(demo["tap"] == 0)
+    peak = taps[np.argmax(demo["indentation_mm"][taps])]
+    return demo["counts"][peak], demo["unit_patterns"][0].astype(float) * float(demo["indentation_mm"][peak])
+
+
+# What a person sees of a page.
+
+
+def part(page, name, sensor="4"):
+    return page.locator(f'[data-sensor="{sensor}"] [data-part="{name}"]')
+
+
+def number(page, name, sensor="4"):
+    return page.locator(f'[data-sensor="{sensor}"] [data-number="{name}"]')
+
+
+def live(page, sensor="4"):
+    page.wait_for_selector(f'[data-sensor="{sensor}"] [data-part="field"][data-live="yes"]')
+
+
+def word(page, text, sensor="4"):
+    playwright.expect(part(page, "word", sensor)).to_contain_text(text)
+
+
+def logged(page, text):
+    playwright.expect(page.locator("#log li").filter(has_text=text).first).to_be_visible()
+
+
+def shares(pixels):
+    """Return the shares of the scale of a canvas's colours, by the terminal's own table of the same colours."""
+    height, width, *data = pixels
+    rgba = np.array(data, dtype=float).reshape(height, width, 4)
+    assert (rgba[..., 3] == 255).all()
+    steps = np.linspace(0, 1, 256)
+    return steps[np.abs(rgba[..., None, :3] - colours(steps)).sum(axis=-1).argmin(axis=-1)]
+
+
+def likeness(shown, truth):
+    return float(np.corrcoef(shown.ravel(), truth.ravel())[0, 1])

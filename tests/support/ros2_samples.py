@@ -1,0 +1,44 @@
+"""Results for the ROS 2 sink, and the environment that keeps its tests to this machine."""
+
+import os
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+
+from edge_samples import make_scan
+
+from edge.perception.result import Result
+from edge.sinks.ros2.sink import Ros2Sink
+
+TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
+"""Tag that keeps other test runs on this machine apart."""
+ENVIRONMENT = {
+    "ROS_DOMAIN_ID": str(1 + os.getpid() % 90),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    "CYCLONEDDS_URI": TAG,
+}
+
+
+def contact(number, *, sensor="4", source="device", **changes):
+    random = np.random.default_rng(number)
+    maps = {name: random.random((40, 40), dtype=np.float32) for name in ("pattern", "deviation")}
+    scan = make_scan(number, sensor=sensor, time_ns=time.monotonic_ns())
+    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0, **maps)
+    return replace(made, **changes)
+
+
+def without_pattern(result, **changes):
+    scan = replace(result.scan, time_ns=time.monotonic_ns())
+    return replace(result, scan=scan, pattern=None, deviation=None, **changes)
+
+
+@pytest.fixture
+def sink():
+    made = Ros2Sink("/skin", ENVIRONMENT)
+    yield made
+    if hasattr(made, "_domain"):
+        made.close()

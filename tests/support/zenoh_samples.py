@@ -1,0 +1,129 @@
+"""Results over zenoh, and consumers of them in processes of their own."""
+
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+
+import pytest
+from edge_samples import BASELINE, ROOT, FakeModel, make_pad_contract, make_scan
+
+from edge.perception.runtime import Runtime
+
+zenoh = pytest.importorskip("zenoh")
+
+CONTRACT = make_pad_contract(interval_factor=1.6)
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}", "PYTHONUNBUFFERED": ""}
+# Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
+CONSUME = """
+import json, sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+def tell(*words):
+    print(json.dumps(words), flush=True)
+def take(sample):
+    writer, payload = str(sample.timestamp.get_id()), sample.payload.to_bytes().hex()
+    tell("got", str(sample.key_expr), str(sample.encoding), writer, payload)
+def follow(token):
+    tell("came" if token.kind == zenoh.SampleKind.PUT else "went", str(token.key_expr))
+here = lambda callback: zenoh.handlers.Callback(callback, indirect=False)
+with zenoh.open(config) as session:
+    session.liveliness().declare_subscriber("grip/alive/*", here(follow), history=True)
+    session.declare_subscriber("grip/**", here(take))
+    tell("listens")
+    time.sleep(100)
+"""
+
+
+def free_endpoint():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{one.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+def listening(endpoint, *connect):
+    """Open a session of zenoh's own that listens there."""
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/endpoints", json.dumps(connect))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+class Consumer:
+    def __init__(self, endpoint):
+        self.process = subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE)
+        self.lines = queue.SimpleQueue()
+        self.reader = threading.Thread(target=self.read)  # at once: a full pipe would hold up the consumer
+        self.reader.start()
+        assert self.next() == ["listens"]
+
+    def read(self):
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(line)
+
+    def next(self):
+        return json.loads(self.lines.get(timeout=60))
+
+    def until_gone(self):
+        """Return the messages until the writer has gone, as key, encoding, writer, payload; and who came and went."""
+        told = [self.next()]
+        while told[-1][0] != "went":
+            told.append(self.next())
+        with suppress(queue.Empty):  # that it goes may overtake what it sent
+            while True:
+                told.append(json.loads(self.lines.get(timeout=0.6)))
+        messages = [(*words[1:-1], bytes.fromhex(words[-1])) for words in told if words[0] == "got"]
+        return messages, [words for words in told if words[0] != "got"]
+
+    def stop(self):
+        self.process.kill()
+        self.process.wait()
+        self.reader.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def consume():
+    consumers = []
+
+    def start(endpoint):
+        consumers.append(Consumer(endpoint))
+        return consumers[-1]
+
+    yield start
+    for consumer in consumers:
+        consumer.stop()
+
+
+def make_results(count, **of_the_scans):
+    """Return results in contact from the second on; every other of those as the one before it."""
+    runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
+    presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
+    return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]
+
+
+def wait_for(condition, within_s=10):
+    end_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def hear_interrupts():
+    """Restore SIGINT as in a terminal, since the tests may have been started with it ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
