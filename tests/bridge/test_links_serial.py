@@ -17,6 +17,7 @@ from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links import fd_reader as bursts
+from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, USPA44_MAP, trigger_frame
