@@ -80,18 +80,6 @@ def test_a_press_while_zeroing_is_refused_and_zeroing_starts_over():
     assert push_all(estimator, still(100, 1))[-1] is not None
 
 
-@pytest.mark.parametrize(("axis", "name", "limit"), [(0, "x", 15), (1, "y", 15), (2, "z", 25)])
-def test_shear_has_a_limit_of_its_own(axis, name, limit):
-    quiet = np.broadcast_to(REST, (100, 3, 4, 4)).copy()
-    quiet[:, 0, 0, 0] += np.arange(100) % 2  # so that no scan is sent again
-    wobble = np.where(np.arange(100) % 10 == 0, limit, 0)
-    quiet[:, axis, 3, 1] += wobble
-    assert push_all(BaselineEstimator(), quiet)[-1] is not None
-    quiet[:, axis, 3, 1] += wobble // limit
-    with pytest.raises(BaselineRefusedError, match=rf"taxel \(3, 1\) {name} moved by {limit + 1} counts"):
-        push_all(BaselineEstimator(), quiet)
-
-
 def test_slow_creep_is_refused():
     counts = still(100)
     counts[:, 2, 0, 3] += np.linspace(0, 22, 100).astype(np.int32)

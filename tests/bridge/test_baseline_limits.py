@@ -10,14 +10,14 @@ from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline, BaselineEstimator, load_baselines, save_baselines
 
 
-def zeroed(moved_z: np.ndarray) -> Baseline | None:
+def zeroed(moved: np.ndarray, axis: int = 2) -> Baseline | None:
     """The baseline of a pad one of whose taxels moved so, in [counts] a scan, and no other."""
-    series, estimator = ScanSeries("4", USPA44), BaselineEstimator(min_scans=len(moved_z))
+    series, estimator = ScanSeries("4", USPA44), BaselineEstimator(min_scans=len(moved))
     baseline = None
-    for number, counts in enumerate(moved_z):
+    for number, counts in enumerate(moved):
         readings = REST.copy()
         readings[0, 0, 0] += number % 2  # so that no scan is sent again
-        readings[2, 3, 1] += counts
+        readings[axis, 3, 1] += counts
         baseline = estimator.push(series.close(readings, number))
     return baseline
 
@@ -27,6 +27,14 @@ def test_one_scan_in_twenty_may_be_far_off_and_one_more_is_motion(counts):
     assert zeroed(np.where(np.arange(100) % 20 == 7, counts, 0)) is not None
     with pytest.raises(BaselineRefusedError, match=r"taxel \(3, 1\) z moved by 100 counts"):
         zeroed(np.where((np.arange(100) % 20 == 7) | (np.arange(100) == 50), counts, 0))
+
+
+@pytest.mark.parametrize(("axis", "name", "limit"), [(0, "x", 15), (1, "y", 15), (2, "z", 25)])
+def test_shear_has_a_limit_of_its_own(axis, name, limit):
+    wobble = np.arange(100) % 10 == 0
+    assert zeroed(limit * wobble, axis) is not None
+    with pytest.raises(BaselineRefusedError, match=rf"taxel \(3, 1\) {name} moved by {limit + 1} counts"):
+        zeroed((limit + 1) * wobble, axis)
 
 
 @pytest.mark.parametrize("at_the_end", [True, False])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP, Reading
-from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -361,17 +361,6 @@ def test_a_broken_link_leaves_no_half_scan_to_be_joined():
     (scan,) = feed(assembler, [*cycle(7)[9:], *cycle(8)], 100)
     assert set((scan.counts[0].ravel() % 1000).tolist()) == {8}
     assert counters(assembler)["abandoned"] == 9 and counters(assembler)["resynchronised"] == 7
-
-
-def test_a_pause_is_measured_by_the_device_s_own_clock():
-    """Its times on our clock are a guess, and a better one may hide a pause: half a press would join another's half."""
-    assembler, clock = ScanAssembler(USPA44_MAP), DeviceClock(1_000_000, None)
-    ms = 1_000_000
-    feed(assembler, cycle(0))
-    for number, reading in enumerate(cycle(1)[:9]):
-        assembler.feed(reading, 400 * ms, clock.at(number, 400 * ms))
-    (torn,) = assembler.feed(cycle(2)[9], 450 * ms, clock.at(350, 450 * ms))
-    assert not torn.complete
 
 
 def test_counters_are_asked_for_while_another_thread_finds_a_sensor():

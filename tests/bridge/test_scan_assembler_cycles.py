@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, Reading
-from firmware_bridge.scans.device_clock import DeviceTime
+from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS, SHORTEST_PAUSE_NS
@@ -206,3 +206,13 @@ def test_two_frames_that_changed_places_are_of_one_scan():
     assembler, swapped = ScanAssembler(USPA44_MAP), readings(1)
     swapped[6], swapped[7] = swapped[7], swapped[6]
     assert [scan.whole for scan in feed(assembler, readings(0) + swapped)] == [True, True]
+
+
+def test_a_pause_is_measured_by_the_device_s_own_clock():
+    """Its times on our clock are a guess, and a better one may hide a pause: half a press would join another's half."""
+    assembler, clock = ScanAssembler(USPA44_MAP), DeviceClock(1_000_000, None)
+    feed(assembler, readings(0))
+    for number, reading in enumerate(readings(1)[:9]):
+        assembler.feed(reading, 400 * MS, clock.at(number, 400 * MS))
+    (torn,) = assembler.feed(readings(2)[9], 450 * MS, clock.at(350, 450 * MS))
+    assert not torn.complete

@@ -77,7 +77,10 @@ SUBJECTS = {
     "drift": Subject(
         "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
     ),
-    "contract": Subject("edge.inference.contract", ("tests/runtime/test_session.py", "tests/bridge/test_pad.py")),
+    "contract": Subject(
+        "edge.inference.contract",
+        ("tests/runtime/test_contract_limits.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
+    ),
 }
 
 EQUIVALENT: dict[str, dict[str, str]] = {
@@ -96,6 +99,10 @@ EQUIVALENT: dict[str, dict[str, str]] = {
         "deformation: signed.min() >= -half -> signed.min() > -half": "the slower way gives the same",
         "push: 0 -> 1": "what a silent taxel reads is the same in all scans, and its rest is NaN",
         "save_baselines: 1 -> 2": "the blanks before a line of the file",
+    },
+    "contract": {
+        "_check_pad_and_traction: False -> True": "asked for nothing but whether it is of a kind",
+        "_is_pad_input: return False -> return None": "its caller asks for nothing but whether it is true",
     },
     "drift": {
         "push: 1000000000.0 -> 1000000001.0": "seconds that are off by a billionth",
