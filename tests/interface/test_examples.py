@@ -14,6 +14,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_model
 
 from edge.api import Result
+from edge.perception.event import Note
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Notice
@@ -166,7 +167,11 @@ def reading(state="idle", sensor="4", **said):
 WRONG = {
     "the reading is 50": {"age_ms": 5000},
     "taxels [5] are dead": {"dead": {5: "stuck"}},
-    "not ready: taxel 3 was not heard": {"state": "incomplete", "note": "taxel 3 was not heard", "force_counts": None},
+    "not ready: taxel 3 was not heard": {
+        "state": "incomplete",
+        "notes": (Note("dead", "taxel 3 was not heard"),),
+        "force_counts": None,
+    },
     "not ready: zeroing": {"state": "zeroing", "force_counts": None},
     "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
 }
