@@ -12,8 +12,8 @@ from firmware_bridge.zeroing.drift_tracker import Drift
 BUCKETS_PER_OCTAVE: Final = 32
 """Resolution of the run-time histogram: a quantile is at most 2.2 % too high."""
 SHORTEST_NS: Final = 1_000_000_000
-"""Of a run whose rate is told: the first scans have waited for the model, and come all at once, which over less makes
-some 100 Hz look like 135."""
+"""Shortest run whose rate is reported: the first scans have waited for the model and come at once, and over less time
+100 Hz looks like 135."""
 STAGES: Final = ("zeroing", "incomplete", "idle", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 LONGEST_US: Final = 2.0**26

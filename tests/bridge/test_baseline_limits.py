@@ -1,4 +1,4 @@
-"""What zeroing and a baseline's file still take, and what is one too many."""
+"""Limits of zeroing and of a baseline's file: the last value that is taken, and the first that is not."""
 
 import numpy as np
 import pytest

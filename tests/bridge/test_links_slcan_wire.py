@@ -139,7 +139,7 @@ def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatc
 
 
 def test_to_leave_stamps_out_waits_for_a_read_that_may_take_its_time(monkeypatch):
-    """Who reads several links in one thread must not wait for the quiet line of one of them."""
+    """A thread that reads several links must not wait for the quiet line of one of them."""
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         assert device.received(10) == b"C\rS8\rZ1\rO\r" and link.wait_on() is not None

@@ -103,7 +103,7 @@ def _children(node: ast.AST, field: str, value: Any) -> list[tuple[Any, str | in
 
 
 def _changes(node: ast.expr | ast.stmt) -> Iterator[tuple[ast.AST, ast.AST]]:
-    """What a node may be replaced by as a whole."""
+    """Replacements of a node as a whole."""
     match node:
         case ast.Constant(value=bool(value)):
             yield node, ast.Constant(not value)

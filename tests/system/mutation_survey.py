@@ -68,7 +68,11 @@ SUBJECTS = {
     "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
     "assembler": Subject(
         "firmware_bridge.scans.scan_assembler",
-        ("tests/bridge/test_scan_assembler_cycles.py", "tests/bridge/test_scan_assembler.py"),
+        (
+            "tests/bridge/test_scan_assembler_cycles.py",
+            "tests/bridge/test_scan_assembler.py",
+            "tests/bridge/test_slcan_scans.py",
+        ),
     ),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_tap_numbers.py", "tests/runtime/test_taps.py")),
     "baseline": Subject(

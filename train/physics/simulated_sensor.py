@@ -141,7 +141,7 @@ class SimulatedSensor:
         return taps
 
     def _within(self, seen: Footprints) -> Footprints:
-        """What lies under the pad of what lies under the square; depth counts from its own highest point.
+        """Return the part of the square's surface under the pad; depth counts from its own highest point.
 
         Raises:
             ValueError: nothing does at a pose.

@@ -1,0 +1,41 @@
+"""slcan text to scans in one go: cycles read late and in one piece, and the CAN ids that came."""
+
+from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.scans.can_frame_scans import FrameScans
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.slcan_scans import SlcanScans
+
+
+def test_a_cycle_that_was_read_in_one_piece_and_has_a_pause_in_it_is_two():
+    """As after the host stood still: the bus was off between half of one press and half of another."""
+    scans, places = SlcanScans(), USPA44_MAP.wire_order("4")
+
+    def lines(stamps_ms):
+        return b"".join(
+            encode_frame(CanFrame(can_id, bytes([stamp % 251] * 8), timestamp_ms=stamp))
+            for (can_id, _), stamp in zip(places, stamps_ms, strict=True)
+        )
+
+    whole = [*range(100, 116), *range(110, 126)]
+    assert [scan.complete for scan in scans.feed(lines(whole[:16]) + lines(whole[16:]), 0)] == [True, True]
+    broken = lines([*range(59_990, 59_999), *(n % 60_000 for n in range(60_340, 60_347))])
+    assert [int(scan.fresh.sum()) for scan in scans.feed(broken, 10**9)] == [9]
+
+
+def test_every_standard_id_that_came_is_known_whoever_it_is_of():
+    """Whole cycles, half ones, other devices, remote and short frames; extended ids are too many to be kept."""
+    whole = [CanFrame(can_id, bytes(range(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
+    half = [CanFrame(can_id, bytes(range(8))) for can_id, _ in USPA44_MAP.wire_order("6")][:8]
+    others = [CanFrame(0x7F0, bytes(8)), CanFrame(0x123, b"ab"), CanFrame(0x456, b"", remote=True)]
+    frames = [*whole, *whole, *others, CanFrame(0x12345, bytes(8), extended=True), *half]
+    expected = {frame.can_id for frame in (*whole, *others, *half)}
+    text, by_frame = SlcanScans(), FrameScans()
+    text.feed(b"".join(map(encode_frame, frames)), 1)
+    for frame in frames:
+        by_frame.feed(frame, 1)
+    assert text.can_ids == by_frame.can_ids == expected
+    for known in ([frames[:0], half], [half[:3], *[whole] * 5], [whole[10:], *[whole] * 5]):
+        alone = SlcanScans()
+        for number, piece in enumerate(known):
+            alone.feed(b"".join(map(encode_frame, piece)), 10_000_000 * number)
+        assert alone.can_ids == {frame.can_id for piece in known for frame in piece}
