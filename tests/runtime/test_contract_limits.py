@@ -1,4 +1,4 @@
-"""What of a contract is refused by one key alone."""
+"""Refusals of a contract for one key alone, and the last values that are taken."""
 
 from dataclasses import replace
 
