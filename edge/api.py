@@ -30,9 +30,9 @@ from edge.errors import (
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
+from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
-from edge.perception.options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from edge.perception.wrench import Wrench
@@ -57,11 +57,11 @@ from firmware_bridge.errors import (
     SensorFileError,
     SourceError,
 )
-from firmware_bridge.geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.links.parse import DEMO_LOOP
+from firmware_bridge.links.registry import DEMO_LOOP
+from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap, layout_c
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines

@@ -6,9 +6,9 @@ from numbers import Integral, Real
 from typing import Any
 
 from edge.errors import UsageError
-from firmware_bridge.geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.zeroing.baseline import Baseline
 
 

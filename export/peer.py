@@ -18,9 +18,9 @@ from edge.bench.contenders import WEIGHTS_KEY
 from edge.inference.onnx_session import load_session
 from export.errors import ExportError
 from export.graphs.graph import to_model
-from export.integers.rounding import folded
-from firmware_bridge.geometry import USPA44
+from export.quantisation.rounding import folded
 from firmware_bridge.in_place import check_writable, write_in_place
+from firmware_bridge.pad_geometry import USPA44
 from train.networks.cost import macs, parameters_count
 from train.networks.registry import NETWORKS, build
 

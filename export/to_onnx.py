@@ -24,10 +24,10 @@ from export.errors import ExportError
 from export.graphs.graph import known_width, outputs, to_model
 from export.graphs.parity import check_parity
 from export.graphs.writing import Writer
-from export.integers.fine_tune import FineTuning, quantised_well
-from export.integers.int8 import calibration_batch, convolutions, quantised
-from export.integers.rounding import folded
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from export.quantisation.fine_tune import FineTuning, quantised_well
+from export.quantisation.int8 import calibration_batch, convolutions, quantised
+from export.quantisation.rounding import folded
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.dataset import Sequences
 from train.data.files import load_taps

@@ -19,8 +19,8 @@ from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_l
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.in_place import write_in_place
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION, load_recording
 from train.data.batches import Draw, WindowBatches
 from train.data.contact_kinds import fit_kinds

@@ -33,7 +33,7 @@ from typing import Final, cast
 import joblib
 
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.geometry import PADS, USPA44
+from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.dataset import Sequences, join, load_sequences
 from train.data.generation_config import FORCE_N, Generation, one_thread, random_figures, solve_chunk
 from train.data.workers import start_workers

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import BridgeError
-from firmware_bridge.geometry import AXES, USPA44
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train.data.presses import load_presses

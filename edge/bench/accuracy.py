@@ -16,7 +16,7 @@ from edge.evaluation.metrics import volume_mm3
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 
 FORCE_RANGE_N: Final = 5.0
 """Force at which every tap of a frozen set ends, unless the sensor's depth limit comes first."""

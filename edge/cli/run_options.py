@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL
-from edge.perception.options import DEFAULTS, RuntimeOptions
+from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.pipeline.baseline_capture import FEWEST_RECORDED
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final
 
 from edge.doctor.findings import Finding, Verdict
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.base import Link
+from firmware_bridge.pad_geometry import USPA44
 
 LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 LATENCY_LIMIT_MS: Final = 2

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 
 AS_MAPPED: Final = "as the id map says"
 """Name of the orientation in which nothing is to be corrected."""

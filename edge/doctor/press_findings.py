@@ -6,7 +6,7 @@ from typing import Final
 from edge.doctor.findings import Finding, Verdict
 from edge.doctor.pad_orientation import AS_MAPPED, FEWEST_CORNERS, find_axes, find_order, orders, why_no_order, z_sign
 from edge.doctor.press_guide import Answer
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 
 USUAL_COUNTS_PER_NEWTON: Final = (900.0, 1700.0)

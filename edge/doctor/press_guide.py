@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.pad_orientation import CORNERS, Press, corner_taxel
-from edge.perception.options import OFF_COUNTS, ON_COUNTS
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 
 HOLD_SCANS: Final = 20
 FREE_SCANS: Final = 20

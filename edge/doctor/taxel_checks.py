@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from edge.doctor.findings import Finding, Verdict
 from edge.doctor.scan_statistics import Samples, around_counts
 from edge.perception.change_gate import NOISE_COUNTS
-from edge.perception.options import OFF_COUNTS
+from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
-from firmware_bridge.geometry import AXES
+from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.zeroing.baseline import CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 
 NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))

@@ -17,7 +17,7 @@ from edge.evaluation.metrics import (
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import Contract
 from edge.perception.runtime import Model
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 
 
 def judge(

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.expected_error import is_confidence, is_number
-from firmware_bridge.geometry import AXES, SensorGeometry
-from firmware_bridge.scans.pad import PAD_RANGES, Pad
+from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 5
 EARLIER_VERSION: Final = 4

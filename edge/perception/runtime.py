@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from edge.errors import WindowError
 from edge.inference.contract import Contract
 from edge.inference.expected_error import expect
+from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import TaxelEstimator, widening
 from edge.perception.event import Event, EventKind, Note, Untimed
-from edge.perception.options import DEFAULTS, RuntimeOptions
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.wrench import wrench_of
 from edge.validation import check_baselines, check_mountings, check_pads, check_positive
-from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 

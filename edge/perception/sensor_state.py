@@ -16,9 +16,9 @@ from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from edge.perception.zero_on_demand import Rezeroing
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import TAPS_FORGOTTEN_NS
 from firmware_bridge.zeroing.baseline import Baseline, BaselineEstimator, deformation

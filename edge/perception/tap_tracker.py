@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import UsageError
-from edge.perception.options import DEFAULTS, RuntimeOptions
-from firmware_bridge.geometry import USPA44
+from edge.perception.contact_options import DEFAULTS, RuntimeOptions
+from firmware_bridge.pad_geometry import USPA44
 
 MIN_TAP_SCANS: Final = 2
 """Fewest scans of a tap. A touch in a single scan may be a flipped bit; it is reported, but not remembered as a tap."""

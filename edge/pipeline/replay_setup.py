@@ -8,9 +8,9 @@ from pathlib import Path
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import settled, with_recorded
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.geometry import PADS, SensorGeometry
-from firmware_bridge.links.parse import place_recordings, recording_paths
+from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.pad_geometry import PADS, SensorGeometry
 from firmware_bridge.recording.formats import npz_baselines
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.can_id_maps import ModelMap

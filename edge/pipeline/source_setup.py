@@ -9,7 +9,7 @@ from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.base import Link, SourceKind
-from firmware_bridge.links.parse import DEMO_LOOP, open_sources
+from firmware_bridge.links.registry import DEMO_LOOP, open_sources
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
@@ -52,7 +52,7 @@ def links_to(
     """Return the links to the requested sources, not yet entered.
 
     Args:
-        texts: as in firmware_bridge.links.parse; without any, the adapter of the sensor file or the only one.
+        texts: as in firmware_bridge.links.registry; without any, the adapter of the sensor file or the only one.
         known: settings of the sensors.
         model: assignment of CAN ids to taxels, used instead of the id map in the settings.
         rate_hz: rate at which recordings are played, in [Hz].

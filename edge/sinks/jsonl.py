@@ -18,7 +18,7 @@ from edge.perception.field import Columns
 from edge.perception.result import Result
 from edge.perception.result_fields import MAPS
 from edge.pipeline.sink import Sink
-from edge.sinks.json_record import event_record, record
+from edge.sinks.json_encoding import event_record, record
 from edge.sinks.pipe_capacity import has_room, widen
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE

@@ -14,7 +14,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
-from edge.sinks.json_record import record
+from edge.sinks.json_encoding import record
 from edge.sinks.mcap_writer import McapFile
 from edge.sinks.ros2.cdr_messages import (
     IMAGE,
@@ -29,8 +29,8 @@ from edge.sinks.ros2.cdr_messages import (
 )
 from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.forced_end import finishing
-from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
 from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA

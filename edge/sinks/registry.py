@@ -10,8 +10,8 @@ from edge.inference.contract import Contract
 from edge.pipeline.sink import Sink
 from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 
 FORMS: Final = (

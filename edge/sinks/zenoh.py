@@ -21,7 +21,7 @@ from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
 from edge.sinks.binary_message import pack
-from edge.sinks.json_record import event_record, record
+from edge.sinks.json_encoding import event_record, record
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
-from edge.sinks.json_record import encodable, event_record, record
+from edge.sinks.json_encoding import encodable, event_record, record
 from edge.view.run_snapshot import Heard, Newest, Point, Told
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.silence import SENSOR_SILENT_NS

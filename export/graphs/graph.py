@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from edge.inference.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME
 from export.errors import ExportError
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.pad_geometry import SensorGeometry
 from train.networks.blocks import PatternNet
 
 OPSET: Final = 18

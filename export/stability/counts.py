@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from edge.inference.bundled import DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.contact_options import ON_COUNTS
 from edge.perception.dead_taxel_fill import load_estimator
-from edge.perception.options import ON_COUNTS
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from export.stability.case import Case, timed
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 from firmware_bridge.zeroing.drift_tracker import COMMON_PER_S

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from export.stability.case import Case, refused, timed
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer
 from train.physics.fem_cache import REFEREE_POISSON, Mesh
 from train.physics.fem_reference import FemPad, FemPresses, NoEquilibriumError

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from export.stability.case import Case, refused, timed
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.magnets import MOVEMENT, Magnet, MagnetArray, cylinder_mt, dipole_mt
 
 PART: Final = "magnet reading"

@@ -16,7 +16,7 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
 from export.stability.case import timed
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.resample import resample

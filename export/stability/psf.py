@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from export.stability.case import Case, refused, timed
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.networks.tpsf_net import Form, degrade
 from train.physics.tpsf import Kernel, Plateau, spread, tpsf
 

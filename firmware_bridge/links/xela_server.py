@@ -18,8 +18,8 @@ from websockets.exceptions import (
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
-from firmware_bridge.geometry import USPA44, SensorGeometry
 from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
 from firmware_bridge.scans.xela_server_scans import ServerScans

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
-from firmware_bridge.geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name

@@ -24,7 +24,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from firmware_bridge.errors import CdrError, RecordingError
-from firmware_bridge.geometry import MOST_TAXELS, USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, SensorGeometry
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.recording.scan_messages import SCAN_NAME, baseline_type, decode_baseline, decode_scan, scan_type
 from firmware_bridge.recording.tracks import (

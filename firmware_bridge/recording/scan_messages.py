@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import CdrError
-from firmware_bridge.geometry import AXES, USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name

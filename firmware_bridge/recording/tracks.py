@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import SensorGeometry, pad_of
+from firmware_bridge.pad_geometry import SensorGeometry, pad_of
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.schedule import NS_PER_S
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.can.slcan import PACKED_BYTES, CanFrame
-from firmware_bridge.geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
+from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
 
 PAYLOAD_BYTES: Final = 8
 CONTROLLERS: Final = range(16)

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.scan import Scan, VendorReading
 

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.pad_geometry import SensorGeometry
 
 ABSENT: Final = -1
 """Marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1."""

@@ -23,7 +23,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 
 HIGHEST_COUNT: Final = 0xFFFF
 LONGEST_MESSAGE_BYTES: Final = 1 << 18

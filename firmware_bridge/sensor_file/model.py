@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import GAIN_RANGE, PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.sensor_file.toml_reader import (
     REMEDY,

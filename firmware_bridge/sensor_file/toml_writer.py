@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.geometry import AXES
 from firmware_bridge.in_place import write_in_place
+from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import (
     FILE_FORMAT,
     FILE_VERSION,

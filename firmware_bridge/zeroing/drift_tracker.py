@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import AXES
+from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.zeroing.baseline import (
     LOAD_LIMIT_COUNTS,

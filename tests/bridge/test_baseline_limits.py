@@ -5,7 +5,7 @@ import pytest
 from edge_samples import BASELINE, REST
 
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline, BaselineEstimator, load_baselines, save_baselines
 

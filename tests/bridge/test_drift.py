@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, REST
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 from firmware_bridge.zeroing.drift_tracker import COMMON_COUNTS, GAP_NS, OWN_PER_S, STEP_COUNTS, DriftTracker

@@ -7,7 +7,7 @@ import pytest
 from edge_samples import BASELINE, REST
 from numpy.typing import ArrayLike
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker

@@ -3,7 +3,7 @@ import pytest
 from bridge_samples import make_counts, write_recording
 
 from firmware_bridge.errors import RecordingError, SourceError
-from firmware_bridge.links.parse import open_sources
+from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.scans.scan import ABSENT
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.links.mounted import MountedLink
-from firmware_bridge.links.parse import open_source
+from firmware_bridge.links.registry import open_source
 from firmware_bridge.recording.formats import CSV_HEADER
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map

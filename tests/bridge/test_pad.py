@@ -20,10 +20,10 @@ from edge_samples import (
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad
 
 GAINED = tuple(np.linspace(0.5, 2, GAINS).tolist())
 PAD = Pad(thickness_mm=5.0, gains=GAINED)

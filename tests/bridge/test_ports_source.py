@@ -15,7 +15,7 @@ from firmware_bridge.links import parse as source
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink
-from firmware_bridge.links.parse import FORMS, open_source
+from firmware_bridge.links.registry import FORMS, open_source
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.serial_ports import Port, find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink

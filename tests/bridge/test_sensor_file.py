@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from test_mounting import mountings
 
 from firmware_bridge.errors import SensorFileError
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline

@@ -13,7 +13,7 @@ from server_samples import looping, read_notices
 from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
 from firmware_bridge.errors import DeviceError, SourceError
 from firmware_bridge.links import xela_server
-from firmware_bridge.links.parse import open_source, open_sources
+from firmware_bridge.links.registry import open_source, open_sources
 from firmware_bridge.links.xela_server import XelaServerLink, server_address
 
 

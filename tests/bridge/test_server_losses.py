@@ -12,7 +12,7 @@ from websockets.protocol import State
 from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import xela_server
-from firmware_bridge.links.parse import open_sources
+from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.xela_server import XelaServerLink
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 

@@ -17,7 +17,7 @@ from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import ADDED, Contract
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines

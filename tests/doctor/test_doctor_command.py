@@ -24,8 +24,8 @@ from edge.doctor.options import doctor_parser
 from edge.doctor.pad_orientation import CORNERS, orders
 from firmware_bridge.emulation import pty_port as pseudo_port
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.serial_ports import Port
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import load_sensor_file

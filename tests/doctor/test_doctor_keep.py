@@ -19,7 +19,7 @@ from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline

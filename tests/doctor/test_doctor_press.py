@@ -13,8 +13,8 @@ from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_ord
 from edge.doctor.press_findings import judge_press
 from edge.doctor.press_guide import PATIENCE_S, Answer, GuidedPress
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.geometry import USPA44
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import deformation

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from edge.perception.options import OFF_COUNTS, ON_COUNTS
+from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from train.data.dataset import between_frames
 from train.experiments.paper import force_recovery
 from train.experiments.paper.force_recovery import Gauge, training_presses

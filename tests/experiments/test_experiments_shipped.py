@@ -10,7 +10,7 @@ from experiment_samples import quick_bench
 
 from edge.errors import ModelError
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError
 from train.experiments.sensor import families, pads, wrench

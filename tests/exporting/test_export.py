@@ -18,7 +18,7 @@ from export.errors import ExportError, ParityError
 from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun, differences, read_windows
 from export.to_onnx import export, main
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.errors import CheckpointError
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network, infer, load_network

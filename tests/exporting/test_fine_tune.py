@@ -13,10 +13,10 @@ from torch import nn
 from export.errors import ExportError
 from export.graphs.graph import outputs, to_model
 from export.graphs.parity import GraphRun
-from export.integers.fine_tune import FineTuning, fine_tuned, graph_psnr_db, quantised_well, recalibrated
-from export.integers.int8 import integer_nodes, quantised
-from export.integers.rounding import folded, integer_convolutions, rounded
-from firmware_bridge.geometry import USPA44
+from export.quantisation.fine_tune import FineTuning, fine_tuned, graph_psnr_db, quantised_well, recalibrated
+from export.quantisation.int8 import integer_nodes, quantised
+from export.quantisation.rounding import folded, integer_convolutions, rounded
+from firmware_bridge.pad_geometry import USPA44
 from train.data.batch import Batch
 from train.data.batches import network_input
 from train.learning.interval_calibration import interval_coverage

@@ -13,10 +13,10 @@ from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
 from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun
-from export.integers.int8 import calibration_batch, convolutions, integer_nodes, quantised
-from export.integers.rounding import folded
+from export.quantisation.int8 import calibration_batch, convolutions, integer_nodes, quantised
+from export.quantisation.rounding import folded
 from export.to_onnx import export
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.batch import Batch
 from train.networks.registry import build
 

@@ -21,7 +21,7 @@ from export.errors import ExportError, ParityError
 from export.graphs.graph import outputs
 from export.graphs.parity import FULL_TRACTION_KPA, LEVELS, GraphRun, differences, extreme_windows, read_windows
 from export.graphs.reference import network_of
-from export.integers.int8 import convolutions
+from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 

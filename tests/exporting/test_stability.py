@@ -10,7 +10,7 @@ from edge.errors import ModelError
 from export.stability import __main__ as command
 from export.stability import counts, layer_contact, magnets, networks, pareto, psf
 from export.stability.case import Case, refused
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet, MagnetArray

@@ -16,11 +16,11 @@ from edge.perception.taxel_health import TaxelWatch
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import references, settled
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.links.parse import open_sources
+from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -57,7 +57,7 @@ def test_without_a_file_everything_is_as_it_was(pressed):
 
 def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, monkeypatch):
     adapter = Port("/dev/ttyUSB5", (0x0403, 0x6015), "D30BL366", "VScom")
-    monkeypatch.setattr("firmware_bridge.links.parse.serial_ports", lambda: [adapter])
+    monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", lambda: [adapter])
     source = open_source(sensor=file)
     assert source.name == "slcan:serial=D30BL366" and source.sensor_file.model_map.name == "XR1944"
     result = first(pressed, file)

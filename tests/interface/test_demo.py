@@ -12,7 +12,7 @@ from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
 from edge.inference.bundled import demo_recording
 from edge.perception.runtime import Runtime
 from edge.pipeline.scan_reader import Source
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 
 PRESSES = [0, 0, 2000, 3000, 3500, 0, 2100, 4000, 0]

@@ -18,12 +18,12 @@ from edge.pipeline.result_stream import Stream
 from edge.view.frames import hello
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.geometry import USPA44, USPA46, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.recording.formats import csv_header, load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, USPA46_MAP, layout_c
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline

@@ -13,7 +13,7 @@ from edge.evaluation.evaluate import by_surface, judge, judge_model, mean_error
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, bundled_models, find_model
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import load_frozen_presses
 from train.report import bootstrap_interval
 

@@ -7,7 +7,7 @@ from edge_samples import make_contract, make_pad_contract
 
 from edge.errors import ModelError
 from edge.inference.contract import Contract
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from test_pump import run, scans
 
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.pipeline.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
 from edge.pipeline.run_statistics import Statistics

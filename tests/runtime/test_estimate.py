@@ -13,12 +13,12 @@ from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
-from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
 from edge.sinks.jsonl import record_line
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 
 GRID = (4, 4)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
 
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.zero_on_demand import GIVE_UP_NS
 from edge.sinks.event_printer import MessageSink

@@ -18,11 +18,11 @@ from runtime_samples import PRESS, make_runtime
 
 from edge.errors import ModelError, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
-from edge.perception.options import RuntimeOptions
 from edge.perception.result import mask_bits
 from edge.perception.runtime import Runtime
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import Baseline
 

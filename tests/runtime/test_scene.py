@@ -5,7 +5,7 @@ import pytest
 from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 
 from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import TapState
 

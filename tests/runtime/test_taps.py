@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import EdgeError, UsageError
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.tap_tracker import TapTracker
 
 S = 1_000_000_000

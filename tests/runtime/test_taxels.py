@@ -23,7 +23,7 @@ from edge.perception.taxel_health import (
     TAXEL_SILENT_SCANS,
     TaxelWatch,
 )
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS

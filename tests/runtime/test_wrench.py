@@ -12,7 +12,7 @@ from mcap_samples import messages_of
 
 from edge.perception.wrench import LEAST_FORCE_N, wrench_of
 from edge.sinks.binary_message import unpack
-from edge.sinks.json_record import record
+from edge.sinks.json_encoding import record
 from edge.sinks.jsonl import record_line
 from edge.sinks.mcap import McapSink
 from edge.sinks.registry import open_sink

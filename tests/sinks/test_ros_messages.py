@@ -15,7 +15,7 @@ from mcap_samples import OFFSET_NS, make_results, odd_scans
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.sinks.json_record import record
+from edge.sinks.json_encoding import record
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import HEADER, MessageType, stamp

@@ -33,7 +33,7 @@ from edge import api
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
-from edge.sinks.json_record import event_record, record
+from edge.sinks.json_encoding import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 

@@ -18,7 +18,7 @@ from edge_samples import ROOT
 from edge.inference.bundled import demo_recording
 from edge.terminal.heatmap import colours
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import BaselineEstimator, save_baselines

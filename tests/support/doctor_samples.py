@@ -3,7 +3,7 @@
 import numpy as np
 
 from edge.doctor.examine import Watched
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 
 REST = np.array([32_700, 32_900, 37_300])[:, None, None] + np.arange(16).reshape(4, 4) * 37

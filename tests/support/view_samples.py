@@ -12,7 +12,7 @@ from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_sca
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.sinks.binary_message import unpack

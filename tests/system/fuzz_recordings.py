@@ -17,7 +17,7 @@ from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.recording.formats import CSV_HEADER, load_recording
 from firmware_bridge.recording.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad import GAINS, Pad
+from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file

@@ -34,7 +34,7 @@ from edge.errors import EdgeError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.perception.options import RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream

@@ -3,7 +3,7 @@ import pytest
 
 pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import FemPad, NoEquilibriumError

@@ -5,7 +5,7 @@ from edge.errors import EdgeError
 from edge.evaluation.classical_methods import fitted_methods
 from edge.evaluation.evaluate import judge
 from edge.inference.bundled import BUNDLE_DIR
-from edge.perception.options import ON_COUNTS
+from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording
 from train.data.contact_kinds import KINDS, fit_kinds
 from train.data.dataset import Sequences

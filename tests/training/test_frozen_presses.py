@@ -53,7 +53,7 @@ def test_known_gains_leave_what_the_chips_would_read_without(tmp_path):
 
 
 def test_a_pad_as_a_sensor_file_holds_it_is_the_one_that_networks_are_trained_with(wide):
-    """The contract's row of a `firmware_bridge.scans.pad.Pad` is what `FrozenPresses.pads` gives."""
+    """The contract's row of a `firmware_bridge.scans.pad_constants.Pad` is what `FrozenPresses.pads` gives."""
     contract = make_pad_contract(pad_inputs=tuple(input_scale()))
     rows = wide.pads(known=True)
     assert rows.shape == (len(wide), KNOWN)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge.evaluation.metrics import contact_iou
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.families.shape import NOWHERE_MM
 from train.physics.covers import BARE, Cover
 from train.physics.elastic_layer import surface_compliance

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from experiment_samples import quick_bench
 
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify

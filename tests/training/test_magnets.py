@@ -4,7 +4,7 @@ import pytest
 from magpylib.func import cylinder_field, dipole_field
 from scipy.spatial.transform import Rotation
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.physics.magnets import FIELDS, Magnet, MagnetArray, cylinder_mt, dipole_mt
 
 MAGNET = Magnet()

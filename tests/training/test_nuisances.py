@@ -5,8 +5,8 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from edge.perception.options import ON_COUNTS
-from firmware_bridge.geometry import USPA44
+from edge.perception.contact_options import ON_COUNTS
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from train.physics.hysteresis import frame_weights, maxwell
 from train.physics.sensor_noise import (

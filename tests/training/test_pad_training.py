@@ -8,7 +8,7 @@ from edge import api
 from edge.evaluation.test_set import FrozenSet
 from export.to_onnx import export
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.geometry import USPA44, USPA46
+from firmware_bridge.pad_geometry import USPA44, USPA46
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.dataset import turns_of

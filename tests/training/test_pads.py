@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from edge.inference.contract import Contract
-from firmware_bridge.scans.pad import PAD_RANGES
-from firmware_bridge.scans.pad import Pad as KnownPad
+from firmware_bridge.scans.pad_constants import PAD_RANGES
+from firmware_bridge.scans.pad_constants import Pad as KnownPad
 from train.physics.pad_draws import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
 
 DRAWN = [draw_pad(np.random.default_rng([7, number])) for number in range(300)]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.networks.tpsf_net import COUNTS_PER_UNIT, PsfNet, PsfParameters, degrade, fit_psf_net, pressed
 from train.physics.tpsf import tpsf
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 import trimesh
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor

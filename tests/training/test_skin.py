@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet
 from train.physics.taxel_response import NEWTONS_PER_COUNT_Z, Skin

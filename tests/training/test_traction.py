@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
 from train.physics.friction import FrictionSolver

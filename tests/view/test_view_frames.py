@@ -11,7 +11,7 @@ from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
-from edge.sinks.json_record import record
+from edge.sinks.json_encoding import record
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
 from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard
 from edge.view.sink import ViewSink

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.test_set import FrozenSet
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses

@@ -14,7 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import PADS, USPA44
+from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.dataset import Sequences, join
 from train.errors import DatasetError, TrainError
 from train.physics.elastic_layer import Layer

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import fit_linear_map
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.npz_reader import read_npz
 from train.data.presses import PressSet
 from train.errors import DatasetError

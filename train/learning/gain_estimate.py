@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, USPA44
 from train.errors import DatasetError
 from train.learning.contact_mixture import CHANNELS, ContactMixture, normalise
 from train.physics.pad_draws import INPUTS

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.physics.tpsf import Kernel, Plateau, tpsf
 
 Gamma = Literal["sensor", "sample"]

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer
 from train.physics.mooney_rivlin import C2_SHARE
 from train.surfaces.depth_image import Pose, Relief, depth_image

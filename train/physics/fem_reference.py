@@ -19,7 +19,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
 from train.physics.mooney_rivlin import C2_SHARE, MooneyRivlin

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.contact import ContactSolver
 from train.physics.covers import BARE, Cover

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.pad_geometry import SensorGeometry
 from train.physics.elastic_layer import Layer, inner_displacement
 from train.physics.magnets import MOVEMENT, Magnet
 from train.physics.tangential_layer import inner_tangential

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.pad_geometry import SensorGeometry
 
 MOVEMENT: Final = ("right_mm", "back_mm", "down_mm", "lean_x", "lean_y")
 """Components of a magnet's movement: along x and y, towards the board, and the slopes dx/dz and dy/dz of its axis."""

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet
 from train.physics.side_correction import FreeSides

@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from firmware_bridge.geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from train.physics.hysteresis import NuisanceError, draw_lag, frame_weights
 from train.surfaces.depth_image import Pose
 

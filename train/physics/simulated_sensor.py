@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.physics.contact import REACH, ContactSolver
 from train.physics.curved_patterns import heights_pattern
 from train.physics.elastic_layer import Layer

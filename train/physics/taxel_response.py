@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import SensorGeometry
+from firmware_bridge.pad_geometry import SensorGeometry
 from train.physics.elastic_layer import Layer
 from train.physics.magnet_response import pressure_response, traction_response
 from train.physics.magnets import Magnet, MagnetArray

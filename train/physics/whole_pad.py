@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import rest_tangent
 from train.physics.magnets import MOVEMENT, Magnet

@@ -128,7 +128,7 @@ def wrench(result: Result, unix_ns: int) -> bytes | None:
 
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
-    """Return a result without its maps as a message; `record` is its record from edge.sinks.json_record."""
+    """Return a result without its maps as a message; `record` is its record from edge.sinks.json_encoding."""
     values = dict(zip(_NAMES, _COLUMNS.flat(result), strict=True))
     values["header"] = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
     values["record"] = orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode()

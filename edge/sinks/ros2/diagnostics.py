@@ -5,7 +5,7 @@ from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 from edge.perception.result import Result
-from edge.sinks.json_record import record
+from edge.sinks.json_encoding import record
 from firmware_bridge.silence import SHOWN_SILENT_S
 
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")

@@ -20,7 +20,7 @@ from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.sinks.json_record import event_record
+from edge.sinks.json_encoding import event_record
 from edge.sinks.ros2.cdr_messages import Vector, force_and_torque, frame_of
 from edge.sinks.ros2.dds_domain import join
 from edge.sinks.ros2.dds_types import (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import AXES
+from firmware_bridge.pad_geometry import AXES
 from train.experiments.support.trainings import compact, mixed, trained
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.physics.resample import resample

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import fit_gain
-from edge.perception.options import ON_COUNTS
+from edge.perception.contact_options import ON_COUNTS
 from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences, windows
 from train.data.generation_config import SEED

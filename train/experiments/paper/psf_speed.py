@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.physics.tpsf import Kernel, spread, spread_by_fft
 from train.report import Report, Row

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.generation_config import random_figures
 from train.experiments.paper.unseen import TEST_FIGURES, TEST_SEED
 from train.experiments.support.band_limit import WAVELENGTHS_MM, edge_distance_mm, gratings, kept_back, let_through

@@ -23,12 +23,12 @@ from edge.evaluation.metrics import interval_coverage
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, TAXELS, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
-from edge.perception.options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.taxel_health import STUCK_SCANS, TaxelWatch
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline

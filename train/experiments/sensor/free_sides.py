@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import AXES, USPA44
+from firmware_bridge.pad_geometry import AXES, USPA44
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
 from train.data.real_grips import (

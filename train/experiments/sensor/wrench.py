@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edge.perception.wrench import LEAST_FORCE_N, Wrench, wrench_of
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import FrozenPresses
 from train.errors import TrainError
 from train.experiments.sensor.families import TRAINING

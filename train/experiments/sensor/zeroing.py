@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.onnx_session import ModelSession
-from edge.perception.options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
+from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline

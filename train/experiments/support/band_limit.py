@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from edge.evaluation.test_set import FrozenSet
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
 from train.physics.magnets import Magnet

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from edge.evaluation import metrics
 from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import TapTracker
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.dataset import Sequences, between_frames
 from train.data.generation_config import SEED
 from train.freeze import TEST_FORCE_N

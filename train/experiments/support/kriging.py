@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.freeze import SCALE
 from train.physics.contact import ContactSolver
 from train.physics.gripped import GrippedPad

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, method_macs
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.dataset import Sequences
 from train.errors import TrainError
 from train.experiments.support.trainings import compact, trained

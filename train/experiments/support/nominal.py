@@ -10,7 +10,7 @@ from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.scans.pad import GAINS, Pad
+from firmware_bridge.scans.pad_constants import GAINS, Pad
 from train.data.generation_config import random_figures
 from train.experiments.support.scores import pattern_cells
 from train.experiments.support.shipped import ALL, NOTHING, PAD, infer

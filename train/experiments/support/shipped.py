@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
-from firmware_bridge.scans.pad import Pad
+from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses
 
 NOTHING, FORCE, PAD, ALL = KNOWN = ("nothing", "counts per newton", "pad", "pad and gains")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
-from firmware_bridge.geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44
 from train.data.dataset import Sequences
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
 from train.data.generation_config import SEED, Generation

@@ -8,11 +8,11 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.errors import SourceError
-from firmware_bridge.geometry import SensorGeometry
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
+from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_frames
 from firmware_bridge.scans.mounting import Mounting, placed_map
 

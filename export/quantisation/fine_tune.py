@@ -15,9 +15,9 @@ from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet
 from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun
-from export.integers.int8 import quantised
-from export.integers.rounding import integer_convolutions, rounded
-from firmware_bridge.geometry import SensorGeometry
+from export.quantisation.int8 import quantised
+from export.quantisation.rounding import integer_convolutions, rounded
+from firmware_bridge.pad_geometry import SensorGeometry
 from train.data.batch import Batch
 from train.data.batches import network_input
 from train.data.dataset import Sequences
@@ -76,7 +76,7 @@ def fine_tuned(
     weights, to be exported and quantised again with ranges measured again, and then `recalibrated`.
 
     Args:
-        net: without batch normalisation, see `export.integers.rounding.folded`.
+        net: without batch normalisation, see `export.quantisation.rounding.folded`.
         model: its graph in float.
         quantised_model: its graph in int8.
         sequences: training taps, of at least as many taps as it takes.
@@ -152,9 +152,9 @@ def quantised_well(
     Weights that are not better after fine-tuning are discarded.
 
     Args:
-        net: without batch normalisation, see `export.integers.rounding.folded`.
+        net: without batch normalisation, see `export.quantisation.rounding.folded`.
         geometry: of the sensor.
-        seen: of which ranges are taken, see `export.integers.int8.quantised`.
+        seen: of which ranges are taken, see `export.quantisation.int8.quantised`.
         sequences: training taps.
         tuning: settings of the fine-tuning, or None for no fine-tuning.
         most_loss_db: largest accepted loss by int8, in [dB].

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from firmware_bridge.geometry import AXES, MOST_TAXELS, USPA44
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44
 from firmware_bridge.scans.mounting import Mounting
 
 PAD_RANGES: Final = MappingProxyType(
