@@ -50,7 +50,7 @@ PARSED = {
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python -m edge\.bench\.soak .*": "takes minutes; test_soak runs it",
-    r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench and test_zenoh run them",
+    r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench and test_zenoh_programs run them",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
     r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until ended; test_emulator_port runs it",
@@ -70,7 +70,7 @@ LEFT_OUT = {
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
     r"tensorboard .*": "serves until it is ended, and is not ours",
-    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page takes one of them",
+    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_demo takes one",
     r"mkdocs build .*": "test_site builds the site",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }

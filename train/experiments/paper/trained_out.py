@@ -87,7 +87,7 @@ def _plot(report: Report, rows: Sequence[Row]) -> None:
 
 
 def _networks(bench: Workbench) -> Iterator[tuple[Training, PatternNet, dict[str, Any]]]:
-    listed = OUT[::4] if bench.quick else OUT
+    listed = OUT[:: 2 if bench.found else 4] if bench.quick else OUT
     if bench.found:
         there = [(training, bench.brought(training)) for training in listed]
         for training, brought in tracked([pair for pair in there if pair[1]], "networks", "network"):
