@@ -11,7 +11,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
-from firmware_bridge.links import parse as source
+from firmware_bridge.links import registry as source
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink

@@ -31,7 +31,7 @@ from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
 from firmware_bridge.emulation.xela_server_model import VendorServer
 from firmware_bridge.links import discovery as devices
-from firmware_bridge.links import parse as source
+from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
@@ -50,7 +50,7 @@ PARSED = {
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python -m edge\.bench\.soak .*": "takes minutes; test_soak runs it",
-    r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench and test_zenoh_programs run them",
+    r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench, test_zenoh_programs run them",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
     r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until ended; test_emulator_port runs it",

@@ -9,7 +9,7 @@ from edge_samples import BASELINE, make_contract, write_model
 
 from edge.cli import main as cli
 from edge.inference import bundled as bundle
-from firmware_bridge.links import parse as source
+from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.zeroing.baseline import load_baselines
 
