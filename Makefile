@@ -11,10 +11,9 @@ NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt c
 run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 	$(BIN)/edge-sr demo --view
 
-# Three at once on two cores: a third of the time of a test is waiting for sensors that keep their pace.
 test: $(VENV)/.dev  ## everything else, all tests; the soak, which mostly waits, beside the others
 	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider & soak=$$!; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile -m "not soak"; tests=$$?; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak"; tests=$$?; \
 	wait $$soak && test $$tests = 0
 
 lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English

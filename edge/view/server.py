@@ -152,9 +152,11 @@ class Server:
             ready.set()
             said: tuple[object, ...] = ()
             said_s = tidied_s = 0.0
+            closing = False  # connections that were still closing when the others were tidied up
             while not self._ending:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(STATE_S if self._viewers or self._connections.gone else None):
+                    waits = self._viewers or self._connections.gone or closing
+                    async with asyncio.timeout(STATE_S if waits else None):
                         await self._news.wait()
                 self._news.clear()
                 frames = Frames(self._heard, time.monotonic_ns(), self._source)
@@ -165,8 +167,8 @@ class Server:
                     said, said_s = to_say, now_s
                     broadcast(self._viewers, state(recording, len(self._viewers), silent))
                 gone = self._connections.gone
-                if gone >= TIDY_CONNECTIONS or (gone and now_s - tidied_s >= TIDY_S):
-                    self._connections.gone, tidied_s = 0, now_s
+                if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
+                    self._connections.gone, tidied_s, closing = 0, now_s, gone > 0
                     _tidy()
                 for attended in self._viewers.values():
                     attended.send(frames, now_s)

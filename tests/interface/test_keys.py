@@ -56,7 +56,7 @@ class Terminal:
     def __init__(self, folder: Path) -> None:
         write_model(folder / "tiny.onnx")
         save_baselines(folder / "zero.json", [BASELINE])
-        scans = [make_scan(n, press_counts=3000 * (n < 600), noise=3) for n in range(SCANS)]
+        scans = [make_scan(n, press_counts=3000 * (n < 1400), noise=3) for n in range(SCANS)]
         np.savez(
             folder / "rest.npz",
             format=np.array("tactile-recording"),
