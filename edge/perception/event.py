@@ -39,6 +39,7 @@ class Event:
             like none, and "cleared", no longer.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
+        sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
 
     Raises:
         ValueError: the kind is not one of KINDS.
@@ -48,6 +49,7 @@ class Event:
     kind: EventKind
     sensor: str | None
     detail: str = ""
+    sensors: str = ""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -83,7 +85,7 @@ class Event:
     @classmethod
     def of(cls, notice: Notice) -> "Event":
         """Return the event of a link's notice."""
-        return cls(notice.time_ns, notice.kind, None, notice.text)
+        return cls(notice.time_ns, notice.kind, None, notice.text, notice.sensors)
 
 
 class Untimed(NamedTuple):

@@ -1,5 +1,6 @@
 """One source of several links: scripts, and emulated adapters on pseudo-terminals."""
 
+import contextlib
 import itertools
 import os
 import threading
@@ -10,6 +11,7 @@ import pytest
 from bridge_samples import make_recording, stacked
 from edge_samples import FakeLink, make_scan
 
+from edge.pipeline.link_reader import LinkReader
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError, SourceError
@@ -98,6 +100,33 @@ def test_a_link_that_hangs_holds_up_no_other(mixed):
         while (some := source.take(0.2)) is not None:
             taken += some
     assert numbers(taken, "slow/4") == [0]
+
+
+class Flapping(FakeLink):
+    """A link that is away before every other read."""
+
+    def __init__(self, reads):
+        super().__init__([[] for _ in range(reads)])
+        self.reader, self.writer = os.pipe()
+
+    def wait_on(self):
+        return Wait(self.reader, 0) if len(self._batches) % 2 else None
+
+    def __exit__(self, *exc_info):
+        os.close(self.reader)
+        os.close(self.writer)
+
+
+def test_a_link_that_comes_and_goes_for_days_costs_no_memory():
+    ended = threading.Event()
+    links = [Flapping(201), Flapping(201)]
+    with contextlib.ExitStack() as closing:
+        for link in links:
+            closing.enter_context(link)
+        reader = LinkReader(links, lambda notices, scans: None, ended.set)
+        closing.callback(reader.close)
+        assert ended.wait(60)
+        assert all(len(kept) <= 4 for kept in vars(reader).values() if isinstance(kept, (list, dict, tuple)))
 
 
 class Telling(FakeLink):

@@ -16,6 +16,7 @@ from edge.sinks.registry import open_sink
 from edge.sinks.ros2.dds_types import DiagnosticArray
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
+from firmware_bridge.links.base import Notice
 
 __all__ = ["sink"]
 
@@ -79,6 +80,18 @@ def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_sil
     said = [status for one in published if isinstance(one, DiagnosticArray) for status in one.status]
     assert [status.message for status in said] == ["REPLAY, not a sensor", "ended"]
     assert "scan_age_s" not in {pair.key for status in said for pair in status.values}
+
+
+def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another(sink):
+    for name in ("left/4", "right/4"):
+        sink.write(contact(1, sensor=name), {})
+    left, right = sink._sensors["left/4"], sink._sensors["right/4"]
+    for kind in ("lost", "trouble"):
+        sink.tell(Event.of(Notice(time.monotonic_ns(), kind, "slcan:/dev/a", "left: the plug is out", "left/")), {})
+    assert left.trouble.keys() == {"lost", "trouble"} and not left.shown
+    assert right.trouble == {} and len(right.shown) == 2
+    sink.tell(Event.of(Notice(time.monotonic_ns(), "well", "slcan:/dev/b", "right: well", "right/")), {})
+    assert left.trouble.keys() == {"lost", "trouble"}
 
 
 def test_what_a_link_said_of_an_outage_holds_until_the_next_scan(sink):

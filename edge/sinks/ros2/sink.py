@@ -146,7 +146,7 @@ class Ros2Sink(Sink):
         """Publish an event; values that an outage makes unknown are published as NaN."""
         self._counters = counters
         for name, sensor in self._sensors.items():
-            if event.sensor not in (None, name):
+            if event.sensor not in (None, name) or not name.startswith(event.sensors):
                 continue
             if event.kind in _OUTAGES:
                 self._withdraw_all(sensor, event.time_ns)
