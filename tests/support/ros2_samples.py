@@ -13,6 +13,7 @@ from edge_samples import make_scan
 
 from edge.perception.result import Result
 from edge.sinks.ros2.sink import Ros2Sink
+from firmware_bridge.links.base import SourceKind
 
 TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
 """Tag that keeps other test runs on this machine apart."""
@@ -23,12 +24,12 @@ ENVIRONMENT = {
 }
 
 
-def contact(number, *, sensor="4", source="device", **changes):
+def contact(number, *, sensor="4", source: SourceKind = "device", **changes):
     random = np.random.default_rng(number)
-    maps = {name: random.random((40, 40), dtype=np.float32) for name in ("pattern", "deviation")}
+    pattern, deviation = random.random((2, 40, 40), dtype=np.float32)
     scan = make_scan(number, sensor=sensor, time_ns=time.monotonic_ns())
-    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0, **maps)
-    return replace(made, **changes)
+    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0)
+    return replace(made, pattern=pattern, deviation=deviation, **changes)
 
 
 def without_pattern(result, **changes):
