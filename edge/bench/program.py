@@ -27,6 +27,16 @@ PRESS_COUNTS: Final = 3000
 NOISE_COUNTS: Final = 3
 EMULATOR: Final = ("-m", "firmware_bridge.emulation.slcan_main")
 """Arguments of Python that run the emulator."""
+PROGRAM_SOURCES: Final = (
+    "edge/__main__.py",
+    "edge/cli/run_command.py",
+    "edge/perception/runtime.py",
+    "edge/pipeline/link_reader.py",
+    "edge/pipeline/result_stream.py",
+    "firmware_bridge/links/reconnecting.py",
+    "firmware_bridge/scans/scan_assembler.py",
+)
+"""Sources of a report on the whole program: they import most of what a run executes."""
 _SCANS: Final = 500
 _ROOT: Final = Path(__file__).parents[2]
 _MAPS: Final = b',"pattern":'
