@@ -47,11 +47,9 @@ def cases(quick: bool = False) -> Iterator[Case]:
     yield from _waves()
 
 
-def punch(
-    radius_mm: float = RADIUS_MM, x_mm: float = 0.0, y_mm: float = 0.0, size: int = SIZE, cell_mm: float = CELL_MM
-) -> NDArray[np.float64]:
+def punch(radius_mm: float = RADIUS_MM, x_mm: float = 0.0, y_mm: float = 0.0, size: int = SIZE) -> NDArray[np.float64]:
     """Return the depth image of a flat round punch, (size, size) in [mm]."""
-    along_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+    along_mm = (np.arange(size) - (size - 1) / 2) * CELL_MM
     return np.where(np.hypot(along_mm - x_mm, along_mm[:, None] - y_mm) <= radius_mm, 0.0, _OFF)
 
 

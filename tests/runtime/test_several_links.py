@@ -131,7 +131,7 @@ def test_a_link_that_comes_and_goes_for_days_costs_no_memory():
 
 class Telling(FakeLink):
     def notices(self):
-        return [Notice(self.reads, "back", "fake", f"before read {self.reads}")]
+        return [Notice(self.reads, "back", f"before read {self.reads}")]
 
 
 def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
@@ -143,7 +143,7 @@ def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
 @pytest.mark.parametrize("shared", [False, True])
 def test_one_that_gives_up_ends_all_after_its_scans_and_what_it_told(shared):
     lost = (PipeLink if shared else FakeLink)([[make_scan(0)]], error=LinkLostError("gone"))
-    told = [Notice(0, "lost", "fake", "told")]
+    told = [Notice(0, "lost", "told")]
     lost.notices = lambda: [] if lost.reads < 2 or not told else [told.pop()]
     other = FakeLink([], endless=True)
     taken = []

@@ -106,7 +106,7 @@ def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it():
 
     class Lost(FakeLink):
         def notices(self):
-            return [Notice(0, "lost", "fake", "gone")] if self.reads == 90 else []
+            return [Notice(0, "lost", "gone")] if self.reads == 90 else []
 
     before = [[make_scan(n, press_counts=9)] for n in range(89)]
     assert np.abs(take(Lost(before + rest_scans(100, start=89)))["4"].counts - REST).max() <= 2

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
+import ros2_messages
 from edge_samples import make_scan
 
 from edge.perception.result import Result
@@ -35,6 +36,18 @@ def contact(number, *, sensor="4", source: SourceKind = "device", **changes):
 def without_pattern(result, **changes):
     scan = replace(result.scan, time_ns=time.monotonic_ns())
     return replace(result, scan=scan, pattern=None, deviation=None, **changes)
+
+
+def keep_published(sink, kept, *names):
+    """Keep the messages of a sink, or those of some types, as decoded by the rules, in place of publishing them."""
+
+    def keep(writer, data):
+        package, _, kind = writer.data_type.__idl_typename__.split(".", 2)
+        name = f"{package}/msg/{kind.removeprefix('dds_.').removesuffix('_')}"
+        if not names or name in names:
+            kept.append(ros2_messages.decode(name, data))
+
+    sink._publish = keep
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fault_judge import Found
-
-from firmware_bridge.emulation.fault_log import Told
+from fault_log import Told
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,11 +3,11 @@
 import numpy as np
 from fault_accounts import DIFFERENT, accounts
 from fault_judge import judge
+from fault_log import Told
 from fault_played import telling_counts
 from fault_records import Seen
+from fault_truth import FATES, ROW
 
-from firmware_bridge.emulation.fault_log import Told
-from firmware_bridge.emulation.faults.truth import FATES, ROW
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 PERIOD_NS = 10_000_000

@@ -6,9 +6,8 @@ from typing import Final
 
 import numpy as np
 from fault_judge import Found
-
-from firmware_bridge.emulation.fault_log import Told
-from firmware_bridge.emulation.faults.stretches import LINK_FAULTS, RESET
+from fault_log import Told
+from fault_stretches import LINK_FAULTS, RESET
 
 NEVER_NS: Final = 2**62
 OUTAGES: Final = (*LINK_FAULTS, "bus-off")

@@ -7,15 +7,15 @@ from typing import Final
 import numpy as np
 from fault_accounts import CONSISTENT, DIFFERENT, EQUAL, Account, accounts
 from fault_judge import Found
+from fault_log import Told
 from fault_outages import LONGEST_BACK_S, seconds_to_use
 from fault_records import Ran
 from fault_run import CALM_S
 from fault_server import GARBAGE_EVERY, ServerFound, ServerRan
+from fault_stretches import LINK_FAULTS
 
 from edge.bench.report import head, line
 from edge.bench.soak import slope
-from firmware_bridge.emulation.fault_log import Told
-from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
 
 EXIT_SINK: Final = 5
 MEMORY_MB_PER_MINUTE: Final = 0.2

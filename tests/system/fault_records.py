@@ -9,10 +9,10 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 import orjson
+from fault_log import Told
 from numpy.typing import NDArray
 
 from edge.sinks.pipe_capacity import PIPE_BYTES
-from firmware_bridge.emulation.fault_log import Told
 
 
 class Seen(NamedTuple):

@@ -5,10 +5,10 @@ from collections import defaultdict
 from typing import Final
 
 import numpy as np
+from fault_frames import READ
+from fault_log import Told
+from fault_truth import FATES
 
-from firmware_bridge.emulation.fault_log import Told
-from firmware_bridge.emulation.faults.frames import READ
-from firmware_bridge.emulation.faults.truth import FATES
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 FLIPPED: Final = FATES.index("flipped")

@@ -56,6 +56,8 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert {path.name for path in packages.iterdir()} & OURS == IN_THE_WHEEL
     assert {path.parent.name for path in packages.glob("*/py.typed") if path.parent.name in OURS} == IN_THE_WHEEL
     assert not (packages / "edge" / "bench").exists()
+    emulation = {path.stem for path in (packages / "firmware_bridge" / "emulation").glob("[!_]*.py")}
+    assert emulation == {"pty_port", "slcan_emulator", "slcan_main", "xela_controller"}, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
         *("demo.npz", "taxels.npz"),

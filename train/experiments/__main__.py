@@ -32,7 +32,7 @@ EXPERIMENTS: Final = {
     "real": "real grips: are faces drawn as faces, and do patterns explain readings",
     "robust": "error against the severity of nuisances",
     "dead": "dead taxels, found and unfound",
-    "identify": "gains and constants of a sensor from its own contacts",
+    "gains-from-contacts": "gains and constants of a sensor from its own contacts",
     "zeroing": "drift followed, holds not eaten",
     "calibration": "how true the deviations are",
     "confidence": "expected error and early stop against what came out",
@@ -47,14 +47,11 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
-_FILES: Final = {"identify": "gains_from_contacts"}
-"""File names that differ from the experiment's: train.identify is the command of a user's own sensor."""
 
 
 def module_of(name: str) -> str:
     """Return the module of an experiment."""
-    file = _FILES.get(name, name.replace("-", "_"))
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{file}"
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -63,7 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m train.experiments",
         description=(__doc__ or "").splitlines()[0],
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="\n".join(f"  {name:15} {what}" for name, what in EXPERIMENTS.items()),
+        epilog="\n".join(f"  {name:19} {what}" for name, what in EXPERIMENTS.items()),
     )
     parser.add_argument("names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="which, in this order")
     parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")

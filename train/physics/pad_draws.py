@@ -70,9 +70,9 @@ class Pad:
         """Nominal magnet of every taxel."""
         return Magnet(height_mm=self.magnet_height_mm)
 
-    def geometry(self, nominal: SensorGeometry = USPA44) -> SensorGeometry:
+    def geometry(self) -> SensorGeometry:
         """Return the geometry with the pad's true pitch."""
-        return replace(nominal, pitch_mm=self.pitch_mm)
+        return replace(USPA44, pitch_mm=self.pitch_mm)
 
     def rest(self, taxels: int) -> NDArray[np.float64]:
         """Return the place and lean of each magnet at rest, as a movement, (taxels, 5)."""

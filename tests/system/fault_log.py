@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+from fault_injector import Injector
+from fault_stretches import Stretch
+from fault_truth import ROW, Truth
 from numpy.typing import NDArray
-
-from firmware_bridge.emulation.faults.injector import Injector
-from firmware_bridge.emulation.faults.stretches import Stretch
-from firmware_bridge.emulation.faults.truth import ROW, Truth
 
 FRAMES: Final = "frames.bin"
 EVENTS: Final = "events.jsonl"
