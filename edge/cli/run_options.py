@@ -246,6 +246,12 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     )
     add("--every-scan", action="store_true", help="infer also where nothing has changed since the pattern before")
     add("--every-tap", action="store_true", help="use also taps that are not expected to help")
+    add(
+        "--no-fallback",
+        dest="fallback",
+        action="store_false",
+        help="keep a pattern that is not to be believed, instead of the smooth one",
+    )
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:
