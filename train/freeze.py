@@ -21,31 +21,25 @@ from edge.perception.dead_taxel_fill import load_estimator
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION, load_recording
+from firmware_bridge.recording.formats import load_recording
 from train.data.batches import Draw, WindowBatches
 from train.data.contact_kinds import fit_kinds
-from train.data.dataset import Sequences, between_frames, quarter_turns
+from train.data.dataset import Sequences, quarter_turns
 from train.data.files import load_taps
 from train.data.generation_config import SEED, Generation, solve_all
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
+from train.demo import demo_recording
 from train.errors import TrainError
-from train.physics.resample import resample
-from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest
-from train.physics.simulated_sensor import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SimulatedSensor
-from train.surfaces.depth_image import Pose
+from train.physics.sensor_noise import Nuisances, apply_nuisances
+from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
 from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, TEST_POSITION, Split, position_mm
+from train.surfaces.poses import MAX_TAPS, Split
 
 SCALE: Final = 10
 TEST_FORCE_N: Final = 5.0
 """Force at which every tap of a frozen set ends, unless the sensor's largest depth is reached before, in [N]."""
 CLASSICAL_WINDOWS: Final = 12_000
-DEMO_SURFACE: Final = "S"
-DEMO_ANGLE_DEG: Final = 30.0
-DEMO_TAPS: Final = 4
-DEMO_RATE_HZ: Final = 100.0
-REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES = 150, 20, 24, 12, 24
 FIRST_FRAME: Final = 6
 """Frames of a press before the first one kept: kept frames begin at about 30 % of the set force, as in the paper."""
 
@@ -109,51 +103,6 @@ def drawn(taps: PressSet | Sequences, windows: int) -> tuple[NDArray[np.float32]
     batches = WindowBatches(taps.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
     parts = [batches.draw(number) for number in tracked(range(windows // 100), "reading", "batch")]
     return np.concatenate([readings[:, 0] for readings, _ in parts]), np.concatenate([truth for _, truth in parts])
-
-
-def demo_recording() -> dict[str, NDArray]:
-    """Return four taps of one surface as a controller would send them, with the truth of every frame.
-
-    The pad rests, then presses, holds and lifts four times, turned a step each time, at the held-out position.
-    """
-    poses = [
-        Pose(*position_mm(TEST_POSITION), DEMO_ANGLE_DEG - back * ANGLE_STEP_DEG) for back in reversed(range(DEMO_TAPS))
-    ]
-    taps = SimulatedSensor().tap([DEMO_SURFACE] * DEMO_TAPS, poses, TEST_FORCE_N)
-    course = np.concatenate(
-        [np.linspace(0, 1, PRESS_FRAMES + 1)[1:], np.ones(HOLD_FRAMES), np.linspace(1, 0, LIFT_FRAMES + GAP_FRAMES)]
-    )
-    course[PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES :] = 0
-    shares = np.tile(course, (DEMO_TAPS, 1))
-    # The zero is a second old: no drift yet, and the pad has not moved in the earth's field.
-    nuisances = Nuisances().without("thermal_drift_counts", "earth_field_counts")
-    pressed = apply_nuisances(
-        between_frames(taps.counts, shares)[None, ::-1],
-        nuisances,
-        SEED,
-        tap_s=len(course) / DEMO_RATE_HZ,
-        angle_deg=[pose.angle_deg for pose in reversed(poses)],
-    )[0, ::-1]
-    rng = np.random.default_rng([SEED, 2])
-    still = np.rint(rng.normal(0, nuisances.noise_counts, (REST_FRAMES, *USPA44.scan_shape)))
-    counts = draw_rest(rng, USPA44).round() + np.concatenate([still, pressed.reshape(-1, *USPA44.scan_shape)])
-    share = np.concatenate([np.zeros(REST_FRAMES), shares.ravel()])
-    tap = np.concatenate([np.full(REST_FRAMES, -1), np.repeat(np.arange(DEMO_TAPS), len(course))])
-    end_mm = taps.indentation_mm[:, -1]
-    return {
-        "format": np.array(NPZ_FORMAT),
-        "version": np.array(NPZ_VERSION),
-        "rate_hz": np.array(DEMO_RATE_HZ),
-        "sensor": np.full(len(share), "4"),
-        "scan": np.arange(len(share)),
-        "time_ns": (np.arange(len(share)) * 1e9 / DEMO_RATE_HZ).astype(np.int64),
-        "counts": counts.astype(np.int32),
-        "tap": np.where(share > 0, tap, -1),
-        "indentation_mm": (share * end_mm[tap]).astype(np.float32),
-        "unit_patterns": (resample(taps.patterns[:, 0], FINE_SCALE, SCALE) / end_mm[:, None, None]).astype(np.float16),
-        "surface": np.array(DEMO_SURFACE),
-        "angles_deg": np.array([pose.angle_deg for pose in poses]),
-    }
 
 
 def main(arguments: list[str] | None = None) -> None:

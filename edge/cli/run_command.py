@@ -22,6 +22,7 @@ from edge.api import (
     Commands,
     Contract,
     DeviceError,
+    Event,
     Fan,
     Sink,
     SinkClosedError,
@@ -112,7 +113,10 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 counts_per_newton=options.counts_per_newton,
                 **asdict(asked),
             )
-            sinks: list[Sink] = [] if score is None else [score]
+            sinks: list[Sink] = []
+            if score is not None:
+                watching = [messages, *(() if view is None else view.sinks)]
+                sinks += [score, _open_scenes(watching)]
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)
@@ -171,6 +175,17 @@ def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]"
     score = DemoScore(demo_recording(), contract, on_complete)
     print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
     return score
+
+
+def _open_scenes(watching: Sequence[Sink]) -> Sink:
+    """Return the sink that tells those who watch what happens in the scenes of the demo."""
+    from edge.cli.demo_scenes import DemoScenes
+
+    def tell(event: Event) -> None:
+        for sink in watching:
+            sink.tell(event, {})
+
+    return DemoScenes(demo_recording(), tell)
 
 
 def _silence_hint(sources: Sequence[str]) -> str:

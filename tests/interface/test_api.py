@@ -54,6 +54,7 @@ FRONT = {
         "edge.sinks.event_printer",
         "edge.cli.devices_command",
         "edge.cli.demo_score",
+        "edge.cli.demo_scenes",
         "edge.terminal.heatmap",
     ),  # what a person reads
     *(

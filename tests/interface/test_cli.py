@@ -17,6 +17,7 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 __all__ = ["files"]
+DEMO_SCANS = 924
 
 
 def test_one_tap_is_what_a_sensor_gets_unless_asked_and_the_demo_gets_four(tmp_path):
@@ -204,7 +205,7 @@ class TestDemo:
             "--source", "demo", "--model", files / "tiny.onnx", "--rate-hz", "300", env=os.environ | {"COLUMNS": "80"}
         )
         assert done.returncode == 0, done.stderr
-        assert "demo: an emulated sensor taps" in done.stderr and "EMULATED demo: 470 scans" in done.stderr
+        assert "demo: an emulated sensor taps" in done.stderr and f"EMULATED demo: {DEMO_SCANS} scans" in done.stderr
         assert "4 of 4 taps scored" in done.stdout
         rows = re.findall(
             r"^ +(\d) +(\d+) +(\d) +(-?[\d.]+) (-?[\d.]+) +([\d.]+) +- +(\d+)$", done.stdout, re.MULTILINE
@@ -220,5 +221,5 @@ class TestDemo:
             "--source", "demo", "--model", files / "tiny.onnx", "--rate-hz", "300", "--sink", "jsonl:-",
         )  # fmt: skip
         got = records(done.stdout)
-        assert len(got) == 470 and {record["source"] for record in got} == {"emulated"}
+        assert len(got) == DEMO_SCANS and {record["source"] for record in got} == {"emulated"}
         assert "4 of 4 taps scored" in done.stderr

@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_contract, make_scan
 
+from edge.api import load_model
 from edge.cli import main as cli
 from edge.cli import run_command as run
+from edge.cli.demo_scenes import DemoScenes
 from edge.cli.demo_score import DemoScore, score_picture, score_table
 from edge.errors import UsageError
 from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
-from edge.inference.bundled import demo_recording
+from edge.inference.bundled import DEMO_MODEL, demo_recording
+from edge.perception.contact_options import RuntimeOptions
+from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.pad_geometry import USPA44
@@ -94,6 +98,55 @@ def test_when_the_last_tap_is_over_it_says_so_once_and_a_second_pass_changes_not
     assert [one.result.scan.number for one in score.scores()] == [3, 7]
 
 
+def told_of_scenes(results, path):
+    events = []
+    scenes = DemoScenes(path, events.append)
+    for result in results:
+        scenes.write(result, {})
+    scenes.close()
+    assert {event.kind for event in events} <= {"note"}
+    return [event.text.removeprefix("demo: ") for event in events]
+
+
+def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
+    """Two passes; the scans of the second are doubted where the first are believed."""
+    with np.load(recording) as data:
+        arrays = dict(data)
+    np.savez(tmp_path / "scenes.npz", **arrays | {"scene": np.array([-1, -1, 0, 0, 0, -1, 1, 1, -1])})
+    runtime, series = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE}), ScanSeries("4", USPA44)
+    scans = [series.close(counts.copy(), n * 10_000_000) for n, counts in enumerate([*arrays["counts"]] * 2)]
+    results = [runtime.push(scan) for scan in scans]
+    results[9 + 3] = dataclasses.replace(results[9 + 3], events=(Event(0, "tap_dropped", "4"),))
+    results[9 + 7] = dataclasses.replace(results[9 + 7], trusted=False, untrusted_reason="unfamiliar")
+    first, second = (told_of_scenes(part, tmp_path / "scenes.npz") for part in (results[:9], results[9:]))
+    assert [line.split(" ")[:4] for line in first[::2]] == [
+        ["now", "another", "surface", "is"],
+        ["now", "a", "magnet", "comes"],
+    ]
+    assert second[::2] == first[::2]
+    assert first[1].startswith("no tap was dropped") and first[3].startswith("0 of 2 patterns with the magnet")
+    assert second[1] == "earlier taps were dropped 1 times" and second[3].startswith("1 of 2 patterns with the magnet")
+    assert len(told_of_scenes(results[:7], tmp_path / "scenes.npz")) == 3, "a scene that is cut off has no outcome"
+
+
+def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
+    runtime = Runtime(
+        load_model(DEMO_MODEL), source="emulated", options=RuntimeOptions(every_scan=True, every_tap=True)
+    )
+    series = ScanSeries("4", USPA44)
+    with np.load(demo_recording()) as demo:
+        counts, tap, scene = (demo[name] for name in ("counts", "tap", "scene"))
+    results = [runtime.push(series.close(one.astype(np.int32), n * 10_000_000)) for n, one in enumerate(counts)]
+    dropped = [scene[n] for n, one in enumerate(results) for event in one.events if event.kind == "tap_dropped"]
+    assert dropped == [0, 0, 1]
+    made = np.array([one.pattern is not None for one in results])
+    trusted = np.array([one.trusted is True for one in results])
+    doubted = np.array([one.trusted is False for one in results])
+    assert trusted[made & (tap >= 0)].mean() > 0.95 and trusted[made & (scene == 0)].mean() > 0.95
+    assert doubted[made & (scene == 1)].mean() > 0.9
+    assert max(one.taps_used for one, part in zip(results, scene, strict=True) if part >= 0) == 1
+
+
 def test_rest_and_foreign_scans_are_not_scored(recording):
     score = DemoScore(recording, make_contract())
     runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
@@ -140,6 +193,7 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     assert cli.main(["--source", "demo:loop", "--sink", "status"]) == 0
     out, err = capfd.readouterr()
     assert out.count("4 of 4 taps scored") == 1 and err.count("goes on until Ctrl-C") == 1
+    assert err.count("demo: now another surface is tapped") == err.count("demo: now a magnet comes near") == 2
     used: dict[tuple[int, int], set[int]] = {}
     for result in sink.results:
         if result.pattern is not None:

@@ -11,7 +11,8 @@ from train.data.contact_kinds import KINDS, fit_kinds
 from train.data.dataset import Sequences
 from train.data.generation_config import SEED, Generation, solve_all
 from train.data.world import World, solve_pad
-from train.freeze import TEST_FORCE_N, demo_recording, drawn, fit_classical, fit_taxels, freeze, held_out, main
+from train.demo import demo_recording
+from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, held_out, main
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
 
@@ -76,7 +77,7 @@ def test_classical_methods_beat_nothing_and_are_in_order(frozen, tmp_path):
     assert nothing < psnr["bilinear"] < psnr["linear map"]
 
 
-def test_the_demo_presses_holds_and_lifts_four_times(tmp_path):
+def test_the_demo_presses_holds_and_lifts_four_times_and_scores_none_of_the_scenes_after(tmp_path):
     arrays = demo_recording()
     again = demo_recording()
     assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
@@ -86,8 +87,11 @@ def test_the_demo_presses_holds_and_lifts_four_times(tmp_path):
     rest = np.median(arrays["counts"][arrays["tap"] < 0][:100], axis=0)
     force = (arrays["counts"] - rest)[:, 2].sum(axis=(1, 2))
     pressed = force > ON_COUNTS
-    assert np.sum(np.diff(pressed.astype(int)) == 1) == 4
-    assert np.all(force[arrays["tap"] < 0] < ON_COUNTS)
+    scene = arrays["scene"]
+    begins = np.flatnonzero(np.diff(pressed.astype(int)) == 1)
+    assert scene[begins].tolist() == [-1] * 4 + [0, 0, 1]
+    assert np.all(force[(arrays["tap"] < 0) & (scene < 0)] < ON_COUNTS)
+    assert np.all(arrays["tap"][scene >= 0] == -1)
     assert arrays["unit_patterns"].max(axis=(1, 2)) == pytest.approx(1, abs=2e-3)
 
 

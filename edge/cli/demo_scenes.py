@@ -1,0 +1,68 @@
+"""Scenes of the demo: what goes wrong in each, told before it, and what the runtime made of it, told after it."""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.pipeline.sink import Sink
+
+_FREE: Final = -1
+_FOREIGN, _MAGNET = 0, 1
+_BEGINS: Final = {
+    _FOREIGN: "demo: now another surface is tapped, and then the first one again: no pattern may be made from both",
+    _MAGNET: "demo: now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
+}
+
+
+class DemoScenes(Sink):
+    """Sink that tells of each scene of the demo, as events of kind "note".
+
+    A result is matched to its scene by its raw counts, as in `DemoScore`.
+    """
+
+    def __init__(self, recording: Path, tell: Callable[[Event], object]) -> None:
+        """Load the scenes.
+
+        Args:
+            recording: .npz that has, in addition to `counts` (n, 3, rows, cols), `scene` (n,): -1 outside of scenes.
+            tell: called with each event.
+        """
+        with np.load(recording, allow_pickle=False) as data:
+            pairs = zip(data["counts"], data["scene"].tolist(), strict=True)
+            self._scenes = {counts.astype(np.int32).tobytes(): scene for counts, scene in pairs}
+        self._tell = tell
+        self._scene = _FREE
+        self._patterns = self._doubted = self._dropped = 0
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Follow the scenes."""
+        scene = self._scenes.get(result.scan.counts.tobytes(), self._scene)
+        if scene != self._scene:
+            self._end()
+            self._scene = scene
+            if scene in _BEGINS:
+                self._say(_BEGINS[scene])
+        self._dropped += sum(event.kind == "tap_dropped" for event in result.events)
+        if result.pattern is not None:
+            self._patterns += 1
+            self._doubted += result.trusted is False
+
+    def close(self) -> None:
+        """Do nothing: a scene that was cut off is not told of."""
+
+    def _end(self) -> None:
+        """Tell what the runtime made of the scene, and count from 0."""
+        if self._scene == _FOREIGN:
+            none = "no tap was dropped: this model takes one tap, or does not check earlier ones"
+            self._say(f"demo: {f'earlier taps were dropped {self._dropped} times' if self._dropped else none}")
+        elif self._scene == _MAGNET:
+            self._say(f"demo: {self._doubted} of {self._patterns} patterns with the magnet were not to be believed")
+        self._patterns = self._doubted = self._dropped = 0
+
+    def _say(self, text: str) -> None:
+        self._tell(Event(time.monotonic_ns(), "note", None, text))
