@@ -21,6 +21,13 @@ Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
 its readings; readings of one contact after another are unfamiliar, so the sensor or its file is wrong."""
 REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor")
+REASON_TEXTS: Final[dict[Reason, str]] = {
+    "stuck": "a taxel repeats itself (stuck?)",
+    "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
+    "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
+    "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
+}
+"""Reasons in a user's words, each with what to look for."""
 
 LEAST_COUNTS: Final = 100.0
 """Largest z of the weakest contact that is checked: below it, drift is half of the reading."""

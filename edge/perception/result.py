@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.event import Event, Note, joined
-from edge.perception.pattern_check import Reason
+from edge.perception.pattern_check import REASON_TEXTS, Reason
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.scan import Scan
@@ -97,6 +97,11 @@ class Result:
     def event(self) -> str | None:
         """Events in one line, for a person; None without any."""
         return joined(self.events) if self.events else None
+
+    @property
+    def untrusted_text(self) -> str | None:
+        """Reason for which the pattern is not to be believed, for a person; None where it is, or nobody can tell."""
+        return None if self.untrusted_reason is None else REASON_TEXTS[self.untrusted_reason]
 
     def baseline_text(self) -> str:
         """Return id and age of the baseline in words."""

@@ -81,6 +81,7 @@ class Frames:
             **record(result, newest.counters),
             "kind": "result",
             "note_kinds": [note.kind for note in result.notes],
+            "untrusted_text": result.untrusted_text,
             "rate_hz": None if newest.rate_hz is None else round(newest.rate_hz, 2),
             "age_s": _seconds(self.now_ns - newest.heard_ns),
             # The loop may have added points since; they belong to the next frame, which begins after this one.
@@ -116,6 +117,7 @@ def hello(run: Run, recording: Path | None) -> bytes:
         "height": height,
         "width": width,
         "wrench": contract.traction_scale is not None,
+        "checks": bool(contract.trust),
         "recording": _path(recording),
         "max_fps": MAX_FPS,
     }

@@ -98,6 +98,7 @@ def test_hello_says_what_does_not_change():
         "height": 40,
         "width": 40,
         "wrench": False,
+        "checks": False,
         "recording": None,
         "max_fps": MAX_FPS,
         "maps": [],

@@ -71,8 +71,11 @@ const NUMBERS = {
     ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure at", "centre_of_pressure_mm"],
     ["sensitivity", "wrench_origin"],
   ],
-  Doubt: [["90 % within", "interval_mm"], ["expected RMSE", "expected_rmse_mm"], ["pattern", "reused_from"]],
-  Pace: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["model", "model"]],
+  Doubt: [
+    ["to be believed", "trusted"], ["mismatch", "mismatch"], ["tap mismatch", "tap_mismatch"], ["90 % within", "interval_mm"],
+    ["expected RMSE", "expected_rmse_mm"],
+  ],
+  Pace: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["pattern", "reused_from"], ["model", "model"]],
   Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
   Baseline: [["which", "baseline"], ["from", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["own, step", "own"]],
 };
@@ -85,6 +88,18 @@ const LEAST_MM = 0.02;
 const LEAST_DEVIATION_MM = 0.01;
 const FRESH_S = 0.3;
 const SHEAR_SHARE = 0.4; // length of the arrow of a force that is all shear, as a share of the pattern's width
+
+const TOO_LIGHT = "too light to tell";
+
+/** Return the texts of the numbers by which a pattern is believed or not; `checks`: whether the model has any. */
+function trustTexts({ state, trusted, untrusted_reason: reason, mismatch, tap_mismatch: taps }, checks) {
+  const unknown = state !== "contact" ? "\u2013" : checks ? TOO_LIGHT : "not checked";
+  return {
+    trusted: trusted === true ? "yes" : trusted === false ? `no: ${reason}` : unknown,
+    mismatch: percent(mismatch),
+    tap_mismatch: taps?.length ? taps.map((share) => number(share, 2)).join(", ") : "\u2013",
+  };
+}
 
 function wrenchTexts({ wrench, wrench_origin: origin }) {
   const list = (values, decimals, unit) => (values ? `${values.map((value) => number(value, decimals)).join(", ")}${THIN}${unit}` : "\u2013");

@@ -134,7 +134,7 @@ const hear = {
     page.told = number ?? page.told; // the answer to this page alone has no number
     const refused = ["refused", "in_contact", "given_up"].includes(event);
     const key = COUNTED.includes(event) ? `${event} ${sensor}` : note;
-    log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink"].includes(event), ageS: age_s });
+    log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink", "suspected"].includes(event), ageS: age_s });
     if (refused && age_s < REFUSAL_S) refuse(note, event === "in_contact" ? sensor : null);
   },
   state(header) {

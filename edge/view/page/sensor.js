@@ -160,11 +160,22 @@ class Sensor {
   /** Return the result of the pattern shown if that is the newest; else the newest result. */
   made() { return this.newest() ? this.touched : this.said; }
 
+  /** True if the pattern shown is not to be believed, also when it is old. */
+  doubted() { return this.pattern !== null && this.touched.trusted === false; }
+
+  /** Return why the pattern shown is not to be believed, or that it is too light to tell; null if all is well. */
+  verdict() {
+    if (this.doubted()) return `not to be believed: ${this.touched.untrusted_text}`;
+    const unknown = this.pattern !== null && this.touched.trusted === null && this.hello.checks;
+    return unknown ? `${TOO_LIGHT} whether this is to be believed` : null;
+  }
+
   word() {
     if (!page.link.up) return ["lost", lostWord()];
     if (page.paused) return ["paused", "paused"];
     if (this.said === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
     if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
+    if (this.newest() && this.doubted()) return ["doubted", "contact, not believed"];
     const state = this.said.state === "dropped" ? "contact" : this.said.state; // a newer scan was already waiting
     return [state, state];
   }
@@ -222,6 +233,10 @@ class Sensor {
       pattern.getContext("2d").clearRect(0, 0, pattern.width, pattern.height);
       say(this.part["pattern-most"], "");
     }
+    const verdict = this.verdict();
+    show(this.part.verdict, verdict !== null);
+    say(this.part.verdict, verdict ?? "");
+    this.root.classList.toggle("doubted", this.doubted());
     this.paintOver(over, live);
     readout.classList.toggle("read", this.cursor !== null);
     say(readout, this.cursor === null ? "hover, or use the arrow keys, to read a pixel" : this.reading());
@@ -372,11 +387,12 @@ class Sensor {
       area: this.part["area-now"].textContent,
       centroid_mm: made.centroid_mm ? `${made.centroid_mm.map((mm) => number(mm, 1)).join(", ")}${THIN}mm` : "\u2013",
       ...wrenchTexts(made),
+      ...trustTexts(made, this.hello.checks),
       taps_used: made.taps_used ? `${made.taps_used} of ${this.hello.taps}` : "\u2013",
       another_tap: made.another_tap === true ? "would help" : made.another_tap === false ? "would not help" : "\u2013",
       interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
       expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
-      reused_from: !this.live() ? "\u2013" : known(made.reused_from) ? "unchanged" : "new",
+      reused_from: !this.live() ? "\u2013" : `${known(made.reused_from) ? "unchanged" : "new"}${made.estimate === "smooth" ? ", smooth" : ""}`,
       rate_hz: amount(said.rate_hz, 1, "Hz"),
       run_time_us: amount(made.run_time_us, 0, "\u00b5s"),
       latency_us: amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms"),
@@ -394,6 +410,7 @@ class Sensor {
         element.classList.toggle("warn", counters[key] > 0);
       }
     }
+    this.fields.trusted.classList.toggle("warn", made.trusted === false);
     this.fields.baseline_age_s.classList.toggle("warn", said.baseline !== null && !known(said.baseline_age_s));
   }
 }

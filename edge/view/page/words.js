@@ -13,6 +13,7 @@ function largest(values, least = 0) {
   return most;
 }
 
+const percent = (share) => amount(known(share) ? 100 * share : null, 1, "%");
 const short = (value) => String(Number(value.toPrecision(3))).replace("-", MINUS);
 
 /** Return the next larger number that is easy to read on a scale. */
