@@ -4,9 +4,9 @@
     python stop_on_area.py --area-mm2 60 --source demo --pretend        # without a sensor
 
 Replace `PrintedGripper` by your own. It is also stopped for everything that may be wrong: too much force, a dead
-taxel, readings that are old or missing, a lost link, an error, Ctrl-C. Of several sensors every one must be well and
-free before it begins, and any one stops it; --name restricts this to one. It never moves by an emulated sensor or a
-recording, unless --pretend is set. Exit code 0 only if the area was reached.
+taxel, a pattern that is not to be believed, readings that are old or missing, a lost link, an error, Ctrl-C. Of several
+sensors every one must be well and free before it begins, and any one stops it; --name restricts this to one. It never
+moves by an emulated sensor or a recording, unless --pretend is set. Exit code 0 only if the area was reached.
 
 No program can monitor itself: let the gripper's own controller stop when it receives no further commands.
 """
@@ -153,6 +153,8 @@ class Grip:
             return f"taxels {sorted(result.dead)} are dead"
         if result.state in ("zeroing", "incomplete") or result.force_counts is None:
             return f"the sensor is not ready: {result.note or result.state}"
+        if result.trusted is False:  # its area is no ground to go on, nor to have reached anything
+            return f"the pattern is not to be believed: {result.untrusted_text}"
         if result.force_counts > self._most_counts:
             return f"the force is {result.force_counts:.0f} counts"
         return None

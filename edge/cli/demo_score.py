@@ -146,11 +146,12 @@ def score_picture(score: TapScore, columns: int, palette: Palette) -> str:
         raise ValueError("score has no pattern, expected one made by DemoScore")
     taxels_z = deformation(result.scan.counts, result.baseline)[2]
     highest = float(max(result.pattern.max(), score.truth.max()))
+    believed = "super-resolved" if result.trusted is not False else "NOT BELIEVED"
     height, width = result.pattern.shape
     return draw(
         [
             Panel(f"taxels, {taxels_z.shape[0]} x {taxels_z.shape[1]}", taxels_z, 0.0, float(taxels_z.max()), "counts"),
-            Panel(f"super-resolved, {height} x {width}", result.pattern, 0.0, highest, result.pattern_unit),
+            Panel(f"{believed}, {height} x {width}", result.pattern, 0.0, highest, result.pattern_unit),
             Panel("truth", score.truth, 0.0, highest, result.pattern_unit),
         ],
         columns,

@@ -36,12 +36,19 @@ class MessageSink(Sink):
         self._clock_s = clock_s
         self._begun_s = clock_s()
         self._patience_s = FIRST_HINT_S
+        self._doubted: set[str] = set()
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Print the events before this scan."""
+        """Print the events before this scan, and once in a contact that its pattern is not to be believed."""
         self._hint = ""
         for event in result.events:
             self.say(event)
+        sensor = result.scan.sensor
+        if result.contact is False:
+            self._doubted.discard(sensor)
+        elif result.trusted is False and sensor not in self._doubted:
+            self._doubted.add(sensor)
+            self._say(f"sensor {sensor}: pattern not to be believed: {result.untrusted_text}")
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Print one event."""

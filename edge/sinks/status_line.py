@@ -103,6 +103,8 @@ class StatusSink(Sink):
             words.append(f"without taxel {','.join(map(str, result.dead))}")
         if result.drift is not None and result.drift.step_counts:
             words.append(f"rest off by {result.drift.step_counts:.0f}")
+        if result.trusted is False:
+            words.append(f"NOT BELIEVED ({result.untrusted_reason})")
         if result.contact:
             words.append(f"tap {result.taps_used}")
         if result.force_n is not None:

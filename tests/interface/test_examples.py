@@ -165,11 +165,13 @@ def reading(state="idle", sensor="4", **said):
 
 
 SILENT = Note("dead", "taxel 3 was not heard")
+UNTRUSTED = {"trusted": False, "untrusted_reason": "unfamiliar"}
 WRONG = {
     "the reading is 50": {"age_ms": 5000},
     "taxels [5] are dead": {"dead": {5: "stuck"}},
     "not ready: taxel 3 was not heard": {"state": "incomplete", "notes": (SILENT,), "force_counts": None},
     "not ready: zeroing": {"state": "zeroing", "force_counts": None},
+    "not to be believed: readings like no contact": {"state": "contact", "area_mm2": 50.0} | UNTRUSTED,
     "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
 }
 

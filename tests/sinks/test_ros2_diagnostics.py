@@ -54,6 +54,12 @@ def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
     clock.now_ns += 1_000_000_000
     sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), dead={3: "stuck"}), {"dropped": 2})
     assert statuses() == [(Level.WARN, "without taxel 3 (stuck)")]
+    clock.now_ns += 1_000_000_000
+    doubtful = {"state": "contact", "trusted": False, "untrusted_reason": "unexplained"}
+    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubtful), {"dropped": 2})
+    (status,) = statuses()
+    assert status[0] == Level.WARN
+    assert status[1].startswith("pattern not to be believed: the pattern does not explain its readings")
     published.clear()
     sink.tell(Event(clock.now_ns, "lost", None, "the plug is out"), {})
     sink.close()

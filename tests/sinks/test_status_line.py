@@ -35,6 +35,20 @@ def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
     assert stream.getvalue().splitlines() == hints
 
 
+def test_a_pattern_that_is_not_believed_is_told_of_once_a_contact():
+    stream = io.StringIO()
+    messages = MessageSink(stream)
+    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+    for number in range(12):
+        pressed = number % 6 < 4
+        result = runtime.push(make_scan(number, press_counts=3000 if pressed else 0))
+        doubtful = {"trusted": False, "untrusted_reason": "unfamiliar"} if pressed and number % 2 else {}
+        messages.write(replace(result, **doubtful), RUN)
+    line = "edge-sr: sensor 4: pattern not to be believed: readings like no contact"
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 2 and all(one.startswith(line) for one in lines)
+
+
 class TestStatus:
     def test_a_finger_that_is_silent_does_not_stand_there_as_if_it_were_not(self):
         now_s = [0.0]
@@ -82,6 +96,17 @@ class TestStatus:
         result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan())
         sink.write(replace(result, dead={3: "stuck", 7: "silent"}, filled="neighbours"), RUN)
         assert "4 idle without taxel 3,7 " in sink.line() + " "
+
+    def test_a_pattern_that_is_not_believed_is_marked(self):
+        sink = self.make()
+        result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan(press_counts=3000))
+        for trusted, reason, words in (
+            (None, None, "4 contact tap 1 "),
+            (False, "stuck", "4 contact NOT BELIEVED (stuck) tap 1 "),
+            (True, None, "4 contact tap 1 "),
+        ):
+            sink.write(replace(result, trusted=trusted, untrusted_reason=reason), RUN)
+            assert sink.line().startswith(words)
 
     def test_a_note_while_zeroing_is_shown(self):
         sink = self.make()

@@ -69,6 +69,8 @@ def _findings(result: Result, silence_s: float | None, trouble: str | None) -> l
     if result.dead:
         dead = ", ".join(f"{taxel} ({reason})" for taxel, reason in result.dead.items())
         found.append((Level.WARN, f"without taxel {dead}"))
+    if result.trusted is False:
+        found.append((Level.WARN, f"pattern not to be believed: {result.untrusted_text}"))
     if result.drift is not None and result.drift.step_counts:
         found.append((Level.WARN, f"rest level off by {result.drift.step_counts:.0f} counts"))
     return found
