@@ -85,7 +85,7 @@ class Program:
             BenchError: the program ended.
         """
         if self._process.stdout is None:
-            raise ValueError("the program's stdout is no pipe")
+            raise ValueError("the program's stdout is not a pipe")
         got: list[tuple[int, bytes]] = []
         end_ns = time.monotonic_ns() + int(seconds * 1e9)
         now_ns = 0

@@ -228,7 +228,7 @@ def read_record(path: Path) -> dict[str, Any]:
         ) from error
     kind: Sequence[object] = (told.get("format"), told.get("version")) if isinstance(told, dict) else (None, None)
     if kind[0] != FORMAT:
-        raise BenchError(f"{path} is no bench: expected the bench.json of 'edge-sr bench --out'")
+        raise BenchError(f"{path} is not a bench: expected the bench.json of 'edge-sr bench --out'")
     if kind[1] != VERSION:
         raise BenchError(
             f"{path} is of version {repr(kind[1])[:40]}, expected {VERSION}: run that bench again with this release"

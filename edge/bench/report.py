@@ -143,7 +143,7 @@ def front_line(row: FrontRow) -> str:
 
 def against_text(peer: str, weights: str | None) -> str:
     """Describe the table of ratios to the peer."""
-    nobody = f" Its weights are {weights}: its run time is what it is, its patterns are nothing." if weights else ""
+    nobody = f" Its weights are {weights}: its run time is valid, its patterns are not." if weights else ""
     return (
         f"Against {peer}, run time only.{nobody} Both in one process, block by block in turn, back to back on one "
         "thread; medians with 95 % intervals."

@@ -13,7 +13,7 @@ from edge.sinks.registry import check_apart
 
 _NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
 """Suffixes of other formats, which a recording must not be named after."""
-_RECORDS: Final = "records in JSON are edge-sr --sink jsonl:FILE"
+_RECORDS: Final = "for records in JSON use edge-sr --sink jsonl:FILE"
 
 
 @contextmanager

@@ -266,4 +266,4 @@ def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple
     got = ", ".join(f"{tensor.name} {tensor.type} {list(tensor.shape)}" for tensor in tensors)
     expected = ", ".join(f"{name} tensor(float) {list(shape)}" for name, shape in shapes.items())
     if got != expected:
-        raise ModelError(f"graph {role} is {got}, but its contract says {expected}")
+        raise ModelError(f"graph {role} is {got}, but its contract states {expected}")

@@ -161,7 +161,8 @@ FIELDS: Final = (
           "it was stored", decimals=1, byte=160),
     Field("drift_counts", _OBJECT, "drift", "followed since: `common` on x, y, z, and the largest of a taxel's `own` "
           "beyond it; `step`: the largest step in rest level that was not followed", json=_drift, out=Out.RECORD),
-    Field("dead", _BITS, "dead", "taxels that are not believed, and why: `{\"3\": \"stuck\", \"7\": \"silent\"}`, "
+    Field("dead", _BITS, "dead", "dead taxels, whose readings are not used, and why: "
+          "`{\"3\": \"stuck\", \"7\": \"silent\"}`, "
           "`saturated`, `far`, `unzeroed`; elsewhere bit i: taxel i. A pattern is then made without them",
           make=_dead_bits, json=_dead_reasons, out=_RECORD_NPZ, byte=80),
     Field("filled", _one_of("rest", "neighbours", unknown=""), "filled",

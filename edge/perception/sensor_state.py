@@ -123,7 +123,7 @@ class Sensor:
             self._tracker.forget()
         if self._rezeroing is not None:
             self._end_rezeroing()
-            self._report("given_up", "the sensor was away; ask again")
+            self._report("given_up", "the sensor was away; request it again")
 
     def hear(self, scan: Scan) -> NDArray[np.float32] | None:
         """Take a scan and return each taxel's newest reading over the baseline (3, rows, cols); None without one."""

@@ -52,12 +52,12 @@ def take_baselines(
                 raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
             taken = source.take(POLL_S)
             if taken is None:
-                raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor were heard")
+                raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor")
             if any(isinstance(heard, Scan) for heard in taken):
                 heard_s = clock_s()
             elif clock_s() - heard_s > GIVEN_UP_S:
                 silence = f"no scan from {source.name} for {GIVEN_UP_S:.0f} s"
-                raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor says what is wrong")
+                raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor shows what is wrong")
             for heard in taken:
                 if not isinstance(heard, Scan):
                     if heard.kind in ("lost", "silent"):

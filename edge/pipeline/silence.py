@@ -140,7 +140,7 @@ class Silence:
         return events
 
     def _silence(self, sensor: str, now_ns: int, since_ns: int, why_recorded: str) -> Event:
-        why = why_recorded if self._recorded else "see to its cable and its controller, since others go on"
+        why = why_recorded if self._recorded else "check its cable and its controller, since other sensors continue"
         return Event(
             now_ns, "silent", sensor, f"no scan from sensor {sensor} for {(now_ns - since_ns) / 1e9:.1f} s: {why}"
         )

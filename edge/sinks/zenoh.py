@@ -85,7 +85,7 @@ class ZenohSink(Sink):
     @property
     def trouble(self) -> str | None:
         """Trouble where there was no subscriber when the last result was put, else None."""
-        return None if self._read else f"nobody subscribes to zenoh:{self._target}: see to its reader, or the router"
+        return None if self._read else f"nobody subscribes to zenoh:{self._target}: check its reader, or the router"
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Put the scan, and its pattern where that is new.
@@ -160,7 +160,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
         return key, {**CLOSED, "connect/endpoints": value.split(",")}
     if name == "config" and value:
         return key, Path(value)
-    raise UsageError(f"zenoh:{target} has {option!r} behind its key: {_REMEDY}")
+    raise UsageError(f"zenoh:{target} has {option!r} after its key: {_REMEDY}")
 
 
 def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
@@ -173,7 +173,7 @@ def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
         try:
             config = zenoh.Config.from_file(configuration)
         except zenoh.ZError as error:
-            raise SinkError(f"{configuration} is no configuration of zenoh: {_reason(error)}") from error
+            raise SinkError(f"{configuration} is not a zenoh configuration: {_reason(error)}") from error
         configuration = {name: CLOSED[name] for name, said in untouched.items() if config.get_json(name) == said}
     for name, value in configuration.items():
         config.insert_json5(name, json.dumps(value))

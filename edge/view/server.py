@@ -129,7 +129,7 @@ class Server:
             self._loop, self.watched = None, False
             ready.set()
             if not self._ending:
-                self._failed(f"the live page has ended: {sys.exception()!r}; the run goes on")
+                self._failed(f"the live page has ended: {sys.exception()!r}; the run continues")
 
     async def _show(self, run: Run, ready: threading.Event) -> None:
         self._loop = asyncio.get_running_loop()
@@ -188,7 +188,7 @@ class Server:
         if request.path.partition("?")[0] == SOCKET:
             if isinstance(connection, Connection) and self._connections.grant(connection):
                 return None
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} look already: close one\n")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"too many viewers ({MOST_VIEWERS}): close one\n")
         return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
 
     async def _attend(self, run: Run, connection: ServerConnection) -> None:
@@ -237,5 +237,5 @@ def _listen(host: str, port: int) -> socket.socket:
         if error.errno == errno.EADDRINUSE:
             what, remedy = f"port {port} of {host} is in use", "name another with --view, or 0 for any free one"
         elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            what, remedy = f"{host} is no address of this machine", "name one with --view-host, or leave it out"
+            what, remedy = f"{host} is not an address of this machine", "name one with --view-host, or leave it out"
         raise SinkError(f"no live page: {what}; {remedy}") from error

@@ -66,7 +66,7 @@ class Writer:
             if "coverage_90" in error:
                 said.append(f"interval covers {error['coverage_90']:.1%}")
         else:
-            said.append(f"not judged, the test set is of x{self.frozen.scale}")
+            said.append(f"not evaluated, the test set is of x{self.frozen.scale}")
         fitting = [one for one in self.validation if one.scale == contract.scale]
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))

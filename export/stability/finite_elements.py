@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from export.stability.case import Case, refused, timed
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer
-from train.physics.fem_cache import REFEREE_POISSON, Mesh
+from train.physics.fem_cache import REFERENCE_POISSON, Mesh
 from train.physics.fem_reference import FemPad, FemPresses, NoEquilibriumError
 
 PART: Final = "FEM referee"
@@ -64,7 +64,7 @@ def cases(quick: bool = False) -> Iterator[Case]:
     """
     fineness = _QUICK if quick else _WHOLE
     yield from _incompressible(fineness.punch)
-    for poisson in (_poisson(BULKS[0]), REFEREE_POISSON):
+    for poisson in (_poisson(BULKS[0]), REFERENCE_POISSON):
         for step in fineness.steps:
             yield _compress(fineness.compression, poisson, step, LEFT)
     for step in (0.2, 0.1):
@@ -98,7 +98,7 @@ def _incompressible(mesh: Mesh) -> Iterator[Case]:
         alone, run_ms = timed(lambda bulk=bulk: _punch(mesh, bulk, mixed=False))
         ratio = float(alone.force_n[-1]) / forces_n[-1]
         what = "force by displacement alone, to the mixed one"
-        locks = f"{_told(alone)}; locks: not what the referee uses"
+        locks = f"{_told(alone)}; locks: not what the reference uses"
         yield Case(PART, "locking", severity, what, ratio, None, run_ms, note=locks, limit=True, least=1.05)
     change = abs(forces_n[-1] / forces_n[-2] - 1)
     severity = f"K/G {BULKS[-2]:g} to {BULKS[-1]:g}"
@@ -137,11 +137,11 @@ def _face(mesh: Mesh, layer: Layer, steps_mm: NDArray[np.floating]) -> tuple[Fem
 
 def _bulge(mesh: Mesh) -> Iterator[Case]:
     """Yield the cases of sides that bulge over the board's rim, below which the elements do not support them."""
-    layer = Layer(poisson=REFEREE_POISSON)
+    layer = Layer(poisson=REFERENCE_POISSON)
     shares = np.array([0.05, 0.1, 0.15, 0.2, 0.25, 0.3])
     pad = FemPad(*mesh, layer)
     found, run_ms = timed(lambda: pad.press(np.zeros((pad.size, pad.size)), layer.thickness_mm * shares))
-    case, severity = "compression", f"K/G {_bulk(REFEREE_POISSON):.0f}, down by {{:.0%}}"
+    case, severity = "compression", f"K/G {_bulk(REFERENCE_POISSON):.0f}, down by {{:.0%}}"
     last = severity.format(shares[-1])
     what = "residual, share of the reactions"
     yield Case(PART, case, last, what, float(found.residual.max()), _RESIDUAL, run_ms, note=_told(found))
@@ -175,19 +175,19 @@ def _square(count: int, half_width_mm: float) -> FemPresses:
     """Press a square punch on even elements, a quarter as many over the thickness as along a side."""
     # Pixels at x1 and the rim, all at the same distance.
     even = replace(USPA44, rows=count - 1, cols=count - 1, pitch_mm=USPA44.width_mm / count)
-    pad = FemPad(1, count // 4, Layer(poisson=REFEREE_POISSON), geometry=even)
+    pad = FemPad(1, count // 4, Layer(poisson=REFERENCE_POISSON), geometry=even)
     inside = np.abs(pad.nodes_mm) <= half_width_mm * (1 + 1e-9)
     return pad.press(np.where(inside[:, None] & inside, 0.0, _OFF), np.array([0.1]))
 
 
 def _too_far(mesh: Mesh) -> Case:
-    layer = Layer(poisson=REFEREE_POISSON)
+    layer = Layer(poisson=REFERENCE_POISSON)
     pad = FemPad(*mesh, layer)
     down_mm = np.array([(1 - LEFT) * layer.thickness_mm])
     return refused(
         PART,
         f"compression to {LEFT:.0%}",
-        f"K/G {_bulk(REFEREE_POISSON):.0f}, one leap",
+        f"K/G {_bulk(REFERENCE_POISSON):.0f}, one leap",
         lambda: pad.press(np.zeros((pad.size, pad.size)), down_mm),
         NoEquilibriumError,
     )

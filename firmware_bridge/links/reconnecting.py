@@ -135,11 +135,11 @@ class LastingLink(Link):
         if not self._silent and self._lost_ns is None:
             self._silent = True
             self._outages += 1
-            self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it anew")
+            self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it again")
         away_ns = now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)
         if away_ns >= self._give_up_s * 1e9:
             raise LinkLostError(
-                f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: see to the sensor's power and its cable"
+                f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: check the sensor's power and its cable"
             )
         self._silent_s += min(self._silent_s, LATE_RETRY_S)
         self._open = False
@@ -153,7 +153,7 @@ class LastingLink(Link):
             self._reopenings += 1
             self._entered = self._open = True
             if self._link.kind != self.kind:  # every result would go on to state the first kind
-                raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start anew")
+                raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start again")
 
     def _close(self, why: str, now_ns: int | None = None) -> None:
         now_ns = self._clock_ns() if now_ns is None else now_ns

@@ -226,13 +226,13 @@ def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> 
 
 def _no_handshake(error: Exception, opening_s: float) -> str:
     if isinstance(error, TimeoutError):
-        return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is no xela_server"
+        return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is not an xela_server"
     if isinstance(error, InvalidStatus):
         return f"answers with HTTP status {error.response.status_code}: not the xela_server, but another program"
     if isinstance(error, InvalidMessage):
         return "does not answer as a WebSocket does: another program, or one that expects TLS, is at this port"
     if isinstance(error, InvalidHandshake):
-        return f"is no xela_server: {error}"
+        return f"is not an xela_server: {error}"
     return f"the connection broke while it was opened: {error}"
 
 
@@ -243,5 +243,5 @@ def _ending(error: ConnectionClosed) -> str:
         return f"the server closed it (code {int(received.code)}{reason})"
     sent = error.sent
     if sent is not None:
-        return f"the server sent what no xela_server sends: {sent.reason or f'code {int(sent.code)}'}"
+        return f"the server sent a message that no xela_server sends: {sent.reason or f'code {int(sent.code)}'}"
     return "the server is gone"

@@ -244,7 +244,7 @@ class _Reading:
 
     def damaged(self, why: str, left_bytes: int) -> None:
         """Keep the records before the damage and note it."""
-        self._notes.insert(0, f"{self._path} is damaged ({why}): {left_bytes:,} bytes behind that are not read")
+        self._notes.insert(0, f"{self._path} is damaged ({why}): {left_bytes:,} bytes after that are not read")
 
     def recording(self) -> Recording:
         if not self._lanes:
@@ -324,7 +324,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     else:
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, expected zstd, lz4 or nothing")
     if len(data) != size_bytes:
-        raise ValueError(f"it does not hold the {size_bytes:,} bytes that it tells of")
+        raise ValueError(f"it does not hold the {size_bytes:,} bytes that it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("its check sum is wrong")
     return data

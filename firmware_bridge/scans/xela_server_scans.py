@@ -83,7 +83,7 @@ class ServerScans:
         wanted = f"expected {self._geometry.taxel_count}"
         told = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
         silent = [name for name, sensor in self._sensors.items() if sensor.silent]
-        told += [f"nothing comes of sensor {name}: see to its cable and its power" for name in silent]
+        told += [f"nothing arrives from sensor {name}: check its cable and its power" for name in silent]
         if self._lags:
             late = f"what is read is older by {STALE_NS // 1_000_000} ms than usual"
             told.append(f"{late}: the server lags, the network does, or this program is too slow")

@@ -190,7 +190,7 @@ def test_one_that_comes_back_as_another_kind_is_given_up():
     world = World(away=[(1.0, 2.0)])
     inner = Changeling(world)
     link = LastingLink(inner, clock_ns=lambda: world.now_ns, sleep=world.sleep)
-    with pytest.raises(LinkLostError, match=r"^slcan:x was device and came back as emulated: start anew$"), link:
+    with pytest.raises(LinkLostError, match=r"^slcan:x was device and came back as emulated: start again$"), link:
         while world.now_ns < 5 * S:
             for _ in link.read(0.1):
                 assert inner.kind == "device"

@@ -173,7 +173,7 @@ class TestSession:
             ),
             (
                 {"metadata": make_contract(version=4).to_metadata()},
-                r"pad tensor\(float\) \[1, 5\], but its contract says window tensor\(float\) \[1, 12, 4, 4\]$",
+                r"pad tensor\(float\) \[1, 5\], but its contract states window tensor\(float\) \[1, 12, 4, 4\]$",
             ),
         ],
     )

@@ -36,7 +36,7 @@ class TestRefusals:
             (["baseline", "--out", "x", "--skip", "-1"], ["--skip"]),
             (["replay", "--view", "a.mcap"], ["'a.mcap' is no port", "write FILE or command before it"]),
             (["--view", "demo"], ["'demo' is no port"]),
-            (["--view", "65536"], ["'65536' is no port: expected 0 to 65535"]),
+            (["--view", "65536"], ["'65536' is not a port: expected 0 to 65535"]),
             (["--source", "serial:x"], ["'serial:x'", "slcan:/dev/ttyUSB0", "replay:FILE", "demo"]),
             (["--source", "replay:none\nsuch.npz"], ["none such.npz"]),
             (["--source", "replay:none.npz"], ["none.npz", "No such file"]),

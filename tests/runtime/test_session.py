@@ -210,7 +210,7 @@ def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks
         ),
         (
             {"with_deviation": False, "contract": make_contract(interval_factor=1.6)},
-            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract says pattern .*, deviation tensor",
+            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract states pattern .*, deviation tensor",
         ),
         ({"element_type": TensorProto.DOUBLE}, r"graph input is window tensor\(double\)"),
         ({"input_shape": ["n", 12, 4, 4]}, r"graph input is window tensor\(float\) \['n', 12, 4, 4\]"),

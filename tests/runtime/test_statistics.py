@@ -91,7 +91,7 @@ def test_summary_tells_all_of_it():
         f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
         "sinks: nobody subscribes to zenoh:a",
         "events: lost 2, back 1",
-        "refused: 2 lines or messages were no command",
+        "refused: 2 lines or messages were not commands",
     ]
 
 

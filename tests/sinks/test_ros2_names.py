@@ -49,7 +49,7 @@ def test_names_that_ros_cannot_hold_are_refused():
     [
         ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
         ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID is '233'"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, so that nobody finds us"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, so that no other node discovers edge-sr"),
     ],
 )
 def test_an_environment_that_ros_would_not_take_is_refused(environment, said):

@@ -167,8 +167,8 @@ def rewrite(path, **changes):
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"schema": None}, "is no file of sequences: make one"),
-        ({"schema": "something else"}, "is no file of sequences: make one"),
+        ({"schema": None}, "is not a file of sequences: make one"),
+        ({"schema": "something else"}, "is not a file of sequences: make one"),
         ({"version": 2}, "version 2, newer than 1: update"),
         ({"version": "one"}, "damaged"),
         ({"counts": None}, "counts"),

@@ -214,7 +214,7 @@ def test_damaged_parts_are_solved_anew_and_others_are_kept(small, tmp_path):
 
 def test_what_was_made_otherwise_is_not_overwritten(small, tmp_path):
     before = small.read_bytes()
-    with pytest.raises(DatasetError, match="is there and was made otherwise: delete it"):
+    with pytest.raises(DatasetError, match="exists and was made with other settings: delete it"):
         generate(replace(SMALL, seed=6), small, jobs=1)
     solved = []
     assert generate(SMALL, small, jobs=1, progress=solved.append).sha256() == load_sequences(small).sha256()

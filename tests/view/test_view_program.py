@@ -119,7 +119,7 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--view-host", "0.0.0.0"], "--view-host is of the live page, which was not asked for: add --view"),
+        (["--view-host", "0.0.0.0"], "--view-host requires --view"),
         (["--view-token", "x" * 20], "--view-token is of the live page"),
         (["--view-record-dir", "."], "--view-record-dir is of the live page"),
         (

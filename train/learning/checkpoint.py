@@ -171,7 +171,7 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
         net.load_state_dict(torch.load(path, weights_only=True))
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise CheckpointError(f"{path} and {path.stem}.json are no checkpoint of train.fit: {reason}") from error
+        raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {reason}") from error
     return net.eval(), report
 
 

@@ -111,7 +111,7 @@ def _epochs(rows: list[Row], sequences: int) -> str:
         if "steps" in row and not str(row["method"]).startswith("compact")
     }
     told = ", ".join(f"{name} {epochs:.2f}" for name, epochs in of.items())
-    return f"The networks of the paper were trained by the clock, on this machine for so many epochs: {told}."
+    return f"The networks of the paper were trained for a fixed time, on this machine for so many epochs: {told}."
 
 
 def _verdicts(test_psnr: Mapping[str, NDArray[np.float64]], taps: NDArray[np.integer]) -> str:

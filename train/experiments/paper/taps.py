@@ -35,11 +35,11 @@ def run(bench: Workbench, folder: Path) -> Path:
         gain = _gain(found, figures[0], test.tap)
         gains["MTSR-7 given fewer"].append(gain)
         rows.append(row | _cell(gain) | cost_cells(net))
-    told_apart = sum(low > 0 or high < 0 for curve in gains.values() for _, low, high in curve)
+    distinct = sum(low > 0 or high < 0 for curve in gains.values() for _, low, high in curve)
     report = Report("taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "Compact networks on the same targets, all trained on from one of a single tap for as long. "
-        f"Of {2 * MAX_TAPS - 1} ways with other taps or another network, {told_apart} can be told apart from STSR "
+        f"Of {2 * MAX_TAPS - 1} ways with other taps or another network, {distinct} differ significantly from STSR "
         "(95 % interval of the difference, by tap)."
     )
     report.table(rows, "By number of taps, test set.")

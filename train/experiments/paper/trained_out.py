@@ -52,11 +52,11 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"{len(test)} frames of {len(test.surface)} taps a set; full scale {test.full_scale_mm} mm. PSNR with its 95 % "
         f"interval by tap. A name's numbers are passes over the same {SEQUENCES} sequences, from nothing and, after a "
         "+, on from the STSR of that kind; every part is one cycle of the learning rate, batches of 64, in bfloat16. "
-        "Minutes are those of a network's own part, with up to four others beside it on the device. Run time: one "
-        "window, torch, one thread, on the machine that judged."
+        "Minutes are those of a network's own part, with up to four others at once on the device. Run time: one "
+        "window, torch, one thread, on the machine that evaluated it."
     )
     if absent := [_name(training) for training in OUT if _name(training) not in psnr]:
-        report.say(f"Not there, so not judged: {', '.join(absent)}.")
+        report.say(f"Missing, so not evaluated: {', '.join(absent)}.")
     report.say(_verdicts(psnr, test.tap))
     report.table(rows, "Validation and test set, x10.")
     report.table(

@@ -58,8 +58,8 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     report = Report("calibration", folder, __file__, bench.used, quick=bench.quick)
     report.say(
-        "Deviations are scaled once, on the validation position; here they are judged at the test position, on the 18 "
-        f"surfaces and on {TEST_FIGURES} glyphs that no network was trained on. Intervals of the mean are by tap."
+        "Deviations are scaled once, on the validation position; here they are evaluated at the test position, on the "
+        f"18 surfaces and on {TEST_FIGURES} glyphs that no network was trained on. Intervals of the mean are by tap."
     )
     report.say(_coverage_verdict(found))
     report.table(_reliability_rows(found, nets), "Pixels in [%] that intervals of each level cover.")

@@ -100,7 +100,7 @@ def judged(model: Model, given: int, frozen: FrozenSet) -> _Judged:
     ]
     told = [expected for expected in found if expected is not None]
     if len(told) < len(found):
-        raise TrainError(f"model '{model.name}' does not tell what to expect of {given} taps: export it again")
+        raise TrainError(f"model '{model.name}' does not state the expected error of {given} taps: export it again")
     gains = [expected.gain for expected in told if expected.gain is not None]
     expected_mm = np.array([expected.rmse for expected in told])
     return _Judged(frozen.tap, expected_mm, error_mm, np.array(gains) if gains else None)

@@ -255,7 +255,7 @@ def _method(whole: Sequence[Played], model: str) -> str:
     size = np.sqrt(np.mean(np.concatenate([z_of(one.zeroed) for one in whole]) ** 2))
     return (
         f"{scans} scans of {len(whole)} recordings in which some taxel is pressed, z RMS {size:.0f} counts, through "
-        f"edge.perception.runtime with {model} and the baseline of the free pad; nothing is known of the pads, and "
+        f"edge.perception.runtime with {model} and the baseline of the free pad; the pads are unknown, and "
         f"nothing is "
         "fitted on real readings but in the last two rows of the first table. Share: of the pad above half of the "
         "pattern's 95th percentile, wanted .9; std / mean: over the inner 80 %, wanted .25 at most; medians of scans. "
@@ -272,7 +272,7 @@ def _unexplained(presses: PressSet, operator: NDArray[np.floating]) -> str:
     percent = 100 * np.mean(left**2) / np.mean(read**2)
     return (
         f"True patterns of {len(presses)} validation presses leave {percent:.0f} % of their z's energy unexplained by "
-        "the operator: pads and gains differ, and none is known."
+        "the operator: pads and gains differ, and are unknown."
     )
 
 
