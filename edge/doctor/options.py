@@ -41,7 +41,7 @@ def doctor_parser() -> argparse.ArgumentParser:
     drift_help = f"seconds to measure the free, still pad (default {DOCTOR_DRIFT_S:g})"
     add("--drift-s", metavar="T", type=positive, default=DOCTOR_DRIFT_S, help=drift_help)
     add("--baseline", metavar="FILE", type=Path, help="stored baseline, to detect a load on the pad")
-    add("--no-press", action="store_true", help="do not ask for presses on the corners")
+    add("--no-press", action="store_true", help="skip the presses on the corners")
     add("--weight-g", metavar="G", type=positive, help="weight to lay on the pad, to measure counts per newton")
     add("--out", metavar="FILE", type=Path, help="write the results into a sensor file")
     add("--json", action="store_true", help="write one JSON document to stdout")

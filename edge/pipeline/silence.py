@@ -132,7 +132,7 @@ class Silence:
         for sensor, scan in self._last.items():
             if newest_ns - self._heard_ns(sensor, scan.time_ns) > SENSOR_SILENT_NS and sensor not in self._silent:
                 self._silent.add(sensor)
-                events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none for so long"))
+                events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none in that time"))
         if self._expected and newest_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
             why = "the recording has none of it, though there is a baseline or a force for it"

@@ -233,9 +233,10 @@ def _listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as error:
-        what, remedy = f"port {port} of {host} cannot be had: {error.strerror}", "name another with --view"
+        what, remedy = f"cannot listen on {host}:{port}: {error.strerror}", "name another port with --view"
         if error.errno == errno.EADDRINUSE:
-            what, remedy = f"port {port} of {host} is in use", "name another with --view, or 0 for any free one"
+            what = f"cannot listen on {host}:{port}: address in use"
+            remedy = "name another port with --view, or 0 for any free one"
         elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
             what, remedy = f"{host} is not an address of this machine", "name one with --view-host, or leave it out"
         raise SinkError(f"no live page: {what}; {remedy}") from error

@@ -146,9 +146,7 @@ def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
     for step in range(20):
         assert server.say(10 * step, cycle(step))
     scans = [scan for step in range(20, 420) for scan in server.say(10 * step, cycle(19), **dead)]
-    assert (
-        server.scans.trouble is not None and "nothing arrives from sensor 1: see to its cable" in server.scans.trouble
-    )
+    assert server.scans.trouble is not None and "nothing arrives from sensor 1: check its cable" in server.scans.trouble
     assert not any(scan.renewed.any() for scan in scans) and len(scans) <= 67  # a second long it may be a still pad
     assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
     server.scans.begin()  # opening it again brings no scan either

@@ -111,7 +111,8 @@ class TestPage:
 
     def test_a_port_in_use_is_one_line(self, page, tmp_path):
         words = (
-            rf"no live page: port {page.port} of 127.0.0.1 is in use; name another with --view, or 0 for any free one"
+            rf"no live page: cannot listen on 127.0.0.1:{page.port}: address in use; "
+            "name another port with --view, or 0 for any free one"
         )
         with pytest.raises(SinkError, match=words):
             LiveView("127.0.0.1", page.port, None, tmp_path, CONTRACT, Commands())

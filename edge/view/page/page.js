@@ -71,12 +71,12 @@ function paintPage() {
   const source = hello?.source ?? "device";
   show(origin, hello !== null && source !== "device");
   origin.dataset.source = source;
-  say(origin, source === "replay" ? "REPLAY: nothing here is happening now" : "EMULATED: there is no sensor behind this");
+  say(origin, source === "replay" ? "REPLAY: a recording, not live data" : "EMULATED: these are not data of a sensor");
   const models = new Set([...page.sensors.values()].map((sensor) => sensor.said?.model ?? hello.model));
   say(byId("about"), hello === null ? "" : [hello.name, ...(models.size ? models : [hello.model])].join(", "));
   paintTrouble();
   byId("pause").setAttribute("aria-pressed", String(page.paused));
-  byId("pause").firstChild.textContent = page.paused ? "Go on " : "Pause ";
+  byId("pause").firstChild.textContent = page.paused ? "Resume " : "Pause ";
   const recording = Boolean(page.state.recording);
   byId("record").setAttribute("aria-pressed", String(recording));
   byId("record").firstChild.textContent = recording ? "Recording " : "Record ";
@@ -99,8 +99,8 @@ function paintTrouble() {
   show(trouble, lost || page.paused);
   trouble.dataset.kind = lost ? "lost" : "pause";
   const since = ago(nowS() - page.lostS);
-  const what = page.hello === null ? "no connection to edge-sr" : `${link.ended ? `the run has ended (${since})` : `connection lost ${since}`}: what is shown is old`;
-  say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor goes on. Space goes on here`);
+  const what = page.hello === null ? "no connection to edge-sr" : `${link.ended ? `the run has ended (${since})` : `connection lost ${since}`}: the values shown are old`;
+  say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor continues. Press space to resume`);
 }
 
 const lostWord = () => (page.link.ended ? "run ended" : "connection lost");
@@ -188,14 +188,14 @@ function forgetRun() {
   page.paused = false;
   page.told = 0;
   forgetRefusal();
-  log("another run has begun");
+  log("a new run has begun");
 }
 
 // ---- Commands ----
 
 function command(what) {
   const sent = page.link.send(what);
-  if (!sent) log("not done: there is no connection to edge-sr", { bad: true });
+  if (!sent) log("command not sent: no connection to edge-sr", { bad: true });
   return sent;
 }
 

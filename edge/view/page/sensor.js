@@ -275,7 +275,7 @@ class Sensor {
     const [context, width, height] = blank(shear);
     const deaths = Object.entries(this.said?.dead ?? {});
     show(dead, deaths.length > 0);
-    say(dead, `not believed: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
+    say(dead, `dead, not used: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
     if (this.zeroed === null) {
       taxels.getContext("2d").clearRect(0, 0, taxels.width, taxels.height);
       say(this.part["taxels-high"], "counts");

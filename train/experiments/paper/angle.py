@@ -40,8 +40,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     ]
     report.say(
         "Compact networks, each trained from the STSR for as many steps and evaluated with its own angle; of the gain"
-        f" over the STSR a part is these steps. Highest here: {ANGLES_DEG[best]:g} degrees, significantly (intervals that"
-        f" do not meet) more than at {', '.join(apart) or 'none of the others'}; in the paper 10. The newest taps differ"
+        f" over the STSR a part is these steps. Highest here: {ANGLES_DEG[best]:g} degrees, significantly (no common"
+        f" interval) more than at {', '.join(apart) or 'none of the others'}; in the paper 10. The newest taps differ"
         " between angles by their pose error alone."
     )
     report.table(rows, "MTSR-2 by angle between the taps, test set.")

@@ -269,8 +269,8 @@ def _how(surfaces: int, steps: int, psf: str) -> str:
         f"against FEM ({psf}). Depth x indentation: the touching pixels at the indentation, sharp. Depth x force, as "
         "the paper has it: one factor fitted in the same way. layer: bonded layer without sides, Polonsky-Keer, "
         f"Poisson's ratio {Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's ratio "
-        f"{REFERENCE_POISSON:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next to "
-        "them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
+        f"{REFERENCE_POISSON:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
+        "to them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
         "was worked out."
     )
 
