@@ -34,7 +34,7 @@ def head(columns: Sequence[str]) -> str:
 def about(record: Record) -> str:
     """Describe the date, the command, the machine and the settings."""
     settings = record.settings
-    few = "" if settings["ticks"] >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses say little)"
+    few = "" if settings["ticks"] >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses mean little)"
     return (
         f"{record.date}, `{record.command}`\n\n{record.machine}. {settings['ticks']} ticks a row at "
         f"{settings['rate_hz']:g} Hz{few}; threads {' and '.join(map(str, settings['threads']))}; "
@@ -121,8 +121,8 @@ def front_text(rows: Sequence[RunTimeRow]) -> str:
     """Describe the table of the front."""
     threads = min(row.threads for row in rows)
     return (
-        f"On {threads} thread{'s' * (threads > 1)}, the other core idle. * is on the Pareto front: none is at least as "
-        "good in both RMSE and paced p50."
+        f"On {threads} thread{'s' * (threads > 1)}, the other core idle. * is on the Pareto front: no other is at "
+        "least as good in both RMSE and paced p50."
     )
 
 

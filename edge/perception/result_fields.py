@@ -167,8 +167,8 @@ FIELDS: Final = (
           make=_dead_bits, json=_dead_reasons, out=_RECORD_NPZ, byte=80),
     Field("filled", _one_of("rest", "neighbours", unknown=""), "filled",
           "what stands for the dead taxels: an estimate from their `neighbours` "
-          "(`rest` only by earlier releases); unknown while none "
-          "is dead, or no pattern can be made",
+          "(`rest` only by earlier releases); unknown while no "
+          "taxel is dead, or no pattern can be made",
           out=_RECORD_NPZ, byte=76),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),

@@ -135,5 +135,5 @@ def test_percentiles_of_few_runs_are_not_claimed():
     columns = ["", *run_time_columns(100.0)]
     assert cells[columns.index("back to back p99.9 us")] == "-"
     assert cells[columns.index("100 Hz p99.9 us")] == "12"
-    assert "p99.9 and misses say little" in about(make_record(ticks=2999))
+    assert "p99.9 and misses mean little" in about(make_record(ticks=2999))
     assert "say little" not in about(make_record())
