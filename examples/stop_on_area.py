@@ -85,7 +85,7 @@ class Grip:
         self._name = name
         self._missing = frozenset[str]() if name is None else frozenset({name})
         self._first_ns: int | None = None
-        self._heard_ns: dict[str, int] = {}
+        self._received_ns: dict[str, int] = {}
         self._free: set[str] = set()
         self._closing = False
         self._ended = threading.Event()
@@ -98,7 +98,7 @@ class Grip:
         stream = Stream(
             source,
             runtime,
-            on_event=self._hear,
+            on_event=self._on_event,
             on_wait=self._mind_silence,
             stop=self._ended,
             duration_s=duration_s,
@@ -118,7 +118,7 @@ class Grip:
         if self._name not in (None, scan.sensor):
             return
         self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
-        self._heard_ns[scan.sensor] = scan.time_ns if scan.device_ns is None else scan.device_ns
+        self._received_ns[scan.sensor] = scan.time_ns if scan.device_ns is None else scan.device_ns
         self._free.discard(scan.sensor)
         wrong = self._what_is_wrong(result)
         if wrong is not None:
@@ -132,12 +132,12 @@ class Grip:
 
     def _begin(self, after_ns: int) -> None:
         """Close if every sensor has sent readings, and every pad is free."""
-        settled = after_ns >= SETTLING_NS and self._heard_ns.keys() >= self._missing
-        if settled and self._free == self._heard_ns.keys() and not self._closing:
+        settled = after_ns >= SETTLING_NS and self._received_ns.keys() >= self._missing
+        if settled and self._free == self._received_ns.keys() and not self._closing:
             self._closing = True
             self._gripper.close()
 
-    def _hear(self, event: Event) -> None:
+    def _on_event(self, event: Event) -> None:
         """End on any event (lost, silent, in trouble) unless it is of a sensor that is not used."""
         if self._name is None or event.sensor in (None, self._name):
             self._end(event.text)
@@ -164,13 +164,13 @@ class Grip:
 
     def _silent(self) -> str | None:
         """Return a message about the first sensor that is silent for too long, or None."""
-        for sensor in self._heard_ns:
+        for sensor in self._received_ns:
             if self._age_ms(sensor) > self._oldest_ms:
                 return f"no reading of sensor {sensor} for {self._age_ms(sensor):.0f} ms"
         return None
 
     def _age_ms(self, sensor: str) -> float:
-        return (time.monotonic_ns() - self._heard_ns[sensor]) / 1e6
+        return (time.monotonic_ns() - self._received_ns[sensor]) / 1e6
 
     def _end(self, why: str) -> None:
         if not self._closing:  # not closing yet; it waits until all sensors are ready

@@ -78,10 +78,10 @@ def found_pad(found: Estimate) -> Pad:
     constants: dict[str, float] = {}
     intervals: dict[str, tuple[float, float]] = {}
     for number, (name, centre, spread) in enumerate(input_scale()):
-        if found.told[number]:
+        if found.determined[number]:
             constants[name] = float(f"{centre + spread * found.constants[number]:.4g}")
             ends = np.clip(
-                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.told)], -1, 1
+                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.determined)], -1, 1
             )
             intervals[name] = (float(f"{centre + spread * ends[0]:.4g}"), float(f"{centre + spread * ends[1]:.4g}"))
     return Pad(**constants, intervals=intervals, gains=tuple(np.exp(found.log_gains).round(4).tolist()))

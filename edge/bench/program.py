@@ -114,8 +114,8 @@ class Program:
 
     def preemptions(self) -> int:
         """Count the times that one of its threads lost its processor against its will."""
-        told = [(task / "status").read_text() for task in (self._folder / "task").iterdir()]
-        return sum(int(text.rpartition("nonvoluntary_ctxt_switches:")[2]) for text in told)
+        texts = [(task / "status").read_text() for task in (self._folder / "task").iterdir()]
+        return sum(int(text.rpartition("nonvoluntary_ctxt_switches:")[2]) for text in texts)
 
     def resident_mb(self) -> float:
         """Return its resident memory, in [MB]."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow
-from edge.bench.compare import Compared, Comparison, told
+from edge.bench.compare import Compared, Comparison, row_text
 from edge.bench.ratios import Ratio
 from edge.bench.record import Facts, FrontRow, Record, RunTimeRow
 from edge.bench.timing import Times
@@ -180,7 +180,7 @@ def compare_line(row: Compared) -> str:
 
 def progress_text(name: str, threads: int, load: bool) -> str:
     """Name the row that is being measured."""
-    return f"run time of {told(name, threads, load)}"
+    return f"run time of {row_text(name, threads, load)}"
 
 
 def _percentiles(times: Times) -> tuple[str, str, str, str]:

@@ -80,10 +80,10 @@ def soak(minutes: float) -> Soak:
         program.lines(WARM_UP_S)
         count = max(3, round(60 * minutes / WINDOW_S))
         windows = list(tracked(_windows(program, count), "soak", "window", count))
-    return judged(windows)
+    return evaluated(windows)
 
 
-def judged(windows: Sequence[Window]) -> Soak:
+def evaluated(windows: Sequence[Window]) -> Soak:
     """Compute the result of a soak from its windows, three at least."""
     third = len(windows) // 3
     first, last = (np.median([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))

@@ -176,8 +176,8 @@ def check_load(
 
 def _nothing(samples: Mapping[str, Samples], of_link: Sequence[Finding]) -> Finding:
     scans = sum(one.scans for one in samples.values())
-    told = any(finding.verdict == "wrong" for finding in of_link)
-    remedy = "see above" if told else "is the sensor powered, and is nothing else reading it?"
+    link_faulty = any(finding.verdict == "wrong" for finding in of_link)
+    remedy = "see above" if link_faulty else "is the sensor powered, and is nothing else reading it?"
     return Finding("scans", "wrong", f"{scans} scans", f"at least {FEWEST_SCANS} of a sensor", remedy)
 
 

@@ -95,16 +95,16 @@ class Visit:
         whose = f"Sensor {name}: " if several else ""
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._say(whose + guide.first)
-        heard_s = self._clock_s()
+        received_s = self._clock_s()
         while not (guide.done or self._stop.is_set() or self._link.ended):
-            if self._clock_s() - heard_s > GIVEN_UP_S:
+            if self._clock_s() - received_s > GIVEN_UP_S:
                 why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
             for scan in self._link.read(POLL_S):
                 if scan.sensor != name:
                     continue
-                heard_s = self._clock_s()
+                received_s = self._clock_s()
                 zeroed = deformation(scan.counts, baseline, mounting)
                 ask = guide.push(zeroed, scan.time_ns / NS_PER_S)
                 if ask is not None:

@@ -258,8 +258,8 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
 
 def _reason(error: Exception) -> str:
     """Return onnxruntime's message without the place in its source, which may take all the room."""
-    said = _PLACE.sub("", " ".join(str(error).split()))
-    return said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]}..."
+    text = _PLACE.sub("", " ".join(str(error).split()))
+    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}..."
 
 
 def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int | str, ...]]) -> None:

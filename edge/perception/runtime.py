@@ -206,7 +206,7 @@ class Runtime:
         if scan.counts.shape != self._scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
         sensor = self._sensors.get(scan.sensor) or self._meet(scan)
-        zeroed = sensor.hear(scan)
+        zeroed = sensor.take(scan)
         readings = None if zeroed is None or sensor.filler is None else sensor.fill(zeroed)
         filled = None if readings is None else readings.filled
         watch = sensor.watch

@@ -45,7 +45,7 @@ def take_baselines(
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}
-    heard_s = clock_s()
+    received_s = clock_s()
     with Progress("zeroing", skip + scans, "scan") as bar:
         while not (baselines and baselines.keys() == skipped.keys()):
             if stop is not None and stop.is_set():
@@ -53,23 +53,23 @@ def take_baselines(
             taken = source.take(POLL_S)
             if taken is None:
                 raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor")
-            if any(isinstance(heard, Scan) for heard in taken):
-                heard_s = clock_s()
-            elif clock_s() - heard_s > GIVEN_UP_S:
+            if any(isinstance(one, Scan) for one in taken):
+                received_s = clock_s()
+            elif clock_s() - received_s > GIVEN_UP_S:
                 silence = f"no scan from {source.name} for {GIVEN_UP_S:.0f} s"
                 raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor shows what is wrong")
-            for heard in taken:
-                if not isinstance(heard, Scan):
-                    if heard.kind in ("lost", "silent"):
+            for one in taken:
+                if not isinstance(one, Scan):
+                    if one.kind in ("lost", "silent"):
                         estimators.clear()  # the sensor may read differently after the gap
                     continue
-                name = heard.sensor
+                name = one.sensor
                 skipped[name] = skipped.get(name, -1) + 1
                 if skipped[name] < skip or name in baselines:
                     continue
                 estimator = estimators.setdefault(name, BaselineEstimator(scans))
                 try:
-                    baseline = estimator.push(heard)
+                    baseline = estimator.push(one)
                 except BaselineRefusedError as refusal:
                     raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
                 if baseline is not None:

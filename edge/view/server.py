@@ -29,9 +29,9 @@ from edge.pipeline.commands import Commands
 from edge.view.access import SOCKET, Access
 from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import Frames, Run, hello, refused, state
-from edge.view.run_snapshot import Heard
+from edge.view.run_snapshot import RunSnapshot
 from edge.view.static_page import load_page
-from edge.view.viewer_commands import LONGEST_BYTES, hear
+from edge.view.viewer_commands import LONGEST_BYTES, execute
 from edge.view.viewer_connection import Attended
 from firmware_bridge.links.base import SourceKind
 
@@ -57,7 +57,7 @@ class Server:
 
     def __init__(
         self,
-        heard: Heard,
+        snapshot: RunSnapshot,
         commands: Commands,
         access: Access,
         port: int,
@@ -67,7 +67,7 @@ class Server:
         """Take the port; pages are answered from `begin` to `close`.
 
         Args:
-            heard: store of what is shown.
+            snapshot: store of what is shown.
             commands: queue for the viewers' commands.
             access: conditions that a request must meet.
             port: 0 for any free one.
@@ -78,7 +78,7 @@ class Server:
             SinkError: the page cannot be served there.
         """
         self.watched = False
-        self._heard = heard
+        self._snapshot = snapshot
         self._commands = commands
         self._access = access
         self._recording = recording
@@ -150,8 +150,8 @@ class Server:
             max_size=LONGEST_BYTES,
         ) as server:
             ready.set()
-            said: tuple[object, ...] = ()
-            said_s = tidied_s = 0.0
+            sent: tuple[object, ...] = ()
+            sent_s = tidied_s = 0.0
             closing = False  # connections that were still closing when the others were tidied up
             while not self._ending:
                 with contextlib.suppress(TimeoutError):
@@ -159,12 +159,12 @@ class Server:
                     async with asyncio.timeout(STATE_S if waits else None):
                         await self._news.wait()
                 self._news.clear()
-                frames = Frames(self._heard, time.monotonic_ns(), self._source)
+                frames = Frames(self._snapshot, time.monotonic_ns(), self._source)
                 silent, recording = frames.silent(), self._recording()
-                to_say = (recording, len(self._viewers), tuple(silent))
+                new_state = (recording, len(self._viewers), tuple(silent))
                 now_s = time.monotonic()
-                if to_say != said or now_s - said_s >= STATE_S:
-                    said, said_s = to_say, now_s
+                if new_state != sent or now_s - sent_s >= STATE_S:
+                    sent, sent_s = new_state, now_s
                     broadcast(self._viewers, state(recording, len(self._viewers), silent))
                 gone = self._connections.gone
                 if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
@@ -208,7 +208,7 @@ class Server:
                 async for message in connection:
                     if connection.state is not State.OPEN:
                         break  # many commands may wait from before it closed, and each takes its time
-                    why = hear(message, attended.viewer, self._commands)
+                    why = execute(message, attended.viewer, self._commands)
                     if why is not None:
                         broadcast([connection], refused(time.monotonic_ns(), why, self._source))
                     await asyncio.sleep(COMMAND_PAUSE_S)

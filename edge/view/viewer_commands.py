@@ -13,15 +13,15 @@ FORMS: Final = (
 )
 
 
-def hear(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+def execute(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
     """Queue the command in a viewer's message; returns the reason if it is refused."""
-    why = _hear(message, viewer, commands)
+    why = _refusal(message, viewer, commands)
     if why is not None:
         commands.refuse()
     return why
 
 
-def _hear(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
     try:
         parsed = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):

@@ -134,14 +134,14 @@ def _pareto(report: Report, folder: Path, quick: bool) -> None:
 def in_integers(nets: list[Row]) -> str:
     """Return what integers take and lose against float32, network by network, and which model is the default."""
     rows = {str(row["method"]): row for row in nets}
-    told = [
+    comparisons = [
         f"{name} {float(str(rows[name + INT8_SUFFIX]['p50 us'])) / float(str(row['p50 us'])):.2f} of the time, "
         f"{float(str(rows[name + INT8_SUFFIX]['PSNR dB'])) - float(str(row['PSNR dB'])):+.2f} dB"
         for name, row in rows.items()
         if name + INT8_SUFFIX in rows
     ]
     arithmetic = rows[DEFAULT_MODEL]["arithmetic"] if DEFAULT_MODEL in rows else "arithmetic that was not measured"
-    return f"In int8 against float32: {'; '.join(told)}. The default is `{DEFAULT_MODEL}`, in {arithmetic}."
+    return f"In int8 against float32: {'; '.join(comparisons)}. The default is `{DEFAULT_MODEL}`, in {arithmetic}."
 
 
 def _scatter(report: Report, rows: list[Row], by: str, axes_of: tuple[str, str], part: str) -> None:

@@ -89,7 +89,7 @@ def _incompressible(mesh: Mesh) -> Iterator[Case]:
     forces_n: list[float] = []
     for bulk in BULKS:
         mixed, run_ms = timed(lambda bulk=bulk: _punch(mesh, bulk, mixed=True))
-        severity, note = f"K/G {bulk:g}", _told(mixed)
+        severity, note = f"K/G {bulk:g}", _note(mixed)
         what = "residual, share of the reactions"
         yield Case(PART, "flat punch", severity, what, float(mixed.residual.max()), _RESIDUAL, run_ms, note=note)
         apart = float(np.abs(mixed.board_n / mixed.force_n - 1).max())
@@ -98,7 +98,7 @@ def _incompressible(mesh: Mesh) -> Iterator[Case]:
         alone, run_ms = timed(lambda bulk=bulk: _punch(mesh, bulk, mixed=False))
         ratio = float(alone.force_n[-1]) / forces_n[-1]
         what = "force by displacement alone, to the mixed one"
-        locks = f"{_told(alone)}; locks: not what the reference uses"
+        locks = f"{_note(alone)}; locks: not what the reference uses"
         yield Case(PART, "locking", severity, what, ratio, None, run_ms, note=locks, limit=True, least=1.05)
     change = abs(forces_n[-1] / forces_n[-2] - 1)
     severity = f"K/G {BULKS[-2]:g} to {BULKS[-1]:g}"
@@ -123,7 +123,7 @@ def _compress(mesh: Mesh, poisson: float, step: float, wanted: float) -> Case:
     if isinstance(found, NoEquilibriumError):
         guard = f"{type(found).__name__}: {found}"
         return Case(PART, case, severity, what, left, _LEFT_AFTER[step], run_ms, guard=guard)
-    return Case(PART, case, severity, what, left, wanted + 1e-9, run_ms, note=_told(found))
+    return Case(PART, case, severity, what, left, wanted + 1e-9, run_ms, note=_note(found))
 
 
 def _face(mesh: Mesh, layer: Layer, steps_mm: NDArray[np.floating]) -> tuple[FemPresses | NoEquilibriumError, float]:
@@ -144,7 +144,7 @@ def _bulge(mesh: Mesh) -> Iterator[Case]:
     case, severity = "compression", f"K/G {_bulk(REFERENCE_POISSON):.0f}, down by {{:.0%}}"
     last = severity.format(shares[-1])
     what = "residual, share of the reactions"
-    yield Case(PART, case, last, what, float(found.residual.max()), _RESIDUAL, run_ms, note=_told(found))
+    yield Case(PART, case, last, what, float(found.residual.max()), _RESIDUAL, run_ms, note=_note(found))
     apart = float(np.abs(found.board_n / found.force_n - 1).max())
     yield Case(PART, case, last, "push to the board's reaction", apart, _BALANCE, run_ms)
     what, early = "sides below the board, mm", 3
@@ -161,7 +161,7 @@ def _converge(cells: tuple[int, ...], case: str, half_width_mm: float) -> Iterat
         ratio = (forces_n[i - 1] - forces_n[i]) / (forces_n[i - 2] - forces_n[i - 1])
         severity = f"{cells[i - 2]}, {cells[i - 1]}, {cells[i]} elements a side"
         what, run_ms = "change of the force, to the change before", runs[i][1]
-        note = f"order {-np.log2(abs(ratio)):.2f}; {_told(runs[i][0])}"
+        note = f"order {-np.log2(abs(ratio)):.2f}; {_note(runs[i][0])}"
         yield Case(PART, case, severity, what, abs(ratio), 2**-_ORDER, run_ms, note=note)
         # Richardson extrapolation: the limit of a geometric series of such changes.
         limit_n = forces_n[i] + (forces_n[i] - forces_n[i - 1]) * ratio / (1 - ratio)
@@ -193,5 +193,5 @@ def _too_far(mesh: Mesh) -> Case:
     )
 
 
-def _told(found: FemPresses) -> str:
+def _note(found: FemPresses) -> str:
     return f"{len(found.indentation_mm)} load steps, {found.newton_steps.sum()} Newton"

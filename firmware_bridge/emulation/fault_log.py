@@ -57,7 +57,7 @@ class TruthFiles:
         self._events.write(json.dumps(event) + "\n")
 
 
-class Told(NamedTuple):
+class FaultLog(NamedTuple):
     """Content of a folder: frames as ROW, in the order in which they were handed on; events; accounts."""
 
     frames: NDArray[Any]
@@ -65,9 +65,9 @@ class Told(NamedTuple):
     accounts: dict[str, Any]
 
 
-def read_truth(folder: Path) -> Told:
+def read_truth(folder: Path) -> FaultLog:
     """Read the folder of an emulator that has ended."""
-    return Told(
+    return FaultLog(
         np.fromfile(folder / FRAMES, dtype=ROW),
         [json.loads(line) for line in (folder / EVENTS).read_text().splitlines()],
         json.loads((folder / ACCOUNTS).read_text()),

@@ -210,20 +210,20 @@ class Emulator:
         """Serve commands until a time on the monotonic clock; return False after a request to stop."""
         while not self._stop.is_set():
             left_s = deadline_s - time.monotonic()
-            heard = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
-            if heard:
-                self._obey(heard)
+            received = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
+            if received:
+                self._obey(received)
             elif left_s <= 0:
                 return True
         return False
 
-    def _obey(self, heard: bytes) -> None:
+    def _obey(self, received: bytes) -> None:
         if self._faults is None:
-            self._line.write(self.adapter.feed(heard))
+            self._line.write(self.adapter.feed(received))
             return
         was_open = self.adapter.channel_open
-        unread_bytes = self._line.left_bytes() if b"C" in heard else self._line.unread_bytes()
-        answer = self.adapter.feed(heard)
+        unread_bytes = self._line.left_bytes() if b"C" in received else self._line.unread_bytes()
+        answer = self.adapter.feed(received)
         if self.adapter.channel_open != was_open:  # closing and opening drop old bytes, answers as well
             self._faults.truth.close_channel(unread_bytes)
         if not self.adapter.channel_open:

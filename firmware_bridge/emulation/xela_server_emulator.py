@@ -57,7 +57,7 @@ class ServerEmulator:
         self._message_hz = message_hz
         self._garbage_every = garbage_every
         self._on_cycle = on_cycle
-        self._told_cycles = [-1] * server.sensors
+        self._sent_cycles = [-1] * server.sensors
         self._sequence = 0
         self._ticks = 0
         self._garbage = 0
@@ -176,10 +176,10 @@ class ServerEmulator:
         if self._garbage_every and self._sequence % self._garbage_every == 0:
             self._server.say(GARBAGE[self._garbage % len(GARBAGE)])
             self._garbage += 1
-        for sensor, told in enumerate(self._told_cycles):
+        for sensor, sent_cycle in enumerate(self._sent_cycles):
             cycle = self._vendor.cycle(sensor, elapsed_s)
-            if cycle > told:
-                self._told_cycles[sensor] = cycle
+            if cycle > sent_cycle:
+                self._sent_cycles[sensor] = cycle
                 self._on_cycle(str(sensor + 1), now_ns)
         return True
 

@@ -168,7 +168,7 @@ def test_weights_that_are_no_better_are_not_taken(hostile, hostile_graphs, taps,
     _, integers, seen = hostile_graphs
     bad = replace(tuning, steps=3, learning_rate=1.0)
     done = quantised_well(hostile, USPA44, seen, taps, bad, -100.0)
-    assert done.net is hostile and not done.trained_on and done.said.endswith(", so not taken")
+    assert done.net is hostile and not done.trained_on and done.said.endswith(", so not used")
     assert done.integers.SerializeToString() == integers.SerializeToString()
 
 

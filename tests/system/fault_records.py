@@ -12,7 +12,7 @@ import orjson
 from numpy.typing import NDArray
 
 from edge.sinks.pipe_capacity import PIPE_BYTES
-from firmware_bridge.emulation.fault_log import Told
+from firmware_bridge.emulation.fault_log import FaultLog
 
 
 class Seen(NamedTuple):
@@ -60,7 +60,7 @@ class Ran:
     said: str = ""
     seen: list[Seen] = field(default_factory=list)
     sizes: list[Size] = field(default_factory=list)
-    told: Told | None = None
+    told: FaultLog | None = None
     slow: int = 0
     unwritten: int = 0
     broken: list[str] = field(default_factory=list)

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from firmware_bridge.emulation.fault_log import Told
+from firmware_bridge.emulation.fault_log import FaultLog
 from firmware_bridge.emulation.faults.frames import READ
 from firmware_bridge.emulation.faults.truth import FATES
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
@@ -85,7 +85,7 @@ class SentTaxel:
         return self.rows[self.next][0] == STUCK and self._readings[self.next] == self._readings[self.shown]
 
 
-def handed_on(told: Told) -> dict[tuple[str, int], SentTaxel]:
+def handed_on(told: FaultLog) -> dict[tuple[str, int], SentTaxel]:
     """Return what reached the reader, by sensor and taxel."""
     frames = told.frames[told.frames["fate"] < len(READ)]
     frames = frames[np.isin(frames["can_id"], list(USPA44_MAP.taxels))]

@@ -12,7 +12,7 @@ from fault_played import telling_counts
 from fault_records import Ran, Seen, Size, read_record
 from fault_server import ServerRan, judge_server
 
-from firmware_bridge.emulation.fault_log import Told
+from firmware_bridge.emulation.fault_log import FaultLog
 from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
 
 
@@ -79,7 +79,7 @@ def test_every_promise_can_be_broken():
     assert kept == [False] * 10
 
 
-def unkept(ran: Ran, told: Told) -> list[str]:
+def unkept(ran: Ran, told: FaultLog) -> list[str]:
     return [promise.text.split(",")[0] for promise in promises(ran, judge(ran.seen, told), told) if not promise.kept]
 
 

@@ -65,7 +65,7 @@ def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
     silent = [0, 1, 3, 4, 5]
     np.testing.assert_allclose(found.constants[silent], 0, atol=1e-9)
     np.testing.assert_allclose(found.deviations[CHANNELS:][silent], CONSTANT_SPREAD)
-    assert found.told.tolist() == [False, False, True, False, False, False]
+    assert found.determined.tolist() == [False, False, True, False, False, False]
     pad = identify.found_pad(found)
     assert list(pad.constants) == list(pad.intervals) == ["poisson"]
     assert "not told" in identify.table("4", found)

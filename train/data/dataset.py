@@ -196,7 +196,7 @@ def load_sequences(path: Path) -> Sequences:
         found = read_npz(path, _AXES, path.stat().st_size)  # nothing in it is compressed
         arrays = {name: found[name] for name in _AXES}
         arrays["touching"] = _unpacked(arrays["touching"], arrays["unit_patterns"])
-        told: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
+        stated: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
         hashed = str(facts.get("sha256"))[:64]
     except DatasetError:
         raise
@@ -205,10 +205,10 @@ def load_sequences(path: Path) -> Sequences:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DatasetError(f"{path} is not a file of sequences, or a damaged one ({error}): make it again") from error
     _check_axes(path, arrays)
-    loaded = Sequences(**arrays, **told)
+    loaded = Sequences(**arrays, **stated)
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed}: make it again")
-    _check_facts(path, told)
+    _check_facts(path, stated)
     return loaded
 
 

@@ -234,5 +234,5 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta
     size = truth_size(truth)
     error = (pattern.detach() - truth).abs() / size
     spread = deviation / sqrt(2) / size + _LEAST_SHARE
-    misjudged = spread.detach().pow(beta) * (spread.log() + error / spread)
-    return relative_rms_error(pattern, truth) + misjudged.mean()
+    uncertainty_error = spread.detach().pow(beta) * (spread.log() + error / spread)
+    return relative_rms_error(pattern, truth) + uncertainty_error.mean()

@@ -253,8 +253,10 @@ class Ros2Sink(Sink):
         for name, sensor in self._sensors.items():
             trouble = "; ".join(sensor.trouble.values()) or None
             silence_s = (now_ns - sensor.last.scan.time_ns) / 1e9 if self._of_now else None
-            said = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
-            statuses.append(self._status(name, Diagnosis(Level.STALE, "ended", said.values) if ended else said))
+            diagnosis = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
+            statuses.append(
+                self._status(name, Diagnosis(Level.STALE, "ended", diagnosis.values) if ended else diagnosis)
+            )
         self._counters_before = self._counters
         self._publish(self._diagnostics, DiagnosticArray(self._header(now_ns, ""), statuses))
 
@@ -264,6 +266,6 @@ class Ros2Sink(Sink):
             return self._clock_ns()
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
 
-    def _status(self, sensor: str, said: Diagnosis) -> DiagnosticStatus:
-        values = [KeyValue(key, value) for key, value in said.values.items()]
-        return DiagnosticStatus(int(said.level), f"{self._base}: {sensor}", said.text, sensor, values)
+    def _status(self, sensor: str, diagnosis: Diagnosis) -> DiagnosticStatus:
+        values = [KeyValue(key, value) for key, value in diagnosis.values.items()]
+        return DiagnosticStatus(int(diagnosis.level), f"{self._base}: {sensor}", diagnosis.text, sensor, values)

@@ -116,7 +116,7 @@ def _simulated(
     ]
     report.show(rows, f"Gains, {caption}, {len(found)} sensors.")
     middle = np.array([one.constants for one in found])
-    told = np.array([one.told for one in found])
+    determined = np.array([one.determined for one in found])
     off = np.abs(middle - pad)
     inside = off <= half[:, CHANNELS:]
     report.show(
@@ -125,9 +125,9 @@ def _simulated(
                 "constant": name,
                 "correlation": round(float(np.corrcoef(middle[:, at], pad[:, at])[0, 1]), 2),
                 "RMS error": round(_rms(off[:, at]), 2),
-                "told %": round(100 * float(told[:, at].mean())),
-                "determined ones in the interval %": round(100 * float(inside[told[:, at], at].mean()))
-                if told[:, at].any()
+                "determined %": round(100 * float(determined[:, at].mean())),
+                "determined ones in the interval %": round(100 * float(inside[determined[:, at], at].mean()))
+                if determined[:, at].any()
                 else None,
             }
             for at, name in enumerate(INPUTS)
