@@ -44,7 +44,7 @@ VAGUE = _words("found known given")
 SHOWN_DIALECT = (DIALECT - VAGUE) | _words("tell hears doubt doubts judges judging referee pretended mend mended")
 SHOWN_PHRASES = (*DIALECT_PHRASES, "in integers")
 MOST_VAGUE_PER_1000 = 3.0
-SHOWN_ROOTS = ("edge", "firmware_bridge", "train", "export")
+SHOWN_ROOTS = ("edge", "firmware_bridge", "train", "export", "examples")
 FEWEST_SHOWN_WORDS = 4
 ALLOWED = ("empty where it tells none",)
 """Shown text that cannot change: part of a recorded message definition, by which a file is recognised."""

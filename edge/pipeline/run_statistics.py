@@ -177,7 +177,7 @@ class Statistics:
         lines: list[str] = []
         for name, result in sorted(self._farthest.items()):
             why = {
-                "zeroing": f"not zeroed, {result.note or 'too few scans'}; or give --baseline, of the free pad",
+                "zeroing": f"not zeroed, {result.note or 'too few scans'}; or pass --baseline, of the free pad",
                 "incomplete": result.note or "a taxel was not received",
                 "idle": None if self.patterns else "nothing touched it",
                 "dropped": "newer scans overtook all that were in contact",

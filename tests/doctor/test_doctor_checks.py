@@ -280,7 +280,7 @@ class TestIdMap:
         }
         if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
             sensor = {"AB": "7b"}.get(spoken + asked, sensor)
-            assert found["id map"].verdict == "ok" and f"sensor {sensor} heard" in found["id map"].measured
+            assert found["id map"].verdict == "ok" and f"sensor {sensor} received" in found["id map"].measured
             return
         assert found["id map"].verdict == "wrong" and found["id map"].remedy.startswith(f"--id-map {spoken}")
         if {asked, spoken} == {"uSPa44", "XR1944"}:

@@ -52,7 +52,7 @@ class TestLoss:
         )
 
     def test_nothing_found_and_nothing_known_writes_nothing(self, tmp_path):
-        with pytest.raises(SensorFileError, match=r"s\.toml: not written, for nothing was found"):
+        with pytest.raises(SensorFileError, match=r"s\.toml: not written, because nothing was measured"):
             keep.keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
         assert list(tmp_path.iterdir()) == []
 
@@ -73,7 +73,7 @@ class TestLoss:
         path = tmp_path / "s.toml"
         save_sensor_file(path, SensorFile(sensors={"4": held}))
         found = {"6": Baseline.of("6", BASELINE.counts, 1.79e9, 100, "start-up")}
-        with pytest.raises(SensorFileError, match=f"would be lost: {lost}: give --sensor .*s.toml as well"):
+        with pytest.raises(SensorFileError, match=f"would be lost: {lost}: pass --sensor .*s.toml as well"):
             keep.keep(path, SensorFile(), None, found, NONE, NONE)
         keep.keep(path, load_sensor_file(path), None, found, NONE, NONE)
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}

@@ -139,7 +139,7 @@ class TestAnswers:
 
     def test_what_a_sensor_file_keeps_is_no_longer_wrong(self):
         turned = [press(place, USPA44.corners[(n + 1) % 4]) for n, place in enumerate(USPA44.corners)]
-        for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file says so")):
+        for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file states this")):
             findings, mounting = judge_press(Answer(turned), kept, False)
             assert mounting is not None and mounting.moves_taxels
             assert findings[0].verdict == verdict and words in findings[0].remedy

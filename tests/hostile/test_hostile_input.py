@@ -146,7 +146,7 @@ class TestArchives:
     @pytest.mark.parametrize("text", [b"\0\0\x11\0", b"\0\xd8\0\0"])
     def test_text_that_is_no_unicode(self, tmp_path, text):
         sensors = npy(np.array(["4", "4"])).replace(b"4\0\0\0", text)
-        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "no Unicode")
+        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "not Unicode")
 
     def test_a_header_of_pieces_of_python(self, tmp_path):
         sensors = npy(np.array(["4", "4"])).replace(b"'shape': (2,)", b"'shape': (((((")

@@ -68,7 +68,7 @@ def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
     assert found.determined.tolist() == [False, False, True, False, False, False]
     pad = identify.found_pad(found)
     assert list(pad.constants) == list(pad.intervals) == ["poisson"]
-    assert "not told" in identify.table("4", found)
+    assert "not determined" in identify.table("4", found)
 
 
 def test_more_contacts_leave_less_open(mixture):

@@ -135,7 +135,7 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to the workers too
     out, complaint = run.communicate()
     assert run.returncode == 130
-    assert complaint.decode() == "train.data.make_presses: interrupted; the same command goes on from here\n"
+    assert complaint.decode() == "train.data.make_presses: interrupted; the same command continues\n"
     assert not out and any(parts.glob("*.npz"))
 
 

@@ -78,7 +78,7 @@ class TestDemo:
                 socket = full.enter_context(connect(f"ws{run.url[4:].replace('?', 'ws?')}", max_queue=None))
                 socket.send('{"cmd": "pause", "on": true}')
             page.goto(run.url)
-            playwright.expect(trouble).to_contain_text(f"{MOST_VIEWERS} look already")
+            playwright.expect(trouble).to_contain_text(f"too many viewers ({MOST_VIEWERS})")
             socket.close()
             page.wait_for_selector(".sensor")
             playwright.expect(trouble).to_be_hidden()

@@ -121,8 +121,8 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
     ("arguments", "words"),
     [
         (["--view-host", "0.0.0.0"], "--view-host requires --view"),
-        (["--view-token", "x" * 20], "--view-token is of the live page"),
-        (["--view-record-dir", "."], "--view-record-dir is of the live page"),
+        (["--view-token", "x" * 20], "--view-token requires --view"),
+        (["--view-record-dir", "."], "--view-record-dir requires --view"),
         (
             ["--view", "0", "--view-record-dir", "/dev/null"],
             "--view-record-dir /dev/null: expected a folder that may be",
