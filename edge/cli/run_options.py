@@ -205,7 +205,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         "--budget-us",
         metavar="N",
         type=positive,
-        help="choose the most accurate model, with no more taps than M, whose run time is below N us",
+        help="choose the most accurate model, with no more taps than M, that is faster than N us",
     )
     add("--recalibrate", action="store_true", help="with --budget-us: measure run times again")
     add_source(parser)

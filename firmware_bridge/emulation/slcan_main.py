@@ -1,4 +1,4 @@
-"""Command line of the emulated controller and its slcan adapter, to try a client by hand.
+"""Command line of the emulated controller and its slcan adapter, for manual tests.
 
     python -m firmware_bridge.emulation.slcan_main FILE [FILE]
 

@@ -1,4 +1,4 @@
-"""Command line of the emulated xela_server, to try a client by hand.
+"""Command line of the emulated xela_server, for manual tests.
 
     python -m firmware_bridge.emulation.xela_server_main FILE [FILE]
     python -m firmware_bridge.emulation.xela_server_main --sim
