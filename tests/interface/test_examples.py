@@ -71,7 +71,7 @@ def test_the_gripper_stops_on_contact_and_never_moves_by_what_is_emulated_unaske
     assert (
         code == 1
         and out == []
-        and errors == ["stop_on_area: demo is emulated, no sensor: --pretend goes by it all the same"]
+        and errors == ["stop_on_area: demo is emulated, not a sensor: pass --pretend to accept it"]
     )
     code, out, errors = run(empty, *demo, "--pretend")
     assert (code, errors) == (0, []) and out[:2] == ["gripper: closing", "gripper: stopped"]

@@ -107,7 +107,7 @@ def test_a_mixture_is_read_back_and_a_damaged_one_named(mixture, tmp_path):
     mixture.save(tmp_path / "a.npz")
     np.testing.assert_array_equal(load_mixture(tmp_path / "a.npz").means, mixture.means)
     replace(mixture, means=mixture.means[:, :2]).save(tmp_path / "b.npz")
-    with pytest.raises(DatasetError, match=r"b\.npz is no mixture"):
+    with pytest.raises(DatasetError, match=r"b\.npz is not a mixture"):
         load_mixture(tmp_path / "b.npz")
 
 
