@@ -122,7 +122,7 @@ class TestArchives:
 
     def test_an_array_larger_than_its_member(self, tmp_path, bounded_memory):
         header = npy(np.zeros((1, 3, 4, 4), np.int32)).replace(b"(1, 3", b"(9999999999, 3").replace(b" " * 9, b"", 1)
-        self.refused(tmp_path, stored({"counts": header} | members("counts")), "tells of 1919999999808 bytes and holds")
+        self.refused(tmp_path, stored({"counts": header} | members("counts")), "states 1919999999808 bytes and holds")
 
     def test_lengths_whose_product_wraps_around(self, tmp_path):
         shape = f"({1 << 32}, {1 << 32})"
