@@ -341,7 +341,7 @@ def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.
     return forms.open_sink(
         text,
         contract,
-        patient=source.kind == "replay",
+        lossless=source.kind == "replay",
         mountings=source.sensor_file.mountings,
         geometry=source.sensor_file.geometry,
         unix_offset_ns=source.unix_offset_ns,

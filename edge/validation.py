@@ -22,15 +22,14 @@ def check_positive(name: str, number: Any) -> None:
         raise UsageError(f"{name} is {number!r}, expected a positive number")
 
 
-def check_whole(name: str, number: Any, least: int, most: float = math.inf) -> None:
-    """Check that the value called `name` is a whole number from `least` to `most`.
+def check_whole(name: str, number: Any, least: int) -> None:
+    """Check that the value called `name` is a whole number from `least`.
 
     Raises:
         UsageError: it is not.
     """
-    if not isinstance(number, Integral) or not least <= int(number) <= most:
-        to = "" if most == math.inf else f" to {most:.0f}"
-        raise UsageError(f"{name} is {number!r}, expected a whole number from {least}{to}")
+    if not isinstance(number, Integral) or int(number) < least:
+        raise UsageError(f"{name} is {number!r}, expected a whole number from {least}")
 
 
 def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:

@@ -39,6 +39,7 @@ from train.freeze import held_out
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_calibration import half_width_mm
+from train.learning.trust_limits import TrustFit, load_trust
 from train.networks.blocks import PatternNet
 from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG
@@ -106,6 +107,7 @@ def export(
     every: bool = False,
     tuning: FineTuning | None = None,
     validation: Sequence[FrozenSet] = (),
+    trust: TrustFit | None = None,
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
@@ -123,6 +125,7 @@ def export(
         tuning: settings of the fine-tuning for int8; None for no fine-tuning.
         validation: sets apart from test and training, on which confidence is fitted; without them, the contract's
             confidence stays empty.
+        trust: forward model and checks for the contract; None for none.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
@@ -133,7 +136,7 @@ def export(
     net, report = load_network(checkpoint)
     net = folded(net)
     contract = contract_of(net, report, frozen, geometry, batch)
-    writer = Writer(folder, frozen, validation, report)
+    writer = Writer(folder, frozen, validation, report, trust)
     if calibration is None:
         model = to_model(net, geometry, batch)
         single = model if batch in (1, ANY_BATCH) else to_model(net, geometry)
@@ -192,6 +195,9 @@ def main(arguments: list[str] | None = None) -> None:
         "--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them"
     )
     parser.add_argument(
+        "--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust"
+    )
+    parser.add_argument(
         "--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training"
     )
     parser.add_argument(
@@ -211,6 +217,8 @@ def main(arguments: list[str] | None = None) -> None:
     steps: int | None = options.fine_tune_steps
     if steps is not None and steps < 0:
         parser.error(f"--fine-tune-steps is {steps}, expected 0 or more")
+    if options.trust is not None and options.validation is None:
+        parser.error("--trust needs --validation, on which limits are set")
     if options.int8 is None and options.all_integers:
         parser.error("--all-integers needs --int8")
     if options.int8 is None and steps is not None:
@@ -220,10 +228,14 @@ def main(arguments: list[str] | None = None) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
         taps = None if options.int8 is None else load_taps(options.int8)
+        trust = None
         if options.validation is None:
             validation = confidence_sets(held_out("validation"), frozen.scale)
         else:
-            validation = [freeze_presses(load_presses(options.validation), SEED).as_frozen_set()]
+            presses = load_presses(options.validation)
+            validation = [freeze_presses(presses, SEED).as_frozen_set()]
+            if options.trust is not None:
+                trust = load_trust(options.trust, presses)
         tuning = FineTuning(FINE_TUNE_STEPS if steps is None else steps, validation[0], always=steps is not None)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(
@@ -235,6 +247,7 @@ def main(arguments: list[str] | None = None) -> None:
                 every=options.all_integers,
                 tuning=tuning if steps != 0 else None,
                 validation=validation,
+                trust=trust,
             )
             sys.stdout.write(line + "\n")
             lines += line.splitlines()

@@ -22,6 +22,7 @@ from edge.bench.machine import this_machine
 from edge.bench.macs import macs_of
 from edge.bench.plot import draw
 from edge.bench.processes import busy_core, measured, start_up
+from edge.bench.program import PROGRAM_SOURCES
 from edge.bench.provenance import provenance, with_head
 from edge.bench.record import Facts, Record, RunTimeRow, read_record
 from edge.bench.system_section import show_system
@@ -243,7 +244,7 @@ def _compare(record: Record, earlier: dict[str, Any], path: Path, page: Page) ->
 def _write(record: Record, page: Page, folder: Path | None, models: Sequence[Path]) -> None:
     if folder is None:
         return
-    sources = ["edge/bench/command.py", "edge/bench/worker.py", *(["edge/__main__.py"] if record.system else [])]
+    sources = ["edge/bench/command.py", "edge/bench/worker.py", *(PROGRAM_SOURCES if record.system else [])]
     made = provenance(record.command, sources, [*models, subjects.FROZEN_FILE])
     try:
         (folder / "bench.json").write_text(record.to_json())

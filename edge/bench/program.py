@@ -25,6 +25,18 @@ CONTROLLERS: Final = ("4", "6")
 REST_COUNTS: Final = (16_000, 16_400, 38_600)
 PRESS_COUNTS: Final = 3000
 NOISE_COUNTS: Final = 3
+EMULATOR: Final = ("-m", "firmware_bridge.emulation.slcan_main")
+"""Arguments of Python that run the emulator."""
+PROGRAM_SOURCES: Final = (
+    "edge/__main__.py",
+    "edge/cli/run_command.py",
+    "edge/perception/runtime.py",
+    "edge/pipeline/link_reader.py",
+    "edge/pipeline/result_stream.py",
+    "firmware_bridge/links/reconnecting.py",
+    "firmware_bridge/scans/scan_assembler.py",
+)
+"""Sources of a report on the whole program: they import most of what a run executes."""
 _SCANS: Final = 500
 _ROOT: Final = Path(__file__).parents[2]
 _MAPS: Final = b',"pattern":'
@@ -162,13 +174,13 @@ def _emulator(folder: Path, play: Play) -> Iterator[tuple[str, Path]]:
 
 
 @contextmanager
-def emulating(*arguments: str) -> Iterator[str]:
+def emulating(*arguments: str, program: Sequence[str] = EMULATOR) -> Iterator[str]:
     """Run an emulator with these arguments in a process of its own, and yield its port.
 
     Raises:
         BenchError: the emulator did not start.
     """
-    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", *arguments]
+    command = [sys.executable, *program, "--until-stdin-closes", *arguments]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
     ) as emulator:

@@ -19,6 +19,8 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 """Folder of the packages: the checkout's, where there is one."""
 SEARCHED: Final = ("", "tests/support/", "tests/system/")
 """Folders that modules are imported from, below ROOT."""
+FOR_SHOW: Final = ("edge/terminal/", "edge/bench/live_report.py", "edge/bench/provenance.py")
+"""Files and folders that show progress or write the page: no figure depends on them."""
 DIGITS: Final = 12
 """Number of digits kept of a SHA-256."""
 UNKNOWN: Final = "unknown"
@@ -37,8 +39,8 @@ class Provenance:
         tree: "clean", "changed" since that commit, or a note on the origin of the commit's id.
         machine: processor, cores and versions.
         seed: of all chance, or None where each source has its own.
-        sources: files that make it, below ROOT; all they import counts, too.
-        code: hash of these sources and all they import, see `code_hash`.
+        sources: files that make it, below ROOT; the files that they import count, too.
+        code: hash of these sources and the files that they import, see `code_hash`.
         models: file below ROOT -> hash, of each model or frozen set it used.
     """
 
@@ -115,21 +117,21 @@ def read_source(path: str) -> str | None:
 
 
 def imported_sources(entries: Sequence[str], read: Callable[[str], str | None] = read_source) -> dict[str, str]:
-    """Return the entries and every file of this repository that they import, directly or not: path -> text.
+    """Return the entries and the files of this repository that they import themselves, not FOR_SHOW: path -> text.
+
+    Not what those import in turn: nearly every report reaches nearly every module that way, and all would be out of
+    date at any change. A report that depends on more names it among its sources.
 
     Args:
         entries: files below ROOT.
         read: text of a file below ROOT, None where there is none.
     """
-    sources: dict[str, str] = {}
-    waiting = list(entries)
-    while waiting:
-        path = waiting.pop()
-        text = None if path in sources else read(path)
-        if text is not None:
-            sources[path] = text
-            waiting += [f"{folder}{module}" for module in _imports(text) for folder in SEARCHED]
-    return sources
+    sources = {path: text for path in entries if (text := read(path)) is not None}
+    imported = {module for text in sources.values() for module in _imports(text)}
+    paths = sorted(f"{folder}{module}" for module in imported for folder in SEARCHED)
+    return sources | {
+        path: text for path in paths if not path.startswith(FOR_SHOW) and (text := read(path)) is not None
+    }
 
 
 def code_hash(sources: Mapping[str, str]) -> str:

@@ -2,7 +2,8 @@
 
 python -m edge.bench.stale_reports
 
-A report is stale where a model, or code it was made by, has changed since. It is a list and not a gate: exit code 0.
+A report is stale where a model that it names, a file that makes it, or a file that one of these imports has changed
+since; comments and docstrings do not count. It is a list and not a gate: exit code 0.
 """
 
 import argparse

@@ -28,7 +28,6 @@ def run(
     err: TextIO,
     *,
     clock_s: Callable[[], float] = time.monotonic,
-    unix_time_s: Callable[[], float] = time.time,
 ) -> int:
     """Run `edge-sr doctor`; returns the exit code.
 
@@ -37,7 +36,6 @@ def run(
         out: for the findings.
         err: for requests to a person; no press is asked for where it is no terminal.
         clock_s: the clock of the scans, monotonic, in [s].
-        unix_time_s: dates the baselines, in [s] since 1970.
 
     Raises:
         LinkLostError: raised after the findings until then were printed.
@@ -63,7 +61,7 @@ def run(
             except LinkLostError as error:
                 lost = error
             watched = watch.watched()
-            examined = examine(watched, unix_time_s())
+            examined = examine(watched, time.time())
             mountings: dict[str, Mounting] = {}
             if lost is None and not stop.is_set():
                 try:

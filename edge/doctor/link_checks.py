@@ -1,4 +1,4 @@
-"""Checks of the way from the adapter to here: counters, line speed and latency. Pure but for one file that it reads."""
+"""Checks of the way from the adapter to here: counters, line speed, latency. Pure but for one timer that it reads."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,9 +7,9 @@ from typing import Final
 
 from edge.doctor.findings import Finding, Verdict
 from firmware_bridge.links.base import Link
+from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
 from firmware_bridge.pad_geometry import USPA44
 
-LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 LATENCY_LIMIT_MS: Final = 2
 HELD_BACK_LIMIT_MS: Final = 5.0
 """Longest delay of a quarter of the scans, half of a period; a timer at 16 ms makes it 10 to 12."""
@@ -42,22 +42,10 @@ class LineFacts:
     latency_ms: int | None = None
 
 
-def line_facts(link: Link, root: Path = LATENCY_ROOT) -> LineFacts:
-    """Return the facts of an open link; `root` is where the kernel shows USB serial ports."""
+def line_facts(link: Link) -> LineFacts:
+    """Return the facts of an open link."""
     line = link.serial_line()
-    return LineFacts() if line is None else LineFacts(line.port, line.baud, latency_timer_ms(line.port, root))
-
-
-def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
-    """Return the time for which the driver of a port lets bytes wait, in [ms]; None where it is not shown.
-
-    Source: Linux, drivers/usb/serial/ftdi_sio.c, latency_timer_show; 1 is shown while low latency was asked for.
-    """
-    try:
-        text = (root / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii").strip()
-    except (OSError, ValueError):
-        return None
-    return int(text) if text.isdigit() else None
+    return LineFacts() if line is None else LineFacts(line.port, line.baud, latency_timer_ms(line.port))
 
 
 def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None:

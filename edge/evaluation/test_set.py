@@ -2,9 +2,9 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,11 @@ class FrozenSet:
     def touching(self) -> NDArray[np.bool_]:
         """Return the pixels that the surface touches, (n, H, W)."""
         return self.touched[self.tap]
+
+    def every(self, step: int) -> Self:
+        """Return the set of every `step`-th frame, with all taps."""
+        frames = {name: getattr(self, name)[::step] for name in ("newest", "tap", "indentation_mm", "force_n")}
+        return replace(self, **frames)
 
     def sha256(self) -> str:
         """Return a hash over all arrays, independent of the file that holds them."""

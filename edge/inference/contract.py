@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.expected_error import is_confidence, is_number
+from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 
-CONTRACT_VERSION: Final = 5
-EARLIER_VERSION: Final = 4
-"""Version that is still loaded; its files lack the keys of ADDED."""
-ADDED: Final = ("pad_inputs", "takes_gains", "traction_scale")
-"""Keys that version 5 added; without them a model takes no pad and gives no traction."""
+CONTRACT_VERSION: Final = 6
+ADDED: Final = MappingProxyType({5: ("pad_inputs", "takes_gains", "traction_scale"), 6: ("trust",)})
+"""Keys that each version added; without them a model takes no pad, gives no traction, and checks nothing."""
+EARLIER_VERSIONS: Final = (4, 5)
+"""Versions that are still loaded."""
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 PAD_NAME: Final = "pad"
@@ -32,8 +33,8 @@ KEY_PREFIX: Final = "tactile."
 MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
 """Most pixels of a pattern: a run allocates a small multiple of it."""
-LONGEST_VALUE: Final = 1 << 16
-"""Most characters of a key's JSON; the longest of a bundled model has a thousand."""
+LONGEST_VALUE: Final = 1 << 20
+"""Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
 LEAST_UNIT: Final = 1e-6
 """Least divisor in counts, newtons or millimetres, so that float32 holds the quotient."""
@@ -78,6 +79,7 @@ class Contract:
         takes_gains: True if it takes windows with the taxels' gains divided out, and an input that states whether they
             are.
         traction_scale: traction pixels per taxel pitch; None if the model gives no traction.
+        trust: forward model and checks as JSON, see edge.inference.trust; empty if the model has none.
     """
 
     version: int
@@ -103,6 +105,7 @@ class Contract:
     pad_inputs: tuple[tuple[str, float, float], ...] = ()
     takes_gains: bool = False
     traction_scale: int | None = None
+    trust: dict[str, Any] = field(default_factory=dict)
 
     @property
     def window_shape(self) -> tuple[int | str, int, int, int]:
@@ -155,8 +158,9 @@ class Contract:
         """
         version = _value(metadata, "version")
         # Before the other keys, which another version may lack.
-        if version not in (CONTRACT_VERSION, EARLIER_VERSION):
-            expected = f"expected {CONTRACT_VERSION} or {EARLIER_VERSION}: export the model again with this release"
+        if version not in (CONTRACT_VERSION, *EARLIER_VERSIONS):
+            earlier = ", ".join(map(str, EARLIER_VERSIONS))
+            expected = f"expected {CONTRACT_VERSION}, or {earlier}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
         values = {key: _value(metadata, key) for key in _keys(version)}
         _check(values)
@@ -196,6 +200,10 @@ class Contract:
             if got != expected:
                 raise ModelError(f"contract key '{key}' is {got!r}, that of the model asked for {expected!r}")
 
+    def read_trust(self) -> Trust | None:
+        """Return the forward model and the checks; None if the model has none."""
+        return trust_of(self.trust, len(self.pad_inputs))
+
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
@@ -231,8 +239,8 @@ class Contract:
 
 def _keys(version: int) -> list[str]:
     """Return the keys of a contract of this version."""
-    names = [field.name for field in fields(Contract)]
-    return [name for name in names if name not in ADDED] if version == EARLIER_VERSION else names
+    later = {name for added, names in ADDED.items() if added > version for name in names}
+    return [one.name for one in fields(Contract) if one.name not in later]
 
 
 def _value(metadata: Mapping[str, str], key: str) -> Any:
@@ -292,10 +300,14 @@ def _check(values: Mapping[str, Any]) -> None:
     if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
         refuse("test_error", "a map from taps to metrics")
     _check_pad_and_traction(values, refuse)
+    try:
+        trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])))
+    except ValueError as error:
+        raise ModelError(f"contract key 'trust' is damaged ({error}): export the model again") from error
 
 
 def _check_pad_and_traction(values: Mapping[str, Any], refuse: Callable[[str, str], None]) -> None:
-    """Check the keys of ADDED, if they exist."""
+    """Check the keys that version 5 added, if they exist."""
     inputs = values.get("pad_inputs", [])
     if not isinstance(inputs, list) or not all(map(_is_pad_input, inputs)):
         expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"

@@ -9,7 +9,9 @@ from typing import Final, Literal, NamedTuple, get_args
 
 from firmware_bridge.links.base import Notice, NoticeKind
 
-EventKind = Literal[NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level"]
+ZeroingKind = Literal["zeroing", "zeroed", "in_contact", "given_up", "rest_level"]
+TrustKind = Literal["tap_dropped", "suspected", "cleared"]
+EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, "sink", "reset", "refused"]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
 NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]
@@ -33,9 +35,11 @@ class Event:
             Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
             has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
-            its end.
+            its end; "tap_dropped", earlier taps do not belong to the contact; "suspected", contact after contact reads
+            like none, and "cleared", no longer.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
+        sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
 
     Raises:
         ValueError: the kind is not one of KINDS.
@@ -45,6 +49,7 @@ class Event:
     kind: EventKind
     sensor: str | None
     detail: str = ""
+    sensors: str = ""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -65,6 +70,13 @@ class Event:
                 return f"zeroing refused: sensor {self.sensor} is in contact: {remedy}"
             case "given_up":
                 return f"sensor {self.sensor}: zeroing given up, the old baseline stays: {self.detail}"
+            case "tap_dropped":
+                return f"sensor {self.sensor}: {self.detail}"
+            case "suspected":
+                causes = "a magnet or steel near it, another --id-map, or its sensor file"
+                return f"sensor {self.sensor}: several contacts in a row read like none; check {causes}"
+            case "cleared":
+                return f"sensor {self.sensor}: contacts read as they should again"
             case "rest_level":
                 return f"sensor {self.sensor}: {self.detail}"
             case _:
@@ -73,7 +85,7 @@ class Event:
     @classmethod
     def of(cls, notice: Notice) -> "Event":
         """Return the event of a link's notice."""
-        return cls(notice.time_ns, notice.kind, None, notice.text)
+        return cls(notice.time_ns, notice.kind, None, notice.text, notice.sensors)
 
 
 class Untimed(NamedTuple):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.event import Event, Note, joined
+from edge.perception.pattern_check import Reason
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.scans.scan import Scan
@@ -18,12 +19,14 @@ from firmware_bridge.zeroing.drift_tracker import Drift
 MADE: Final = (
     *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),
     *("expected_rmse_mm", "another_tap", "traction", "wrench", "wrench_origin"),
+    *("mismatch", "tap_mismatch", "trusted", "untrusted_reason", "estimate"),
 )
 """Fields of a result that are made from a pattern."""
 
 State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
+Estimate = Literal["network", "smooth"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,11 @@ class Result:
     reused_from: int | None = None
     expected_rmse_mm: float | None = None
     another_tap: bool | None = None
+    mismatch: float | None = None
+    tap_mismatch: tuple[float, ...] | None = None
+    trusted: bool | None = None
+    untrusted_reason: Reason | None = None
+    estimate: Estimate | None = None
     run_time_us: float | None = None
     latency_us: float | None = None
     baseline: Baseline | None = None

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
+from edge.perception.pattern_check import REASONS
 from edge.perception.result import Result, mask_bits
 from edge.perception.wrench import Wrench
 from firmware_bridge.scans.scan import Scan, VendorReading
@@ -75,6 +76,10 @@ def _dead_reasons(dead: Mapping[int, str]) -> dict[str, str]:
 def _drift(drift: Drift) -> dict[str, Any]:
     common = [round(counts, 2) for counts in drift.common_counts]
     return {"common": common, "own": round(drift.own_counts, 2), "step": round(drift.step_counts, 1)}
+
+
+def _rounded(shares: tuple[float, ...]) -> list[float]:
+    return list(map(round, shares, repeat(3)))
 
 
 def _force_and_torque(wrench: Wrench) -> tuple[float, ...]:
@@ -150,6 +155,16 @@ FIELDS: Final = (
           "coefficient of friction; needs no counts per newton", make=attrgetter("shear_ratio"), decimals=4, byte=576),
     Field("reused_from", _NUMBER_OR_NOT, "reused_from",
           "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
+    Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
+          "a contact that is too light to check, and for models without checks", byte=592),
+    Field("untrusted_reason", _one_of(*REASONS, unknown=""), "untrusted_reason",
+          "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
+    Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
+          "linear estimate that replaces one that is not to be believed", byte=600),
+    Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
+          "noise, gains and drift", decimals=4, byte=584),
+    Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "
+          "this contact, 0 to 1; from .5 it is left out", json=_rounded, out=Out.RECORD),
     Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "
           "pattern was there already", decimals=1, byte=168),
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",

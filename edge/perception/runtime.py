@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from edge.errors import WindowError
 from edge.inference.contract import Contract
-from edge.inference.expected_error import expect
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
-from edge.perception.contact_patch import touched, touched_patch
-from edge.perception.dead_taxel_fill import TaxelEstimator, widening
+from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import Event, EventKind, Note, Untimed
+from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import TapTracker
-from edge.perception.wrench import wrench_of
 from edge.validation import check_baselines, check_mountings, check_pads, check_positive
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
@@ -114,7 +112,7 @@ class Runtime:
         self._source: SourceKind = source
         self._estimator = estimator
         self._geometry, self._scan_shape = geometry, geometry.scan_shape
-        self._pixel_mm = geometry.pixel_pitch_mm(model.contract.scale)
+        self._describe = Describer(model.contract, geometry)
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad = pad
@@ -123,7 +121,7 @@ class Runtime:
         self._options = options
         # Plain attributes, since every scan reads them.
         self._every_scan, self._every_tap = options.every_scan, options.every_tap
-        self._follow_drift = options.follow_drift
+        self._follow_drift, self._fallback = options.follow_drift, options.fallback
         self._clock_ns = clock_ns
         self._unix_time_s = unix_time_s
         self._sensors: dict[str, Sensor] = {}
@@ -251,7 +249,7 @@ class Runtime:
             **known,
         )
         made_by = (self._model.name, tap.tap, taps_used, filled)
-        return result, None if window is None else _Due(sensor, window, made_by)
+        return result, None if window is None else _Due(sensor, window, tap.tap, made_by)
 
     def _take_events(self, sensor: Sensor, time_ns: int) -> tuple[Event, ...]:
         """Return the events up to a scan of a sensor, at its time in [ns]."""
@@ -276,6 +274,7 @@ class Runtime:
         pads: list[NDArray[np.float32]] = []
         for index, touch in due.items():
             window = contract.scale_window(touch.window[: contract.taps], touch.sensor.gains)
+            results[index] = with_taps_that_belong(results[index], touch.sensor, touch.window, window)
             window[results[index].taps_used :] = 0
             windows.append(window)
             pads.append(touch.sensor.pad_row)
@@ -285,51 +284,21 @@ class Runtime:
         for row, (index, touch) in enumerate(due.items()):
             deviation = None if deviations is None else deviations[row].copy()
             traction = None if tractions is None else tractions[row].copy()
-            made = self._made(results[index], touch.sensor, patterns[row].copy(), deviation, traction, run_time_us)
+            made = replace(
+                results[index],
+                state="contact",
+                pattern=patterns[row].copy(),
+                deviation=deviation,
+                traction=traction,
+                estimate="network",
+                run_time_us=run_time_us,
+            )
             sensor = touch.sensor
+            made = self._describe(checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback), sensor)
             sensor.last = made
             sensor.last_reading.keep(touch.window[0], touch.made_by)
             sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
             results[index] = made
-
-    def _made(
-        self,
-        result: Result,
-        sensor: Sensor,
-        pattern: NDArray[np.float32],
-        deviation: NDArray[np.float32] | None,
-        traction: NDArray[np.float32] | None,
-        run_time_us: float,
-    ) -> Result:
-        contract = self._model.contract
-        if deviation is not None and result.dead:
-            deviation *= np.float32(widening(len(result.dead) / self._geometry.taxel_count))
-        touching = touched(pattern, contract.contact_level)
-        area_mm2, centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
-        interval_mm = expected = None
-        if deviation is not None:
-            expected = expect(contract.confidence, result.taps_used, pattern, deviation)
-            if contract.interval_factor is not None and touching.any():
-                interval_mm = contract.interval_factor * float(deviation[touching].mean())
-        wrench = wrench_origin = None
-        if traction is not None:
-            wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
-            wrench_origin = sensor.wrench_origin
-        return replace(
-            result,
-            state="contact",
-            pattern=pattern,
-            area_mm2=area_mm2,
-            centroid_mm=centroid_mm,
-            deviation=deviation,
-            interval_mm=interval_mm,
-            expected_rmse_mm=None if expected is None else expected.rmse,
-            another_tap=None if expected is None else expected.another_tap,
-            traction=traction,
-            wrench=wrench,
-            wrench_origin=wrench_origin,
-            run_time_us=run_time_us,
-        )
 
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor
@@ -380,4 +349,5 @@ class _Due(NamedTuple):
 
     sensor: Sensor
     window: NDArray[np.float32]
+    tap: int
     made_by: Hashable

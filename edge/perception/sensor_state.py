@@ -11,6 +11,7 @@ from edge.inference.contract import Contract
 from edge.perception.change_gate import LastReading, TapsThatMatter
 from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
 from edge.perception.event import EventKind, Note, Untimed
+from edge.perception.pattern_check import PatternCheck
 from edge.perception.result import Result, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
@@ -36,6 +37,7 @@ class Sensor:
         counts_per_newton: summed z per [N], if that is known.
         pad: what is known of it.
         pad_row: the same as the model takes it.
+        check: decides whether its patterns are to be believed; None where the model has no checks.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
         wrench_origin: whether the model gets the sensor's counts per newton.
         filler: estimates the dead taxels; None where none is dead, or nothing may be estimated.
@@ -66,6 +68,7 @@ class Sensor:
         self.pad: Pad | None = None
         self.pad_row: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
         self.gains: NDArray[np.float32] | None = None
+        self.check: PatternCheck | None = None
         self.wrench_origin: WrenchOrigin = "nominal"
         self.watch = TaxelWatch((geometry.rows, geometry.cols), mounting)
         self._mounting = mounting
@@ -89,6 +92,8 @@ class Sensor:
         self.gains = None
         if contract.takes_gains and pad is not None and pad.gains is not None:
             self.gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+        trust = contract.read_trust()
+        self.check = None if trust is None else PatternCheck(trust, contract, self.pad_row)
         calibrated = pad is not None and pad.counts_per_newton is not None
         takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
         self.wrench_origin = "calibrated" if calibrated and takes else "nominal"
@@ -123,7 +128,7 @@ class Sensor:
             self._tracker.forget()
         if self._rezeroing is not None:
             self._end_rezeroing()
-            self._report("given_up", "the sensor was away; request it again")
+            self.report("given_up", "the sensor was away; request it again")
 
     def take(self, scan: Scan) -> NDArray[np.float32] | None:
         """Take a scan and return each taxel's newest reading over the baseline (3, rows, cols); None without one."""
@@ -155,7 +160,7 @@ class Sensor:
         self.drift_notes = () if note is None else (Note(kind, note),)
         event = tracker.take_event()
         if event is not None:
-            self._report("rest_level", event)
+            self.report("rest_level", event)
 
     def zero_again(self, *, force: bool) -> None:
         """Take a new baseline from the next scans, with an event for the outcome; the old one stays in use until then.
@@ -164,9 +169,9 @@ class Sensor:
             force: also in contact.
         """
         if self.baseline is None:
-            self._report("zeroing")
+            self.report("zeroing")
         elif self._touched and not force:
-            self._report("in_contact")
+            self.report("in_contact")
         else:
             self._rezeroing = Rezeroing(self.baseline, force=force, unix_time_s=self._unix_time_s)
             self.zeroing_notes = (self._rezeroing.note,)
@@ -202,13 +207,13 @@ class Sensor:
             baseline = rezeroing.push(scan, self._touched, self._silent())
         except BaselineRefusedError as refusal:
             self._end_rezeroing()
-            self._report("given_up", str(refusal))
+            self.report("given_up", str(refusal))
             return False
         self.zeroing_notes = (rezeroing.note,)
         if baseline is None:
             return False
         old = "" if self._taken is None else f" instead of {self._taken.id}"
-        self._report("zeroed", f"baseline {baseline.id}{old}")
+        self.report("zeroed", f"baseline {baseline.id}{old}")
         self._end_rezeroing()
         self.use(baseline, 0.0, scan.time_ns)
         self.taps.reset()  # earlier taps were zeroed with another rest level
@@ -217,7 +222,8 @@ class Sensor:
     def _end_rezeroing(self) -> None:
         self._rezeroing, self.zeroing_notes = None, ()
 
-    def _report(self, kind: EventKind, detail: str = "") -> None:
+    def report(self, kind: EventKind, detail: str = "") -> None:
+        """Report an event with the sensor's next scan."""
         self.events.append(Untimed(kind, self._name, detail))
 
     def _silent(self) -> NDArray[np.bool_] | None:

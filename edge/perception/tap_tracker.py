@@ -84,6 +84,11 @@ class TapTracker:
         self._tap_scans = 0
         self._peak_counts = -math.inf
 
+    def keep(self, earlier: int) -> None:
+        """Forget the earlier taps but for the newest `earlier` ones."""
+        self._earlier = min(self._earlier, earlier)
+        self._window[1 + self._earlier :] = 0
+
     def push(self, deformation: NDArray[np.float32], time_ns: int, z_counts: float | None = None) -> TapState:
         """Take one scan and return the new state.
 

@@ -105,6 +105,11 @@ class TaxelWatch:
         return (self._age >= TAXEL_SILENT_SCANS) & ~self._saturated
 
     @property
+    def most_repeats(self) -> int:
+        """Scans for which a taxel that is believed has repeated itself while a quarter of the others were new."""
+        return 0 if self.sound else int(np.where(self.dead, 0, self._still).max())
+
+    @property
     def may_be_estimated(self) -> bool:
         """True while enough taxels live; half of them silent are not a defect but a wrong id map."""
         silent = sum(reason == "silent" for reason in self.reasons.values())

@@ -36,7 +36,7 @@ def take_baselines(
 
     Raises:
         BaselineRefusedError: a pad moved or was loaded, or the source ended too soon.
-        DeviceError: no scan arrived for a long time.
+        DeviceError: no scan arrived for a long time, or no whole new one of a sensor.
         LinkLostError: the link is lost.
         UsageError: the number of scans is out of range.
     """
@@ -45,6 +45,7 @@ def take_baselines(
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}
+    whole_s: dict[str, float] = {}
     received_s = clock_s()
     with Progress("zeroing", skip + scans, "scan") as bar:
         while not (baselines and baselines.keys() == skipped.keys()):
@@ -53,9 +54,10 @@ def take_baselines(
             taken = source.take(POLL_S)
             if taken is None:
                 raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor")
+            now_s = clock_s()
             if any(isinstance(one, Scan) for one in taken):
-                received_s = clock_s()
-            elif clock_s() - received_s > GIVEN_UP_S:
+                received_s = now_s
+            elif now_s - received_s > GIVEN_UP_S:
                 silence = f"no scan from {source.name} for {GIVEN_UP_S:.0f} s"
                 raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor shows what is wrong")
             for one in taken:
@@ -65,6 +67,8 @@ def take_baselines(
                     continue
                 name = one.sensor
                 skipped[name] = skipped.get(name, -1) + 1
+                if name not in whole_s or (one.complete and not one.repeated):
+                    whole_s[name] = now_s
                 if skipped[name] < skip or name in baselines:
                     continue
                 estimator = estimators.setdefault(name, BaselineEstimator(scans))
@@ -74,5 +78,9 @@ def take_baselines(
                     raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
                 if baseline is not None:
                     baselines[name] = baseline
+            for name in skipped.keys() - baselines.keys():
+                if now_s - whole_s[name] > GIVEN_UP_S:  # a taxel or the sensor is silent, while scans come
+                    lack = f"no whole new scan from sensor {name} for {GIVEN_UP_S:.0f} s"
+                    raise DeviceError(f"{lack}: edge-sr doctor shows what is wrong")
             bar.reach(min(skip + scans, 1 + min(skipped.values(), default=-1)))
     return baselines

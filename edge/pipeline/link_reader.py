@@ -60,14 +60,13 @@ class LinkReader:
         self._poll = select.poll()
         self._poll.register(self._woken, select.POLLIN)
         self._shared: dict[int, _Shared] = {}
-        self._apart: dict[Future[None], tuple[Link, ThreadPoolExecutor]] = {}
-        self._thread_ids: list[int] = []
+        self._apart: dict[Future[None], tuple[Link, ThreadPoolExecutor, int]] = {}
         # A single link may wait without regard to others.
         self._alone = links[0] if len(links) == 1 else None
-        self._executor = self._new_thread("scan-reader")
+        self._executor, thread_id = _new_thread("scan-reader")
         for link in links if self._alone is None else ():
             self._place(link)
-        self.thread_ids = tuple(self._thread_ids)
+        self.thread_ids = (thread_id, *(apart_id for _, _, apart_id in self._apart.values()))
         self.reading = self._executor.submit(self._read)
 
     def close(self) -> None:
@@ -78,11 +77,6 @@ class LinkReader:
         self._waking.close()
         self._woken.close()
 
-    def _new_thread(self, name: str) -> ThreadPoolExecutor:
-        executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
-        self._thread_ids.append(executor.submit(threading.get_native_id).result())
-        return executor
-
     def _read(self) -> None:
         try:
             if self._alone is not None:
@@ -91,7 +85,7 @@ class LinkReader:
                 self._take_turns()
         finally:
             self._stop.set()
-            for _, executor in self._apart.values():
+            for _, executor, _ in self._apart.values():
                 executor.shutdown()
             self._on_end()
 
@@ -122,9 +116,9 @@ class LinkReader:
                 self._poll.register(wait.descriptor, select.POLLIN)
             self._shared[wait.descriptor] = _Shared(link, time.monotonic() + wait.longest_s)
         elif not link.ended:
-            executor = self._new_thread("link-reader")
+            executor, thread_id = _new_thread("link-reader")
             reading = executor.submit(self._follow, link)
-            self._apart[reading] = link, executor
+            self._apart[reading] = link, executor, thread_id
             reading.add_done_callback(lambda _: self._wake())
 
     def _welcome_back(self) -> None:
@@ -136,7 +130,7 @@ class LinkReader:
         with suppress(BlockingIOError):
             self._woken.recv(_WAKES)
         for reading in [reading for reading in self._apart if reading.done()]:
-            link, executor = self._apart.pop(reading)
+            link, executor, _ = self._apart.pop(reading)
             executor.shutdown()
             reading.result()
             self._place(link)
@@ -160,3 +154,9 @@ class LinkReader:
     def _wake(self) -> None:
         with suppress(OSError):  # it is awake already, or has ended
             self._waking.send(b"!")
+
+
+def _new_thread(name: str) -> tuple[ThreadPoolExecutor, int]:
+    """Return an executor of one thread, and the system's number of the thread."""
+    executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
+    return executor, executor.submit(threading.get_native_id).result()

@@ -74,7 +74,7 @@ class Silence:
             self._expected.discard(scan.sensor)
             self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
             self._paced_from[scan.sensor] = scan
-            return None
+            return self._back(scan, self._first_ns)
         if scan.device_ns is not None:  # by the device's own time, too, or bursts of a busy reader would look like gaps
             pace = self._paces.get(scan.sensor)
             if pace is None:
@@ -83,11 +83,14 @@ class Silence:
             period_ns = pace.period_ns or period_ns
         if period_ns and period_ns >= SHORTEST_PERIOD_NS:
             self._follow_gap(before, scan, period_ns)
-        if scan.sensor in self._silent:
-            self._silent.remove(scan.sensor)
-            away_s = (scan.time_ns - before.time_ns) / 1e9
-            return Event(scan.time_ns, "back", scan.sensor, f"sensor {scan.sensor} is back after {away_s:.1f} s")
-        return None
+        return self._back(scan, before.time_ns)
+
+    def _back(self, scan: Scan, since_ns: int) -> Event | None:
+        if scan.sensor not in self._silent:
+            return None
+        self._silent.remove(scan.sensor)
+        away_s = (scan.time_ns - since_ns) / 1e9
+        return Event(scan.time_ns, "back", scan.sensor, f"sensor {scan.sensor} is back after {away_s:.1f} s")
 
     def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
         """Count the scans missing in a gap, once scans come at their pace again: late ones come in a burst."""
@@ -135,6 +138,7 @@ class Silence:
                 events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none in that time"))
         if self._expected and newest_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
+            self._silent.update(missing)
             why = "the recording has none of it, though there is a baseline or a force for it"
             events += [self._silence(sensor, newest_ns, self._first_ns, why) for sensor in missing]
         return events

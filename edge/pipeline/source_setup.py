@@ -45,7 +45,6 @@ def links_to(
     texts: Sequence[str],
     known: SensorFile,
     *,
-    model: ModelMap | None = None,
     rate_hz: float | None = None,
     give_up_s: float | None = math.inf,
 ) -> list[Link]:
@@ -54,7 +53,6 @@ def links_to(
     Args:
         texts: as in firmware_bridge.links.registry; without any, the adapter of the sensor file or the only one.
         known: settings of the sensors.
-        model: assignment of CAN ids to taxels, used instead of the id map in the settings.
         rate_hz: rate at which recordings are played, in [Hz].
         give_up_s: longest time that a lost source may be away, in [s]; None leaves its loss to the caller.
 
@@ -69,9 +67,7 @@ def links_to(
         texts = [f"slcan:serial={known.adapter}"]
     demo = any(text.rpartition("=")[2] in ("demo", DEMO_LOOP) for text in texts)
     recording = demo_recording() if demo else None
-    return open_sources(
-        texts, rate_hz, recording, known.model_map if model is None else model, give_up_s, mountings=known.mountings
-    )
+    return open_sources(texts, rate_hz, recording, known.model_map, give_up_s, mountings=known.mountings)
 
 
 def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:

@@ -36,13 +36,13 @@ class JsonLinesSink(Sink):
     """
 
     def __init__(
-        self, target: str, *, patient: bool = True, source: str | None = None, stop: threading.Event | None = None
+        self, target: str, *, lossless: bool = True, source: str | None = None, stop: threading.Event | None = None
     ) -> None:
         """Open the target; a file that exists is replaced.
 
         Args:
             target: path, or "-".
-            patient: wait for a slow reader, rather than leave records out.
+            lossless: wait for a slow reader, rather than leave records out.
             source: kind of the source, written with every event.
             stop: set when the run is to end, which ends all patience.
 
@@ -51,7 +51,7 @@ class JsonLinesSink(Sink):
         """
         self._target = "stdout" if target == "-" else target
         self._stop = threading.Event() if stop is None else stop
-        self._patient = patient
+        self._lossless = lossless
         self._source = source
         self.unwritten = 0
         try:
@@ -73,7 +73,7 @@ class JsonLinesSink(Sink):
 
     def _write(self, line: bytes) -> None:
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
-            if not self._patient or self._stop.wait(_ROOM_S):
+            if not self._lossless or self._stop.wait(_ROOM_S):
                 self.unwritten += 1
                 return
         try:

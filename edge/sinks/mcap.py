@@ -52,7 +52,7 @@ class McapSink(Sink):
         path: Path,
         contract: Contract,
         *,
-        patient: bool = True,
+        lossless: bool = True,
         mountings: Mapping[str, Mounting] | None = None,
         geometry: SensorGeometry = USPA44,
         unix_offset_ns: int | None = None,
@@ -64,7 +64,7 @@ class McapSink(Sink):
         Args:
             path: of the file; one that exists is left alone.
             contract: of the model that the run begins with.
-            patient: wait for a slow disk, rather than leave records out.
+            lossless: wait for a slow disk, rather than leave records out.
             mountings: of the sensors, by name: without them, axes would point elsewhere when the file is played again.
             geometry: of the sensors.
             unix_offset_ns: added to the time of a scan gives [ns] since 1970; by default as the clocks are now.
@@ -82,7 +82,7 @@ class McapSink(Sink):
         self._scan, self._baseline = scan_type(geometry.taxel_count), baseline_type(geometry.taxel_count)
         self._origin = origin
         self._source_told = False
-        self._patient = patient
+        self._lossless = lossless
         self.unwritten = 0
         self._failed = False
         try:
@@ -180,7 +180,7 @@ class McapSink(Sink):
         """Return True if there is room for one more record; else count it as left out."""
         try:
             full = self._file.full()
-            if full and self._patient:
+            if full and self._lossless:
                 self._file.drain()
                 return True
         except OSError as error:

@@ -7,6 +7,7 @@ costs no recorded scan: afterwards `python -m edge.sinks.npz FILE.npz` makes the
 
 import argparse
 import json
+import os
 import shutil
 import sys
 import zipfile
@@ -174,6 +175,8 @@ def gather(path: Path) -> int:
                         chunk = column[start : start + CHUNK_SCANS].tobytes()
                         entry.write(chunk)
                         bar.advance(len(chunk))
+        with draft.open("rb") as file:
+            os.fsync(file.fileno())  # otherwise a power cut could leave an empty .npz, and no rows
         draft.replace(path)
         shutil.rmtree(parts)
     except OSError as error:

@@ -57,7 +57,7 @@ def open_sink(
     text: str,
     contract: Contract,
     *,
-    patient: bool = True,
+    lossless: bool = True,
     mountings: Mapping[str, Mounting] | None = None,
     geometry: SensorGeometry = USPA44,
     unix_offset_ns: int | None = None,
@@ -70,7 +70,7 @@ def open_sink(
     Args:
         text: one of FORMS.
         contract: names the maps that will come, and their shapes.
-        patient: wait for slow readers, rather than leave records out.
+        lossless: wait for slow readers, rather than leave records out.
         mountings: of the sensors, by name.
         geometry: of the sensors.
         unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
@@ -91,7 +91,7 @@ def open_sink(
     if form == "jsonl":
         from edge.sinks.jsonl import JsonLinesSink
 
-        return JsonLinesSink(target, patient=patient, source=source, stop=stop)
+        return JsonLinesSink(target, lossless=lossless, source=source, stop=stop)
     if form == "npz":
         from edge.sinks.npz import NpzSink
 
@@ -109,7 +109,7 @@ def open_sink(
         return McapSink(
             Path(target),
             contract,
-            patient=patient,
+            lossless=lossless,
             mountings=mountings,
             geometry=geometry,
             unix_offset_ns=unix_offset_ns,
@@ -122,7 +122,7 @@ def open_sink(
     if form == "zenoh":
         from edge.sinks.zenoh import ZenohSink
 
-        return ZenohSink(target, patient=patient, source=source)
+        return ZenohSink(target, lossless=lossless, source=source)
     try:
         from edge.sinks.ros2.sink import Ros2Sink
     except ModuleNotFoundError as error:

@@ -50,12 +50,12 @@ class ZenohSink(Sink):
         zid: the session's id, which the time stamp of every message holds, too.
     """
 
-    def __init__(self, target: str, *, patient: bool = False, source: str | None = None) -> None:
+    def __init__(self, target: str, *, lossless: bool = False, source: str | None = None) -> None:
         """Open a session; it does not matter whether a subscriber is there, now or later.
 
         Args:
             target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
-            patient: wait for a slow network, rather than leave messages out.
+            lossless: wait for a slow network, rather than leave messages out.
             source: kind of the source, published with every event.
 
         Raises:
@@ -71,7 +71,7 @@ class ZenohSink(Sink):
         self._zenoh = zenoh
         self._key = key
         self._source = source
-        self._congestion = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
+        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         try:
             self._session = zenoh.open(_config(configuration))
             self.zid = str(self._session.zid())

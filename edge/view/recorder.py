@@ -32,7 +32,6 @@ class Recorder(Sink):
         self,
         directory: Path,
         tell: Callable[[Event], object],
-        clock_ns: Callable[[], int] = time.monotonic_ns,
         local_time: Callable[[], time.struct_time] = time.localtime,
     ) -> None:
         """Start the thread, without a recording.
@@ -40,14 +39,12 @@ class Recorder(Sink):
         Args:
             directory: folder in which files are made.
             tell: called with an event for what begins, ends and fails.
-            clock_ns: monotonic, in [ns].
             local_time: names the files.
         """
         self.path: Path | None = None
         self.open_sink: Callable[[str], Sink] | None = None
         self._directory = directory
         self._tell = tell
-        self._clock_ns = clock_ns
         self._local_time = local_time
         self._sink: Sink | None = None
         self._unwritten = 0
@@ -145,7 +142,7 @@ class Recorder(Sink):
             self._end(self.path)
 
     def _say(self, kind: EventKind, text: str) -> None:
-        self._tell(Event(self._clock_ns(), kind, None, text))
+        self._tell(Event(time.monotonic_ns(), kind, None, text))
 
 
 def _unused(stem: Path) -> Path:

@@ -26,10 +26,11 @@ LEVELS: Final = {
 }
 """Optimisation levels of onnxruntime by name; each includes the ones before it. The runtime uses the last."""
 
-TOLERANCE: Final = 1e-5
+TOLERANCE: Final = 2e-5
 """Largest accepted difference between torch and a float32 graph on readings, as `Difference.relative`.
 
-Both compute in float32 but add in another order. Measured from x4 to x20: compact networks 6e-7, seed-size ones 2e-6.
+Both compute in float32 but add in another order. Measured from x4 to x20: patterns of compact networks 6e-7, of
+seed-size ones 2e-6; a deviation 1.3e-5 on pads far outside the range of training.
 """
 EXTREME_TOLERANCE: Final = 5e-5
 """Largest accepted difference on extreme windows; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""

@@ -16,6 +16,7 @@ from edge.terminal.progress_bar import tracked
 from export.graphs.reference import origin
 from firmware_bridge.in_place import write_in_place
 from train.learning.expected_error_table import fit_confidence
+from train.learning.trust_limits import TrustFit
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +31,14 @@ class Writer:
         frozen: the test set.
         validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
         report: of the checkpoint.
+        trust: forward model and checks, for models of the pad that they were fitted for; None for none.
     """
 
     folder: Path
     frozen: FrozenSet
     validation: Sequence[FrozenSet]
     report: Mapping[str, Any]
+    trust: TrustFit | None = None
 
     def error(self, single: onnx.ModelProto, contract: Contract) -> dict[str, float]:
         """Return the mean errors of a graph of a batch of one with all taps; empty if it is not evaluated."""
@@ -70,6 +73,8 @@ class Writer:
         fitting = [one for one in self.validation if one.scale == contract.scale]
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))
+        if self.trust is not None and contract.pad_inputs and contract.traction_scale:
+            contract.trust.update(self.trust.of(session).to_json())
         content = self._bytes(model, contract)
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
         write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)

@@ -41,9 +41,9 @@ _HERTZ: Final = tuple(
 _PAD: Final = tuple(_Ball(radius_mm, 0.3, 0.47, 4.5, size=42) for radius_mm in (0.5, 2.0, 10.0, 100.0, 1000.0))
 
 
-def cases(_quick: bool = False) -> Iterator[Case]:
+def cases(quick: bool = False) -> Iterator[Case]:
     """Yield all cases."""
-    for ball in _HERTZ:
+    for ball in _HERTZ[:3] if quick else _HERTZ:  # the thicker a layer, the wider the grid of its response
         solver, depth_mm = _solver(ball), _depth_mm(ball)
         found, run_ms = timed(
             lambda solver=solver, depth=depth_mm, ball=ball: solver.solve(depth[None], ball.indentation_mm)

@@ -35,7 +35,7 @@ def cases(quick: bool = False) -> Iterator[Case]:
     for thickness_mm in THICKNESSES_MM[::4] if quick else THICKNESSES_MM:
         layer = replace(whole, thickness_mm=thickness_mm)
         yield from _press("thickness", f"{thickness_mm:g} mm", layer, punch())
-        yield _against_a_wide_grid(layer, f"{thickness_mm:g} mm")
+        yield against_a_wide_grid(layer, f"{thickness_mm:g} mm")
     yield from _press("contact", "one cell", whole, punch(radius_mm=0.4 * CELL_MM, x_mm=CELL_MM / 2, y_mm=CELL_MM / 2))
     yield from _press("contact", "the whole face", whole, np.zeros((SIZE, SIZE)))
     yield from _press("contact", "punch half off the pad", whole, punch(x_mm=SIZE * CELL_MM / 2))
@@ -47,11 +47,9 @@ def cases(quick: bool = False) -> Iterator[Case]:
     yield from _waves()
 
 
-def punch(
-    radius_mm: float = RADIUS_MM, x_mm: float = 0.0, y_mm: float = 0.0, size: int = SIZE, cell_mm: float = CELL_MM
-) -> NDArray[np.float64]:
+def punch(radius_mm: float = RADIUS_MM, x_mm: float = 0.0, y_mm: float = 0.0, size: int = SIZE) -> NDArray[np.float64]:
     """Return the depth image of a flat round punch, (size, size) in [mm]."""
-    along_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+    along_mm = (np.arange(size) - (size - 1) / 2) * CELL_MM
     return np.where(np.hypot(along_mm - x_mm, along_mm[:, None] - y_mm) <= radius_mm, 0.0, _OFF)
 
 
@@ -74,7 +72,7 @@ def _balance(found: ContactResult) -> float:
     return abs(work / (float(found.force_n[0]) * INDENTATION_MM) - 1)
 
 
-def _against_a_wide_grid(layer: Layer, severity: str) -> Case:
+def against_a_wide_grid(layer: Layer, severity: str) -> Case:
     """Return the case of the periodic grid of the pad's response, whose copies must have no effect."""
     solver = ContactSolver(layer, SIZE, CELL_MM, torch.float64)
     found, run_ms = timed(lambda: solver.solve(punch()[None], INDENTATION_MM))

@@ -13,15 +13,12 @@ from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.faults.injector import Injector
-from firmware_bridge.emulation.faults.lines import Piece
-from firmware_bridge.emulation.pty_port import COUNTED_LATE_NS, PseudoPort
+from firmware_bridge.emulation.pty_port import PseudoPort
 from firmware_bridge.emulation.xela_controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
 
 _STOP_POLL_S: Final = 0.05
 _DRAIN_POLL_S: Final = 0.01
-_LONGEST_DRAIN_S: Final = 0.5
 
 
 class Emulator:
@@ -51,8 +48,8 @@ class Emulator:
         ignores_line_speed: bool = False,
         seed: int = 0,
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
-        faults: Injector | None = None,
         link: Path | None = None,
+        waits: bool = False,
     ) -> None:
         """Prepare to play; nothing is opened yet.
 
@@ -71,8 +68,8 @@ class Emulator:
             ignores_line_speed: True to accept any speed, as USB-CDC adapters do.
             seed: seed of jitter and unused bytes.
             on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
-            faults: faults between bus and client.
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
+            waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
 
         Raises:
             ValueError: an option is out of range.
@@ -94,9 +91,7 @@ class Emulator:
         self._latency_s = latency_s
         self._on_scan = on_scan
         self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
-        self._faults = faults
-        self._resets = 0
-        self._elsewhere = False
+        self._waits = waits
         self._line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
         self._stop = threading.Event()
         self._through = threading.Event()
@@ -118,10 +113,7 @@ class Emulator:
 
     def tell(self, line: bytes) -> None:
         """Send an unsolicited line, such as `adapter.state_line(...)`."""
-        if self._faults is None:
-            self._line.write(line)
-        else:
-            self._send([Piece(line, None, answer=True)], time.monotonic_ns())
+        self._line.write(line)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until it has hung up; return False on time-out."""
@@ -136,24 +128,27 @@ class Emulator:
             for handed_on_s, frames in groupby(self._timeline, key=self._handed_on_s):
                 if not self._obey_until(start_s + handed_on_s):
                     return
-                if self._faults is not None:
-                    self._hand_on_spoilt(self._faults, frames)
-                elif self.adapter.hears_the_bus:
-                    self._hand_on(frames)
+                self._hand_on(frames)
             self._drain()
         finally:
-            if self._faults is not None:
-                self._faults.truth.close_channel(self._line.unread_bytes())
-            self._line.unplug()
+            self._unplug()
             self._through.set()
 
+    def _unplug(self) -> None:
+        self._line.unplug()
+
     def _handed_on_s(self, timed: tuple[float, CanFrame]) -> float:
-        latency_s = self._latency_s if self._faults is None else self._faults.latency_s(timed[0], self._latency_s)
+        latency_s = self._latency_at(timed[0])
         if latency_s == 0:
             return timed[0]
         return math.ceil(timed[0] / latency_s) * latency_s
 
+    def _latency_at(self, time_s: float) -> float:
+        return self._latency_s
+
     def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
+        if not self.adapter.hears_the_bus:
+            return
         lines: list[bytes] = []
         ended: list[int] = []
         for time_s, frame in frames:
@@ -161,50 +156,18 @@ class Emulator:
             if frame.can_id in self._last_frames:
                 ended.append(self._last_frames[frame.can_id])
         now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
-        room = self._line.write(b"".join(lines))
+        data = b"".join(lines)
+        room = self._line.write(data)
+        while self._waits and room < len(data) and self._obey_until(time.monotonic() + _DRAIN_POLL_S):
+            if not self.adapter.channel_open:
+                break
+            room += self._line.write(data[room:])
         for line in lines:
             room -= len(line)
             self.sent_frames += room >= 0
             self.lost_frames += room < 0
         for controller in ended:
             self._on_scan(controller, now_ns)
-
-    def _hand_on_spoilt(self, faults: Injector, frames: Iterable[tuple[float, CanFrame]]) -> None:
-        """Hand on frames through faults, which also pull the cable and reset the adapter."""
-        truth, pieces = faults.truth, list[Piece]()
-        now_ns = time.monotonic_ns()
-        for time_s, frame in frames:
-            for sent in faults.disturb(time_s, frame):
-                if sent.lost:
-                    truth.lose(sent, now_ns)
-                elif not (self._line.plugged and self.adapter.hears_the_bus):
-                    truth.lose(sent._replace(fate="unheard"), now_ns)
-                else:
-                    pieces += faults.corrupt(self.adapter.encode(sent.frame, sent.time_s), sent)
-        truth.settle(self._line.unread_bytes(), now_ns - COUNTED_LATE_NS)
-        self._send(pieces, now_ns)
-        if faults.resets > self._resets:
-            self._resets = faults.resets
-            self.adapter.begin_anew()
-        if faults.unplugged and self._line.plugged:
-            self._drain(time.monotonic() + _LONGEST_DRAIN_S)
-            truth.close_channel(self._line.unread_bytes())
-            self._line.unplug()
-            self._elsewhere = faults.renamed
-        elif not faults.unplugged and not self._line.plugged:
-            self.adapter.begin_anew()
-            self._line.plug(elsewhere=self._elsewhere)
-
-    def _send(self, pieces: Sequence[Piece], now_ns: int) -> None:
-        """Write pieces, and report to the truth how much of each went out."""
-        room = self._line.write(b"".join(piece.data for piece in pieces))
-        for piece in pieces:
-            written = min(max(room, 0), len(piece.data))
-            room -= len(piece.data)
-            if self._faults is not None:
-                self._faults.truth.hand_on(piece, written, now_ns)
-            self.sent_frames += room >= 0 and piece.sent is not None
-            self.lost_frames += room < 0 and piece.sent is not None
 
     def _obey_until(self, deadline_s: float) -> bool:
         """Serve commands until a time on the monotonic clock; return False after a request to stop."""
@@ -218,20 +181,7 @@ class Emulator:
         return False
 
     def _obey(self, received: bytes) -> None:
-        if self._faults is None:
-            self._line.write(self.adapter.feed(received))
-            return
-        was_open = self.adapter.channel_open
-        unread_bytes = self._line.left_bytes() if b"C" in received else self._line.unread_bytes()
-        answer = self.adapter.feed(received)
-        if self.adapter.channel_open != was_open:  # closing and opening drop old bytes, answers as well
-            self._faults.truth.close_channel(unread_bytes)
-        if not self.adapter.channel_open:
-            self._line.write(answer)
-            return
-        if not was_open:
-            self._faults.truth.open_channel()
-        self._send([Piece(answer, None, answer=True)], time.monotonic_ns())
+        self._line.write(self.adapter.feed(received))
 
     def _drain(self, deadline_s: float = math.inf) -> None:
         """Let the client fetch the bytes under way, which hanging up would discard."""

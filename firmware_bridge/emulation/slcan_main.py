@@ -9,27 +9,32 @@ import argparse
 import os
 import select
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from firmware_bridge.emulation.fault_log import TruthFiles
-from firmware_bridge.emulation.faults.injector import Injector
-from firmware_bridge.emulation.faults.stretches import parse_stretches
-from firmware_bridge.emulation.faults.truth import Truth
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.tracks import Recording
 
 INTERRUPTED: Final = 130
 _STOP_POLL_S: Final = 0.05
+MakeEmulator = Callable[[Sequence[Recording], Mapping[str, Any], argparse.Namespace, ExitStack], Emulator]
+"""Constructor from recordings, the emulator's options and all options; the stack closes what it opens."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play the recordings named on the command line."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_bridge.emulation.slcan_main", description=__doc__)
+    parser = argument_parser("python -m firmware_bridge.emulation.slcan_main", __doc__)
+    return play(parser, arguments, lambda recordings, usual, options, closing: Emulator(recordings, **usual))
+
+
+def argument_parser(program: str, description: str | None) -> argparse.ArgumentParser:
+    """Return a parser of the options of `Emulator`."""
+    parser = argparse.ArgumentParser(prog=program, description=description)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("file", nargs="+", help="recording, .csv or .npz")
     parser.add_argument(
@@ -43,21 +48,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ignore-line-speed", action="store_true", help="accept any line speed, like USB-CDC adapters")
     parser.add_argument("--jitter-ms", type=float, default=1.0, help="largest jitter of a scan (default: 1)")
     parser.add_argument("--latency-ms", type=float, default=1.0, help="latency of the adapter (default: 1)")
-    parser.add_argument(
-        "--frame-us", type=float, default=1e6 * FRAME_S, help="time of a frame on the bus (default: 130)"
-    )
-    parser.add_argument(
-        "--first-frame", type=int, default=0, metavar="N", help="frame of the cycle that follows the opening"
-    )
+    parser.add_argument("--frame-us", type=float, default=1e6 * FRAME_S, help="time on the bus, a frame (default: 130)")
+    parser.add_argument("--first-frame", type=int, default=0, metavar="N", help="frame of the cycle sent first")
     parser.add_argument("--seed", type=int, default=0, help="seed of jitter and unused bytes (default: 0)")
     parser.add_argument("--stamps", metavar="FILE", help="write controller and time [ns] of each scan's last frame")
     parser.add_argument("--link", type=Path, metavar="PATH", help="symbolic link to the emulated serial port")
-    parser.add_argument("--faults", default="", metavar="F", help="faults, as lost@2+3 or mixed@5+600; see docs/run.md")
-    parser.add_argument("--truth", type=Path, metavar="DIR", help="folder for logs of the fate of every frame")
     parser.add_argument("--until-stdin-closes", action="store_true", help="end when stdin is closed")
+    return parser
+
+
+def play(parser: argparse.ArgumentParser, arguments: Sequence[str] | None, make_emulator: MakeEmulator) -> int:
+    """Play the recordings named in the arguments, and return the exit code."""
     options = parser.parse_args(arguments)
     try:
-        _serve(options)
+        _serve(options, make_emulator)
     except KeyboardInterrupt:
         return INTERRUPTED
     except (BridgeError, ValueError) as error:
@@ -67,35 +71,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _serve(options: argparse.Namespace) -> None:
+def _serve(options: argparse.Namespace, make_emulator: MakeEmulator) -> None:
     with ExitStack() as closing:
         # First of all: what cannot be played shall cost no file of an earlier run.
         recordings = [load_recording(path) for path in options.file]
         stamps = closing.enter_context(Path(options.stamps).open("w")) if options.stamps else None
-        truth = closing.enter_context(TruthFiles(options.truth)) if options.truth else None
-        faults = None
-        if options.faults or truth is not None:
-            stretches = parse_stretches(options.faults, options.seed) if options.faults else []
-            faults = truth.injector(stretches, options.seed) if truth else Injector(stretches, Truth(), options.seed)
-        emulator = Emulator(
-            recordings,
-            controllers=options.controller,
-            rate_hz=options.rate_hz,
-            loop=options.loop,
-            acknowledges=not options.no_acks,
-            left_open=options.left_open,
-            old_canable=options.old_canable,
-            jitter_s=options.jitter_ms / 1000,
-            latency_s=options.latency_ms / 1000,
-            frame_s=options.frame_us / 1e6,
-            first_frame=options.first_frame,
-            ignores_line_speed=options.ignore_line_speed,
-            seed=options.seed,
-            on_scan=lambda controller, time_ns: stamps.write(f"{controller} {time_ns}\n") if stamps else None,
-            faults=faults,
-            link=options.link,
-        )
-        _play(emulator, until_stdin_closes=options.until_stdin_closes)
+        usual = {
+            "controllers": options.controller,
+            "rate_hz": options.rate_hz,
+            "loop": options.loop,
+            "acknowledges": not options.no_acks,
+            "left_open": options.left_open,
+            "old_canable": options.old_canable,
+            "jitter_s": options.jitter_ms / 1000,
+            "latency_s": options.latency_ms / 1000,
+            "frame_s": options.frame_us / 1e6,
+            "first_frame": options.first_frame,
+            "ignores_line_speed": options.ignore_line_speed,
+            "seed": options.seed,
+            "on_scan": lambda controller, time_ns: stamps.write(f"{controller} {time_ns}\n") if stamps else None,
+            "link": options.link,
+        }
+        _play(make_emulator(recordings, usual, options, closing), until_stdin_closes=options.until_stdin_closes)
 
 
 def _controllers(text: str) -> list[int]:

@@ -36,7 +36,6 @@ class ServerEmulator:
         message_hz: float = DEFAULT_MESSAGE_HZ,
         port: int = 0,
         garbage_every: int = 0,
-        on_cycle: Callable[[str, int], object] = lambda sensor, time_ns: None,
     ) -> None:
         """Prepare to serve; nothing is opened yet.
 
@@ -45,7 +44,6 @@ class ServerEmulator:
             message_hz: messages a second, independent of the sensors.
             port: port to listen on, 0 for a free one.
             garbage_every: number of messages after which an invalid one follows; 0 for never.
-            on_cycle: called with the sensor and the monotonic time in [ns] of a message with its next whole cycle.
 
         Raises:
             ValueError: an option is out of range.
@@ -56,8 +54,6 @@ class ServerEmulator:
         self._vendor = server
         self._message_hz = message_hz
         self._garbage_every = garbage_every
-        self._on_cycle = on_cycle
-        self._sent_cycles = [-1] * server.sensors
         self._sequence = 0
         self._ticks = 0
         self._garbage = 0
@@ -171,16 +167,10 @@ class ServerEmulator:
         self._ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
         text = self._vendor.message(self._sequence, elapsed_s, time.time())
         self._sequence += 1
-        now_ns = time.monotonic_ns()
         self._server.say(text)
         if self._garbage_every and self._sequence % self._garbage_every == 0:
             self._server.say(GARBAGE[self._garbage % len(GARBAGE)])
             self._garbage += 1
-        for sensor, sent_cycle in enumerate(self._sent_cycles):
-            cycle = self._vendor.cycle(sensor, elapsed_s)
-            if cycle > sent_cycle:
-                self._sent_cycles[sensor] = cycle
-                self._on_cycle(str(sensor + 1), now_ns)
         return True
 
     def _begin_anew(self) -> None:

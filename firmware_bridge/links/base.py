@@ -32,14 +32,12 @@ class Notice(NamedTuple):
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
             all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
             longer does; "note", a remark on a recording.
-        source: name of the link.
         text: message to the user.
         sensors: common prefix of the names of the sensors concerned.
     """
 
     time_ns: int
     kind: NoticeKind
-    source: str
     text: str
     sensors: str = ""
 

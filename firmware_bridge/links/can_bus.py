@@ -94,6 +94,7 @@ class CanBusLink(Link):
         else:
             self._errors.restarted()
         self._scans.begin_anew()
+        self._device_clock.begin_anew()
         self._unread.empty_ns = self._clock_ns()
         self._bus = self._open()
         try:

@@ -94,7 +94,7 @@ class DemoLink(Link):
 
     def counters(self) -> dict[str, int]:
         """Return the counters of the serial link, the last ones after it was closed."""
-        return self._link.counters() if self._link else self._counts
+        return self._link.counters() if self._link else dict(self._counts)
 
     def _reap(self) -> None:
         process, self._process = self._process, None

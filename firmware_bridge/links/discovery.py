@@ -12,7 +12,7 @@ from typing import Final, Literal, NamedTuple
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
-from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, serial_ports
+from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, latency_timer_ms, serial_ports
 
 _IP_TIMEOUT_S: Final = 2.0
 SLOW_LATENCY_MS: Final = 16
@@ -81,7 +81,7 @@ def serial_devices(
             problems.append(NO_PERMISSION)
         if holders := _holders(port.path, proc_root):
             problems.append(f"held by {', '.join(holders)}: end it first")
-        latency_ms = _latency_ms(port.path, sys_root)
+        latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
         if latency_ms >= SLOW_LATENCY_MS:
             problems.append(
                 f"latency timer at {latency_ms} ms: edge-sr sets 1 ms when it opens it; other programs read in bunches"
@@ -149,12 +149,6 @@ def _text(path: Path) -> str | None:
         return path.read_text().strip()
     except OSError:
         return None
-
-
-def _latency_ms(path: str, sys_root: Path) -> int:
-    """Return the time for which a USB serial chip holds bytes back, in [ms]; 0 if it does not report one."""
-    text = _text(sys_root / "bus/usb-serial/devices" / Path(path).name / "latency_timer") or ""
-    return int(text) if text.isdecimal() else 0
 
 
 def _holders(path: str, proc_root: Path) -> list[str]:

@@ -48,7 +48,6 @@ class BurstReader:
         descriptor: int,
         *,
         clock_s: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         """Configure the kernel to gather bytes.
 
@@ -57,7 +56,6 @@ class BurstReader:
         """
         self.descriptor = descriptor
         self._clock_s = clock_s
-        self._sleep = sleep
         self._newest_s = self.empty_s = clock_s()
         self._held = b""
         self.held_until_s: float | None = None
@@ -85,7 +83,7 @@ class BurstReader:
             left_s = max(end_s - self._clock_s(), 0.0)
             wait_s = min(left_s, self.longest_wait_s(wanted_bytes))
             if 0 < wait_s <= STEP_S:  # poll() counts in milliseconds
-                self._sleep(wait_s)
+                time.sleep(wait_s)
                 wait_s = 0
             data = self._step(bool(self._poll.poll(1000 * wait_s)), wanted_bytes)
             if data or left_s <= 0:

@@ -189,4 +189,4 @@ class LastingLink(Link):
             self._reopen(now_ns)
 
     def _tell(self, kind: NoticeKind, text: str) -> None:
-        self._notices.append(Notice(self._clock_ns(), kind, self.name, text))
+        self._notices.append(Notice(self._clock_ns(), kind, text))

@@ -17,6 +17,7 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_fram
 from firmware_bridge.scans.mounting import Mounting, placed_map
 
 if TYPE_CHECKING:
+    from firmware_bridge.links.replay import ReplayLink
     from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 FORMS: Final = (
@@ -135,10 +136,22 @@ def recording_paths(text: str) -> list[str]:
     return [text] if Path(text).exists() else text.split(",")
 
 
-def place_recordings(link: Link, paths: Sequence[str | Path], mountings: Mapping[str, Mounting]) -> Link:
-    """Wrap a link that plays these files so that all taxels are in place: those of a CSV are as wired."""
-    raw = {path.stem for path in map(Path, paths) if path.suffix.lower() == ".csv"}
-    return _placed(link, {name: one for name, one in mountings.items() if name in raw})
+def place_recordings(link: "ReplayLink", paths: Sequence[str | Path], mountings: Mapping[str, Mounting]) -> Link:
+    """Wrap a link that plays these files so that all taxels are in place: those of a CSV are as wired.
+
+    Raises:
+        SourceError: a CSV is of a pad with another number of taxels than its mounting.
+    """
+    raw = {path.stem: path for path in map(Path, paths) if path.suffix.lower() == ".csv"}
+    mounted = {name: one for name, one in mountings.items() if name in raw}
+    for track in (track for recording in link.recordings for track in recording.tracks):
+        one, taxels = mounted.get(track.sensor), track.geometry.taxel_count
+        if one is not None and one.taxel_count != taxels:
+            raise SourceError(
+                f"{raw[track.sensor]} has {taxels} taxels, and in the sensor file sensor {track.sensor} has "
+                f"{one.taxel_count}: leave out the sensor file, or give that of this pad"
+            )
+    return _placed(link, mounted)
 
 
 def _slcan(text: str, rest: str, model: ModelMap) -> Link:

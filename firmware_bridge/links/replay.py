@@ -122,7 +122,7 @@ class ReplayLink(Link):
     def notices(self) -> list[Notice]:
         """Return the notes on the files, once."""
         notes, self._notes = self._notes, []
-        return [Notice(self._start_ns, "note", self.name, note) for note in notes]
+        return [Notice(self._start_ns, "note", note) for note in notes]
 
     def counters(self) -> dict[str, int]:
         """Return the counts of scans, and of the torn and repeated ones among them, as in the recording."""

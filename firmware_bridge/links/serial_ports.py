@@ -26,6 +26,7 @@ NO_PERMISSION: Final = (
     "no permission: add the user to the group that owns it (often: sudo usermod -aG dialout $USER), log in again"
 )
 MOST_LOOKS: Final = 3
+LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 
 
 class Port(NamedTuple):
@@ -88,6 +89,18 @@ def _comports() -> list[ListPortInfo]:
         with suppress(TypeError, ValueError, OSError):
             return list(list_ports.comports())
     return []
+
+
+def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
+    """Return the time for which the driver of a port lets bytes wait, in [ms]; None where it is not shown.
+
+    Source: Linux, drivers/usb/serial/ftdi_sio.c, latency_timer_show; 1 is shown while low latency was asked for.
+    """
+    try:
+        text = (root / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return None
+    return int(text) if text.isdigit() else None
 
 
 def find_adapter(ports: Sequence[Port]) -> Port:

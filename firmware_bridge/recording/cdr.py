@@ -19,7 +19,8 @@ LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000
 HEADER: Final = b"\x00\x01\x00\x00"
 _NUMBERS: Final = dict(
     (
-        *(("int8", "b"), ("uint8", "B"), ("int16", "h"), ("uint16", "H"), ("int32", "i"), ("uint32", "I")),
+        *(("int8", "b"), ("uint8", "B"), ("byte", "B"), ("int16", "h"), ("uint16", "H")),
+        *(("int32", "i"), ("uint32", "I")),
         *(("int64", "q"), ("uint64", "Q"), ("float32", "f"), ("float64", "d")),
     )
 )
@@ -28,10 +29,20 @@ _FIELD = re.compile(r"([A-Za-z][A-Za-z0-9_/]*)(\[([0-9]*)\])? +([a-z][a-z0-9_]*)
 _RULE: Final = "=" * 80
 
 
-class _Field(NamedTuple):
-    """One field: a number, a text, or a message; `length` of an array of numbers, 0 if it is variable, else None."""
+class Field(NamedTuple):
+    """One field: a number, a text, or a message.
+
+    Attributes:
+        name: name of the field.
+        kind: name of its kind, such as "uint8", "string" or "std_msgs/Header".
+        number: encoding of a number, else None.
+        dtype: type of the numbers in an array, else None.
+        length: length of an array, 0 if it is variable; None for a single value.
+        message: type of a message, or of those in a sequence, else None.
+    """
 
     name: str
+    kind: str
     number: struct.Struct | None
     dtype: np.dtype[Any] | None
     length: int | None
@@ -43,6 +54,7 @@ class MessageType:
 
     Attributes:
         name: name of the type, such as "std_msgs/msg/Header".
+        fields: its fields in order.
         definition: its text, followed by those of the messages in it, the format of MCAP for the encoding "ros2msg".
     """
 
@@ -51,7 +63,8 @@ class MessageType:
 
         Args:
             name: name with its package.
-            text: text of the .msg file: numbers, texts, arrays of numbers, other messages; no constants, no defaults.
+            text: text of the .msg file: numbers, texts, arrays of numbers, other messages and sequences of them; no
+                constants, no defaults.
             parts: the messages in it.
 
         Raises:
@@ -62,7 +75,7 @@ class MessageType:
         self._parts = tuple(dict.fromkeys(one for part in parts for one in (part, *part._parts)))
         known = {part.name.replace("/msg/", "/"): part for part in parts}
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
-        self._fields = tuple(_field(line, known) for line in lines if line)
+        self.fields = tuple(_field(line, known) for line in lines if line)
 
     @property
     def definition(self) -> str:  # noqa: D102 - above
@@ -95,10 +108,14 @@ class MessageType:
         return values
 
     def _write(self, out: bytearray, values: Mapping[str, Any]) -> None:
-        for name, number, dtype, count, message in self._fields:
+        for name, _, number, dtype, count, message in self.fields:
             value = values[name]
-            if message is not None:
+            if message is not None and count is None:
                 message._write(out, value)
+            elif message is not None:
+                out += bytes(-len(out) % 4) + _LENGTH.pack(len(value))
+                for one in value:
+                    message._write(out, one)
             elif number is None:
                 text = value.encode() + b"\0"
                 out += bytes(-len(out) % 4) + _LENGTH.pack(len(text)) + text
@@ -115,8 +132,8 @@ class MessageType:
 
     def _read(self, body: memoryview, at: int) -> tuple[dict[str, Any], int]:
         values: dict[str, Any] = {}
-        for name, number, dtype, count, message in self._fields:
-            if message is not None:
+        for name, _, number, dtype, count, message in self.fields:
+            if message is not None and count is None:
                 values[name], at = message._read(body, at)
                 continue
             if number is not None and count is None:
@@ -129,6 +146,12 @@ class MessageType:
                 at += -at % 4
                 (length,) = _LENGTH.unpack_from(body, at)
                 at += 4
+            if message is not None:
+                values[name] = []
+                for _ in range(length):
+                    one, at = message._read(body, at)
+                    values[name].append(one)
+                continue
             if number is None:
                 if not 0 < length <= len(body) - at:
                     raise ValueError(f"{name} has {length} bytes, {len(body) - at} are there")
@@ -143,19 +166,19 @@ class MessageType:
         return values, at
 
 
-def _field(line: str, known: Mapping[str, MessageType]) -> _Field:
+def _field(line: str, known: Mapping[str, MessageType]) -> Field:
     match = _FIELD.fullmatch(line)
     if match is None:
         raise ValueError(f"{line!r} is not a field of a message")
     kind, array, length, name = match.groups()
     count = None if array is None else int(length or 0)
-    if kind in known and count is None:
-        return _Field(name, None, None, None, known[kind])
+    if kind in known and not count:
+        return Field(name, kind, None, None, count, known[kind])
     if kind == "string" and count is None:
-        return _Field(name, None, None, None, None)
+        return Field(name, kind, None, None, None, None)
     if kind in _NUMBERS:
         number = struct.Struct("<" + _NUMBERS[kind])
-        return _Field(name, number, np.dtype("<" + _NUMBERS[kind]), count, None)
+        return Field(name, kind, number, np.dtype("<" + _NUMBERS[kind]), count, None)
     raise ValueError(f"{line!r}: {kind} is not a supported kind")
 
 

@@ -58,6 +58,10 @@ class DeviceClock:
         self._smallest_ns: int | None = None
         self._smallest_before_ns: int | None = None
 
+    def begin_anew(self) -> None:
+        """Forget the offset after the link was opened again: the device may have counted from another origin since."""
+        self.begun_ns = self._smallest_ns = self._smallest_before_ns = None
+
     def host_ns(self, stamp: int, arrival_ns: int) -> int:
         """Return `at` on the host's clock alone, in [ns]."""
         return self.at(stamp, arrival_ns).host_ns
@@ -77,7 +81,7 @@ class DeviceClock:
             step_ns += turns * self._wrap_ns
         if self._smallest_ns is not None and step_ns < -BACK_NS:
             self.restarts += 1
-            self._smallest_ns = self._smallest_before_ns = None
+            self.begin_anew()
         self._stamp_ns, self._arrival_ns = stamp_ns, arrival_ns
         self._device_ns += step_ns
         difference_ns = arrival_ns - self._device_ns

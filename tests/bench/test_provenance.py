@@ -7,6 +7,7 @@ import pytest
 from edge_samples import ROOT
 
 from edge.bench import stale_reports
+from edge.bench.program import PROGRAM_SOURCES
 from edge.bench.provenance import (
     UNKNOWN,
     changed_files,
@@ -52,16 +53,22 @@ def test_a_head_that_lacks_or_is_damaged_is_none(page):
     assert read_provenance(page) is None
 
 
-def test_sources_are_all_that_is_imported_here_and_nothing_else():
+def test_sources_are_what_the_entries_import_themselves_and_nothing_else():
     files = {
-        "a.py": "import numpy\nfrom pack import b\ndef f():\n    from pack.c import g\n",
+        "a.py": "import numpy\nimport edge.terminal.bar\nfrom pack import b\ndef f():\n    from pack.c import g\n",
+        "edge/terminal/bar.py": "",
         "pack/__init__.py": "",
         "pack/b.py": "import fake\n",
         "pack/c.py": "from pack.b import h\n",
         "pack/d.py": "",
         "tests/support/fake.py": "",
     }
-    assert set(imported_sources(["a.py"], files.get)) == set(files) - {"pack/d.py"}
+    assert set(imported_sources(["a.py"], files.get)) == {"a.py", "pack/__init__.py", "pack/b.py", "pack/c.py"}
+    assert set(imported_sources(["pack/b.py", "gone.py"], files.get)) == {"pack/b.py", "tests/support/fake.py"}
+
+
+def test_the_sources_of_the_whole_program_exist():
+    assert all((ROOT / path).is_file() for path in PROGRAM_SOURCES)
 
 
 def test_words_do_not_age_a_report_and_code_does():

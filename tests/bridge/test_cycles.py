@@ -17,12 +17,12 @@ from cycle_samples import (
     read,
     swapping,
 )
+from fault_emulator import FaultyEmulator
+from fault_injector import Injector
+from fault_stretches import parse_stretches
+from fault_truth import Truth
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.faults.injector import Injector
-from firmware_bridge.emulation.faults.stretches import parse_stretches
-from firmware_bridge.emulation.faults.truth import Truth
-from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP
 
@@ -147,7 +147,7 @@ def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_
     lost = Injector(parse_stretches("dead=4.5@.15+.01,dead=4.3@.25+.01"), Truth())
     recording = numbered(60, first=FIRST)
     with (
-        Emulator([recording], first_frame=first_frame, old_canable=old_canable, faults=lost) as emulator,
+        FaultyEmulator([recording], first_frame=first_frame, old_canable=old_canable, faults=lost) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         scans = read_until_lost(link)

@@ -196,7 +196,6 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
         ([str(path), "--rate-hz", "9", "--link", "/nonexist/x"], "link is /nonexist/x, expected a path in a folder"),
         ([str(path), "--rate-hz", "9", "--link", str(path)], "a.csv, expected a path that is free or a link"),
         ([str(path), "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),
-        ([str(path), "--rate-hz", "9", "--truth", "/proc/x"], "/proc/x: cannot be written: No such file"),
         ([str(path), "--rate-hz", "9", "--stamps", "/nonexist/x"], "/nonexist/x: cannot be written: No such file"),
         ([str(path), "--rate-hz", "0"], "positive"),
         ([str(path), "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),

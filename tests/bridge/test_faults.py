@@ -7,15 +7,15 @@ from itertools import pairwise, takewhile
 import numpy as np
 import pytest
 from bridge_samples import make_counts
+from fault_frames import FRAME_FAULTS, READ, BusFrame
+from fault_injector import BURST_S, Injector
+from fault_lines import LINE_FAULTS, Piece
+from fault_stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
+from fault_truth import FATES, ROW, Truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.faults.frames import FRAME_FAULTS, READ, BusFrame
-from firmware_bridge.emulation.faults.injector import BURST_S, Injector
-from firmware_bridge.emulation.faults.lines import LINE_FAULTS, Piece
-from firmware_bridge.emulation.faults.stretches import CALM_S, LINK_FAULTS, NAMES, Stretch, mixture, parse_stretches
-from firmware_bridge.emulation.faults.truth import FATES, ROW, Truth
 from firmware_bridge.emulation.pty_port import PseudoPort
 from firmware_bridge.emulation.xela_controller import Controller, bus_timeline
 from firmware_bridge.recording.tracks import Track

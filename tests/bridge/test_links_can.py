@@ -1,6 +1,7 @@
 """The python-can link: the real library, its virtual bus, and what its other interfaces do."""
 
 import errno
+import itertools
 import random
 import threading
 import time
@@ -64,7 +65,8 @@ def test_the_same_scans_as_over_slcan(bus):
 
 
 def test_a_scan_comes_with_its_last_frame(bus):
-    with link_to(bus) as link:
+    now_ns = itertools.count(5 * 10**12, 1_000_000)  # a machine that pauses here must make no pause on the bus
+    with link_to(bus, clock_ns=now_ns.__next__) as link:
         for frame in frames_of(1)[:15]:
             bus.send(message_of(frame))
         assert [link.read(0.0) for _ in range(15)] == [[]] * 15 and link.read(0.01) == []
@@ -85,6 +87,21 @@ def test_a_step_of_the_wall_clock_does_not_hurt(bus, step_s):
             assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns < 1_000_000
             now_ns[0] += 10_000_000
         assert link.counters()["clock_restarts"] == (step_s < 0)
+
+
+@pytest.mark.parametrize("begun_us", [0, 10**9])
+def test_a_driver_that_counts_from_its_opening_makes_no_reading_old(bus, begun_us):
+    """Count stamps from each opening: those after an outage may lie ahead of the earlier ones by any time."""
+    now_ns, delays_ns = [5 * 10**12], []
+    link = link_to(bus, clock_ns=lambda: now_ns[0])
+    for opened_us in (1000, 2_000_000 + begun_us):
+        with link:
+            for frame in frames_of(1, seed=opened_us):
+                bus.send(message_of(frame, timestamp=opened_us / 1e6))
+            (scan,) = [scan for _ in range(16) for scan in link.read(0.0)]
+            delays_ns.append(scan.time_ns - scan.not_before_ns)
+        now_ns[0] += 9 * 10**9
+    assert delays_ns == [0, 0] and link.counters()["clock_restarts"] == 0
 
 
 def test_the_interface_gone_is_told_at_once_and_every_time(bus):

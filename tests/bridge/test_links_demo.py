@@ -52,6 +52,15 @@ def test_the_demo_plays_through_and_ends(recording):
     assert processes_playing(recording) == []
 
 
+def test_the_counters_of_a_closed_demo_are_the_callers_own(recording):
+    """A source adds those of its other links to them, each time that it is asked."""
+    link = DemoLink(recording)
+    with link:
+        read_until_lost(link)
+    link.counters()["scans"] += 1000
+    assert link.counters()["scans"] == 30
+
+
 def test_a_loop_goes_on_where_the_demo_ends_until_it_is_left(recording):
     with DemoLink(recording, rate_hz=1000, loop=True) as link:
         scans = read_scans(link, 75)

@@ -233,7 +233,7 @@ def test_can_ids_are_known_behind_names_and_outages():
 def test_trouble_and_notices_are_of_the_name():
     class Telling(FakeLink):
         def notices(self):
-            return [Notice(self.reads, "back", "fake", f"before read {self.reads}")]
+            return [Notice(self.reads, "back", f"before read {self.reads}")]
 
     inner = Telling([[make_scan(0)]])
     inner.trouble = "bus-off"

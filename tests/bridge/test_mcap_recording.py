@@ -139,20 +139,20 @@ class TestSink:
         sink.close()
         assert len(messages_of(tmp_path / "out.mcap")["/s4/scan"]) == 4
 
-    @pytest.mark.parametrize("patient", [True, False])
-    def test_a_disk_that_hangs_is_waited_for_by_the_patient_alone(self, tmp_path, monkeypatch, patient):
+    @pytest.mark.parametrize("lossless", [True, False])
+    def test_a_disk_that_hangs_is_waited_for_by_the_lossless_alone(self, tmp_path, monkeypatch, lossless):
         monkeypatch.setattr(mcap_file, "MOST_WAITING_BYTES", 20_000)
         put, mended, waited_for = McapFile._put, threading.Event(), []
         monkeypatch.setattr(McapFile, "_put", lambda file, data: mended.wait() and put(file, data))
         drain = McapFile.drain
         monkeypatch.setattr(McapFile, "drain", lambda file: (mended.set(), waited_for.append(1), drain(file)))
         path, results = tmp_path / "out.mcap", make_results([make_scan(number) for number in range(60)])
-        sink = McapSink(path, SURE, patient=patient, clock_s=itertools.count(0.0, 0.1).__next__)
+        sink = McapSink(path, SURE, lossless=lossless, clock_s=itertools.count(0.0, 0.1).__next__)
         for result in results[:50]:
             sink.write(result, {})
-        assert bool(waited_for) == patient
+        assert bool(waited_for) == lossless
         left_out = sink.unwritten
-        assert (left_out == 0) == patient and left_out < 50
+        assert (left_out == 0) == lossless and left_out < 50
         mended.set()
         sink._file.drain()
         for result in results[50:]:

@@ -6,9 +6,10 @@ from edge_samples import BASELINE, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_bridge.errors import SourceError
 from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.registry import open_source
-from firmware_bridge.recording.formats import CSV_HEADER
+from firmware_bridge.recording.formats import CSV_HEADER, csv_header
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
 from firmware_bridge.scans.scan import ABSENT, VendorReading
@@ -114,6 +115,14 @@ def test_deformation_is_corrected_once_and_silent_taxels_stay_unknown():
 def test_a_mounting_that_cannot_be_is_refused(settings, word):
     with pytest.raises(ValueError, match=word):
         Mounting(**settings)
+
+
+@pytest.mark.parametrize(("taxels", "mounted"), [(24, 16), (16, 24)])
+def test_csv_of_another_pad_than_its_mounting_is_refused(tmp_path, taxels, mounted):
+    (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(taxels)), ",".join(["1000"] * 3 * taxels), ""]))
+    mounting = Mounting(tuple(range(mounted))[::-1], taxel_count=mounted)
+    with pytest.raises(SourceError, match=rf"4\.csv has {taxels} taxels, .* sensor 4 has {mounted}: leave out"):
+        open_source(f"replay:{tmp_path}/4.csv", 100.0, mountings={"4": mounting})
 
 
 def test_csv_of_the_vendors_server_is_put_in_place_and_what_edge_sr_recorded_is_not(tmp_path):

@@ -53,7 +53,7 @@ PARSED = {
     r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench, test_zenoh_programs run them",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
-    r"python -m firmware_bridge\.emulation\.slcan_main .*--loop.*": "plays until ended; test_emulator_port runs it",
+    r"python tests/system/fault_emulator\.py .*--loop.*": "plays until ended; test_fault_bench runs it",
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",

@@ -13,10 +13,10 @@ from edge.doctor.link_checks import (
     check_baud,
     check_latency,
     check_link,
-    latency_timer_ms,
 )
 from edge.doctor.scan_statistics import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.links.serial_ports import latency_timer_ms
 from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, USPA44_MAP, XR1944_MAP, trigger_frame
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.slcan_scans import SlcanScans

@@ -33,5 +33,5 @@ def test_a_verdict_is_kept_and_recalled_without_finite_elements(tmp_path, monkey
 
 def test_half_precision_is_precise_enough(tmp_path):
     kept = press_or_recall("large circle", COARSE, STEPS_MM, tmp_path).patterns_mm
-    pad_pattern = referee._work_out("large circle", COARSE, STEPS_MM, referee.CENTRE, referee.LAYER).patterns_mm
+    pad_pattern = referee._work_out("large circle", COARSE, STEPS_MM, referee.LAYER).patterns_mm
     assert np.abs(kept - pad_pattern).max() < 5e-4 * STEPS_MM[-1]

@@ -263,7 +263,7 @@ class Outage(FakeLink):
     """A cable that is out for a moment after ten scans."""
 
     def notices(self):
-        return [Notice(0, kind, "fake", kind) for kind in ("lost", "back")] if self.reads == 11 else []
+        return [Notice(0, kind, kind) for kind in ("lost", "back")] if self.reads == 11 else []
 
 
 def test_a_loop_that_was_left_goes_on_with_the_next_result():

@@ -256,7 +256,7 @@ class Live(FakeLink):
     told: tuple[str, ...] = ()
 
     def notices(self):
-        return [Notice(0, kind, "fake", f"fake is {kind}") for kind in self.told] if self.reads == 11 else []
+        return [Notice(0, kind, f"fake is {kind}") for kind in self.told] if self.reads == 11 else []
 
     def read(self, timeout_s):
         time.sleep(0.005)

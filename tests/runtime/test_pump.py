@@ -235,7 +235,7 @@ class Telling(FakeLink):
         self._at, self._kind = at, kind
 
     def notices(self):
-        return [Notice(0, self._kind, "fake", "told")] if self.reads == self._at else []
+        return [Notice(0, self._kind, "told")] if self.reads == self._at else []
 
 
 @pytest.mark.parametrize("kind", ["lost", "silent", "back", "trouble", "well"])

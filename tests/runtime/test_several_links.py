@@ -1,5 +1,6 @@
 """One source of several links: scripts, and emulated adapters on pseudo-terminals."""
 
+import contextlib
 import itertools
 import os
 import threading
@@ -10,6 +11,7 @@ import pytest
 from bridge_samples import make_recording, stacked
 from edge_samples import FakeLink, make_scan
 
+from edge.pipeline.link_reader import LinkReader
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError, SourceError
@@ -100,9 +102,36 @@ def test_a_link_that_hangs_holds_up_no_other(mixed):
     assert numbers(taken, "slow/4") == [0]
 
 
+class Flapping(FakeLink):
+    """A link that is away before every other read."""
+
+    def __init__(self, reads):
+        super().__init__([[] for _ in range(reads)])
+        self.reader, self.writer = os.pipe()
+
+    def wait_on(self):
+        return Wait(self.reader, 0) if len(self._batches) % 2 else None
+
+    def __exit__(self, *exc_info):
+        os.close(self.reader)
+        os.close(self.writer)
+
+
+def test_a_link_that_comes_and_goes_for_days_costs_no_memory():
+    ended = threading.Event()
+    links = [Flapping(201), Flapping(201)]
+    with contextlib.ExitStack() as closing:
+        for link in links:
+            closing.enter_context(link)
+        reader = LinkReader(links, lambda notices, scans: None, ended.set)
+        closing.callback(reader.close)
+        assert ended.wait(60)
+        assert all(len(kept) <= 4 for kept in vars(reader).values() if isinstance(kept, (list, dict, tuple)))
+
+
 class Telling(FakeLink):
     def notices(self):
-        return [Notice(self.reads, "back", "fake", f"before read {self.reads}")]
+        return [Notice(self.reads, "back", f"before read {self.reads}")]
 
 
 def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
@@ -114,7 +143,7 @@ def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
 @pytest.mark.parametrize("shared", [False, True])
 def test_one_that_gives_up_ends_all_after_its_scans_and_what_it_told(shared):
     lost = (PipeLink if shared else FakeLink)([[make_scan(0)]], error=LinkLostError("gone"))
-    told = [Notice(0, "lost", "fake", "told")]
+    told = [Notice(0, "lost", "told")]
     lost.notices = lambda: [] if lost.reads < 2 or not told else [told.pop()]
     other = FakeLink([], endless=True)
     taken = []

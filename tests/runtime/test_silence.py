@@ -129,6 +129,20 @@ def test_without_a_period_nobody_knows():
     assert silence.missed == 0
 
 
+def test_a_finger_that_comes_after_it_was_missed_is_told_back_once():
+    silence, events = Silence(["4", "6"]), []
+    for n in range(100):
+        for sensor in ("4", "6") if n >= 80 else ("4",):
+            back = silence.follow(scan(n, 10 * n, sensor), PERIOD_NS)
+            events += [] if back is None else [back]
+        events += silence.look()
+    assert [(event.kind, event.sensor, event.time_ns // MS) for event in events] == [
+        ("silent", "6", SENSOR_SILENT_NS // MS + 10),
+        ("back", "6", 800),
+    ]
+    assert events[1].text == "sensor 6 is back after 0.8 s"
+
+
 def test_a_finger_that_falls_silent_while_the_other_goes_on_is_told_once_and_told_back():
     silence, events = Silence(), []
     for n in range(200):

@@ -59,6 +59,30 @@ def test_silence_is_told_and_measured_from_the_last_scan():
     assert source.taken == 30 + 11
 
 
+@pytest.mark.parametrize(
+    ("heard", "skip"),
+    [
+        (lambda n: [make_scan(n, noise=3, absent=(3,))], 0),  # a silent taxel, or another id map
+        (lambda n: [make_scan(n, noise=3)] + ([make_scan(n, sensor="6", noise=3)] if n < 30 else []), 0),
+        (lambda n: [make_scan(n, noise=3)] + ([make_scan(n, sensor="6", noise=3)] if n < 30 else []), 50),
+        (lambda n: [make_scan(0, stale=range(16))], 0),  # frozen: the same readings again and again
+    ],
+)
+def test_a_sensor_that_gives_no_whole_scan_is_told_though_scans_come(heard, skip):
+    class Script:
+        name, kind, taken = "fake", "device", 0
+
+        def take(self, timeout_s):
+            self.taken += 1
+            assert self.taken < 5000
+            return heard(self.taken)
+
+    source = Script()
+    with pytest.raises(DeviceError, match=r"no whole new scan from sensor [46] for 10 s: .*edge-sr doctor"):
+        take_baselines(source, skip=skip, clock_s=lambda: 0.1 * source.taken)
+    assert source.taken < 200
+
+
 def test_a_sensor_that_is_done_may_move_while_another_is_not():
     scans = [
         [
@@ -82,7 +106,7 @@ def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it():
 
     class Lost(FakeLink):
         def notices(self):
-            return [Notice(0, "lost", "fake", "gone")] if self.reads == 90 else []
+            return [Notice(0, "lost", "gone")] if self.reads == 90 else []
 
     before = [[make_scan(n, press_counts=9)] for n in range(89)]
     assert np.abs(take(Lost(before + rest_scans(100, start=89)))["4"].counts - REST).max() <= 2

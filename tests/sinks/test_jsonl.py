@@ -190,7 +190,7 @@ class TestJsonLines:
         fifo = tmp_path / "fifo"
         os.mkfifo(fifo)
         reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
-        sink = JsonLinesSink(str(fifo), patient=False)
+        sink = JsonLinesSink(str(fifo), lossless=False)
         result, written = make_results(3)[4], 300
         for _ in range(written):
             sink.write(result, {})  # would wait for ever

@@ -1,6 +1,8 @@
 """The npz sink: arrays of all scans, whole whatever ended their writer."""
 
+import errno
 import json
+import os
 import resource
 import signal
 import subprocess
@@ -47,6 +49,29 @@ class TestNpz:
             np.testing.assert_array_equal(track.counts, np.stack([scan.counts for scan in mine]))
             assert track.time_ns is not None and track.time_ns.tolist() == [scan.time_ns for scan in mine]
         assert not parts_dir(path).exists() and list(tmp_path.iterdir()) == [path]
+
+    def test_the_rows_stay_until_the_npz_is_on_the_disk(self, tmp_path, monkeypatch):
+        """A power cut may leave the name of a file whose content was never written."""
+        path, fsync, written = tmp_path / "out.npz", os.fsync, []
+
+        def note(descriptor):
+            written.append((os.fstat(descriptor).st_ino, parts_dir(path).exists(), path.exists()))
+            fsync(descriptor)
+
+        monkeypatch.setattr(os, "fsync", note)
+        self.record(path, make_results())
+        assert written == [(path.stat().st_ino, True, False)] and zipfile.ZipFile(path).testzip() is None
+
+    def test_a_disk_that_fails_at_the_end_costs_no_row(self, tmp_path, monkeypatch):
+        def fail(descriptor):
+            raise OSError(errno.EIO, "Input/output error")
+
+        path = tmp_path / "out.npz"
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", fail)
+            with pytest.raises(SinkError, match="Input/output error; the parts are kept"):
+                self.record(path, make_results())
+        assert gather(path) == len(make_results()) and list(tmp_path.iterdir()) == [path]
 
     def test_every_array_holds_its_row(self, tmp_path):
         results = make_results(counts_per_newton=5)

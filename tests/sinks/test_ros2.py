@@ -4,7 +4,6 @@ import json
 import math
 import os
 import queue
-import re
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ros2_samples import ENVIRONMENT, TAG, contact, sink, without_pattern
+from ros2_samples import ENVIRONMENT, TAG, contact, keep_published, sink, without_pattern
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
@@ -25,7 +24,7 @@ from edge.perception.event import Event
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
-from edge.sinks.ros2.dds_types import TYPE_HASHES
+from edge.sinks.ros2.dds_types import TYPE_HASHES, dds_type
 from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.scans.scan import VendorReading
@@ -202,7 +201,7 @@ def test_of_another_source_than_a_sensor_the_frame_and_the_diagnostics_tell(sink
 
 def test_forces_of_the_vendor_have_three_axes_and_counts_are_no_newtons(sink):
     published = []
-    sink._publish = lambda writer, message: published.append(message)
+    keep_published(sink, published, WRENCH)
     newtons = np.zeros((3, 4, 4), dtype=np.float32)
     newtons[:, 1, 1] = 0.25, -0.5, 2.0
     result = contact(1)
@@ -210,10 +209,10 @@ def test_forces_of_the_vendor_have_three_axes_and_counts_are_no_newtons(sink):
     sink.write(replace(result, scan=scan, force_n=2.0), {})
     sink.write(replace(result, scan=scan, force_n=1.9), {})
     sink.write(result, {})
-    forces = [message.wrench.force for message in published if hasattr(message, "wrench")]
-    assert (forces[0].x, forces[0].y, forces[0].z) == (0.25, -0.5, 2.0)
-    assert math.isnan(forces[1].x) and forces[1].z == 1.9, "z of one calibration beside x and y of another"
-    assert len(forces) == 3 and math.isnan(forces[2].z), "counts in place of newtons"
+    forces = [message["wrench"]["force"] for message in published]
+    assert forces[0] == {"x": 0.25, "y": -0.5, "z": 2.0}
+    assert math.isnan(forces[1]["x"]) and forces[1]["z"] == 1.9, "z of one calibration beside x and y of another"
+    assert len(forces) == 3 and math.isnan(forces[2]["z"]), "counts in place of newtons"
     assert diagnose(result, {}, {}, 0.0, None).values["force"].startswith("counts only")
 
 
@@ -252,19 +251,19 @@ def open_sink_in(environment, text):
 def test_a_force_that_is_known_no_more_is_taken_back_once():
     published = []
     sink = Ros2Sink("skin", ENVIRONMENT, source="emulated")
-    sink._publish = lambda writer, message: published.append(message)
+    keep_published(sink, published)
 
     def taken_back():
-        forces = [one.wrench.force for one in published if hasattr(one, "wrench")]
+        forces = [one["wrench"]["force"] for one in published if "wrench" in one]
         published.clear()
-        return [math.isnan(force.z) for force in forces]
+        return [math.isnan(force["z"]) for force in forces]
 
     idle = without_pattern(contact(1, force_n=0.1), state="idle", contact=False)
     lost = Event(time.monotonic_ns(), "lost", None, "the plug is out")
     sink.write(idle, {})
     assert taken_back() == [False]
     sink.tell(lost, {})
-    (said,) = (json.loads(one.data) for one in published if hasattr(one, "data"))
+    (said,) = (json.loads(one["data"]) for one in published if one.keys() == {"data"})
     assert (said["event"], said["source"]) == ("lost", "emulated")
     assert taken_back() == [True]
     sink.tell(lost, {})
@@ -280,11 +279,16 @@ def test_a_force_that_is_known_no_more_is_taken_back_once():
     assert taken_back() == [False, True]
 
 
-@pytest.mark.parametrize("kind", list(TYPE_HASHES), ids=lambda kind: kind.__name__)
-def test_types_are_called_and_hashed_as_ros_does(kind):
-    name = re.sub(r"::msg::dds_::(.*)_$", r"/msg/\1", kind.__idl__.idl_transformed_typename)
-    assert name in ros2_messages.DEFINITIONS
-    assert TYPE_HASHES[kind] == ros2_messages.type_hash(name)
+KINDS = (ros_messages.IMAGE, ros_messages.WRENCH_STAMPED, ros_messages.DIAGNOSTIC_ARRAY, ros_messages.STRING)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_types_are_called_described_and_hashed_as_ros_does(kind):
+    ours, theirs = dds_type(kind), ros2_messages.dds_type(kind.name)
+    assert ours.__idl__.idl_transformed_typename == theirs.__idl__.idl_transformed_typename
+    assert ours.__idl__.get_type_info() == theirs.__idl__.get_type_info(), "names and types of all fields"
+    assert TYPE_HASHES.keys() == {one.name for one in KINDS}
+    assert TYPE_HASHES[kind.name] == ros2_messages.type_hash(kind.name)
 
 
 def test_bytes_on_the_wire_are_plain_cdr(sink):
@@ -293,9 +297,7 @@ def test_bytes_on_the_wire_are_plain_cdr(sink):
     result = contact(3, force_n=1.25, events=(Event(3, "refused", "4", "not done, ä"),))
     sink.write(result, {"dropped": 1})
     sink._diagnose()
-    pattern, deviation, wrench, event, diagnostics = (
-        message.serialize(use_version_2=sink._events._use_version_2) for message in published
-    )
+    pattern, deviation, wrench, event, diagnostics = published
     image = ros2_messages.decode(IMAGE, pattern)
     assert bytes(image.pop("data")) == result.pattern.tobytes()
     assert bytes(ros2_messages.decode(IMAGE, deviation)["data"]) == result.deviation.tobytes()
@@ -314,13 +316,23 @@ def test_bytes_on_the_wire_are_plain_cdr(sink):
     assert (values["state"], values["pattern_unit"], values["force_n"]) == ("contact", "mm", "1.25")
 
 
+def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
+    """The types are made of ROS's .msg files, so the definitions of the sink have no part in them."""
+    published = []
+    sink._publish = lambda writer, message: published.append(message)
+    sink.write(contact(3, force_n=1.25, events=(Event(3, "refused", "4", "not done, ä"),)), {"dropped": 1})
+    sink._diagnose()
+    names = (IMAGE, IMAGE, WRENCH, "std_msgs/msg/String", "diagnostic_msgs/msg/DiagnosticArray")
+    for name, sent in zip(names, published, strict=True):
+        again = ros2_messages.dds_type(name).deserialize(sent).serialize(use_version_2=False)
+        assert again[: len(sent)] == sent and not any(again[len(sent) :]) and len(again) - len(sent) < 4
+
+
 def test_recordings_hold_the_same_bytes(sink):
     published = []
-    sink._publish = lambda writer, message: published.append(message.serialize(use_version_2=False))
+    sink._publish = lambda writer, message: published.append(message)
     result = contact(3, force_n=1.25)
     sink.write(result, {})
     unix_ns = result.scan.time_ns + sink._unix_offset_ns
     recorded = [ros_messages.image(values, "4", unix_ns) for values in (result.pattern, result.deviation)]
-    recorded.append(ros_messages.wrench(result, unix_ns))
-    for sent, kept in zip(published, recorded, strict=True):
-        assert sent[: len(kept)] == kept and not any(sent[len(kept) :]) and len(sent) - len(kept) < 4
+    assert published == [*recorded, ros_messages.wrench(result, unix_ns)]

@@ -73,15 +73,21 @@ def open_page(browser):
     assert asked and strangers == []
     # That nobody answers, or not as wanted, is Chromium's to tell, and what some of these tests are about.
     told = ("ERR_CONNECTION_REFUSED", "403 (Forbidden)", "Unexpected response code: 403", "503")
-    told += ("is closed before the connection is established",)  # where a test leaves the page while it tries again
     unexpected = [text for text in wrong if not any(words in text for words in told)]
     assert unexpected == [], unexpected
+
+
+class Run(subprocess.Popen[str]):
+    """Run of `edge-sr` with the address of its page, and the bus that it reads where that is emulated."""
+
+    url: str
+    emulator: Emulator
 
 
 @contextlib.contextmanager
 def edge_sr(*arguments):
     """Run `edge-sr --view 0` and yield it with the address that it reports."""
-    process = subprocess.Popen(
+    process = Run(
         [sys.executable, "-m", "edge.cli.main", "--view", "0", *map(str, arguments)],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
@@ -90,8 +96,10 @@ def edge_sr(*arguments):
         stderr=subprocess.PIPE,
         text=True,
     )
+    stderr = process.stderr
+    assert stderr is not None
     lines: Queue[str] = Queue()
-    reader = threading.Thread(target=lambda: [lines.put(line) for line in process.stderr])
+    reader = threading.Thread(target=lambda: [lines.put(line) for line in stderr])
     reader.start()
     try:
         said = []
@@ -109,7 +117,7 @@ def edge_sr(*arguments):
             process.send_signal(signal.SIGINT)
         process.wait(timeout=TIMEOUT_MS / 1000)
         reader.join()
-        process.stderr.close()
+        stderr.close()
 
 
 @pytest.fixture(scope="module")

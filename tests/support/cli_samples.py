@@ -53,9 +53,9 @@ def run(*arguments, **settings):
     )
 
 
-def start(*arguments, **settings):
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | settings
-    return subprocess.Popen([*EDGE_SR, *map(str, arguments)], cwd=ROOT, text=True, **pipes)
+def start(*arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **settings):
+    command = [*EDGE_SR, *map(str, arguments)]
+    return subprocess.Popen(command, cwd=ROOT, text=True, stdin=stdin, stdout=stdout, stderr=stderr, **settings)
 
 
 def records(text):

@@ -3,7 +3,7 @@
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from edge.inference.contract import (
 )
 from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
-from firmware_bridge.links.base import Link
+from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -32,7 +32,7 @@ TINY_DOUBT = 0.01
 REST = (
     np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None] + np.arange(16, dtype=np.int32).reshape(4, 4) * 37
 )
-BASELINE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")
+BASELINE = Baseline.of("4", REST.astype(np.float32), created_unix_s=1000.0, scans=100, origin="file")
 
 
 def make_contract(**changes) -> Contract:
@@ -249,7 +249,7 @@ class FakeModel:
             self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32) * stiffness
         return pattern
 
-    def run_together(self, windows: list[np.ndarray], pads: list[np.ndarray] | None = None) -> np.ndarray:
+    def run_together(self, windows: Sequence[np.ndarray], pads: Sequence[np.ndarray] | None = None) -> np.ndarray:
         patterns, deviations, tractions = [], [], []
         for index, window in enumerate(windows):
             patterns.append(self.run(window, None if pads is None else pads[index]))
@@ -263,9 +263,11 @@ class FakeModel:
 class FakeLink(Link):
     """Link with one batch of scans a read, which waits where a batch is an event, and then ends or fails."""
 
-    def __init__(self, batches, *, error: Exception | None = None, kind="device", endless: bool = False) -> None:
+    def __init__(
+        self, batches, *, error: Exception | None = None, kind: SourceKind = "device", endless: bool = False
+    ) -> None:
         self.name = "fake"
-        self.kind = kind
+        self.kind: SourceKind = kind
         self.ended = False
         self.reads = 0
         self.thread: threading.Thread | None = None

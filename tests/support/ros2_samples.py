@@ -9,10 +9,12 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
+import ros2_messages
 from edge_samples import make_scan
 
 from edge.perception.result import Result
 from edge.sinks.ros2.sink import Ros2Sink
+from firmware_bridge.links.base import SourceKind
 
 TAG = f"<CycloneDDS><Domain><Discovery><Tag>{os.getpid()}</Tag></Discovery></Domain></CycloneDDS>"
 """Tag that keeps other test runs on this machine apart."""
@@ -23,17 +25,29 @@ ENVIRONMENT = {
 }
 
 
-def contact(number, *, sensor="4", source="device", **changes):
+def contact(number, *, sensor="4", source: SourceKind = "device", **changes):
     random = np.random.default_rng(number)
-    maps = {name: random.random((40, 40), dtype=np.float32) for name in ("pattern", "deviation")}
+    pattern, deviation = random.random((2, 40, 40), dtype=np.float32)
     scan = make_scan(number, sensor=sensor, time_ns=time.monotonic_ns())
-    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0, **maps)
-    return replace(made, **changes)
+    made = Result(scan, source, "m", "contact", contact=True, pattern_unit="mm", force_counts=3000.0)
+    return replace(made, pattern=pattern, deviation=deviation, **changes)
 
 
 def without_pattern(result, **changes):
     scan = replace(result.scan, time_ns=time.monotonic_ns())
     return replace(result, scan=scan, pattern=None, deviation=None, **changes)
+
+
+def keep_published(sink, kept, *names):
+    """Keep the messages of a sink, or those of some types, as decoded by the rules, in place of publishing them."""
+
+    def keep(writer, data):
+        package, _, kind = writer.data_type.__idl_typename__.split(".", 2)
+        name = f"{package}/msg/{kind.removeprefix('dds_.').removesuffix('_')}"
+        if not names or name in names:
+            kept.append(ros2_messages.decode(name, data))
+
+    sink._publish = keep
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ def frames_of(*, extended: bool, remote: bool, stamped: bool) -> st.SearchStrate
 
 kinds = [(extended, remote) for extended in (False, True) for remote in (False, True)]
 plain_frames, stamped_frames = (
-    st.one_of(frames_of(extended=extended, remote=remote, stamped=stamped) for extended, remote in kinds)
+    st.one_of([frames_of(extended=extended, remote=remote, stamped=stamped) for extended, remote in kinds])
     for stamped in (False, True)
 )
 frames = plain_frames | stamped_frames

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fault_judge import Found
-
-from firmware_bridge.emulation.fault_log import FaultLog
+from fault_log import Told
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,7 @@ def counted_at_the_end(said: str) -> dict[str, int]:
     return {name: int(count) for name, _, count in pairs if count.isdigit()}
 
 
-def accounts(found: Found, told: FaultLog, said: str = "") -> list[Account]:
+def accounts(found: Found, told: Told, said: str = "") -> list[Account]:
     """Return the accounts of losses and arrivals by both sides; `said` is the program's summary.
 
     A record that was left out held a reading or a missing taxel in each of its sixteen places. Only the program's own

@@ -3,11 +3,11 @@
 import numpy as np
 from fault_accounts import DIFFERENT, accounts
 from fault_judge import judge
+from fault_log import Told
 from fault_played import telling_counts
 from fault_records import Seen
+from fault_truth import FATES, ROW
 
-from firmware_bridge.emulation.fault_log import FaultLog
-from firmware_bridge.emulation.faults.truth import FATES, ROW
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 PERIOD_NS = 10_000_000
@@ -46,11 +46,11 @@ class Forged:
         self.seen[number] = one._replace(head=one.head | changes)
 
     @property
-    def told(self) -> FaultLog:
+    def told(self) -> Told:
         fates = {FATES[fate]: int((self.rows["fate"] == fate).sum()) for fate in set(self.rows["fate"].tolist())}
         counters = dict.fromkeys(COUNTERS, 0) | {"frames": sum(fates.get(name, 0) for name in FATES[:6])}
         account = {"counters": counters, "fates": fates, "begun": {}, "noise": 0, "openings": 1}
-        return FaultLog(self.rows, self.events, account)
+        return Told(self.rows, self.events, account)
 
     def judged(self):
         return judge(self.seen, self.told)

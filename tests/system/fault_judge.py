@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from fault_log import Told
 from fault_records import Seen
 from fault_sent import FLIPPED, STUCK, SentTaxel, handed_on
-
-from firmware_bridge.emulation.fault_log import FaultLog
 
 STALE_US: Final = 100_000
 """Longest time on the bus between the readings that a record gives as one scan of the pad."""
@@ -78,7 +77,7 @@ class Found:
     last_counters: Mapping[str, int] = field(default_factory=dict)
 
 
-def judge(seen: Sequence[Seen], told: FaultLog) -> Found:
+def judge(seen: Sequence[Seen], told: Told) -> Found:
     """Evaluate the records against the truth."""
     taxels = handed_on(told)
     found = Found()

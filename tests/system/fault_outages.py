@@ -6,9 +6,8 @@ from typing import Final
 
 import numpy as np
 from fault_judge import Found
-
-from firmware_bridge.emulation.fault_log import FaultLog
-from firmware_bridge.emulation.faults.stretches import LINK_FAULTS, RESET
+from fault_log import Told
+from fault_stretches import LINK_FAULTS, RESET
 
 NEVER_NS: Final = 2**62
 OUTAGES: Final = (*LINK_FAULTS, "bus-off")
@@ -16,7 +15,7 @@ LONGEST_BACK_S: Final = 1.0
 """Within this time a link that is back is to be used: from then on nothing that follows excuses a wait."""
 
 
-def seconds_to_use(found: Found, told: FaultLog, names: Sequence[str]) -> list[float]:
+def seconds_to_use(found: Found, told: Told, names: Sequence[str]) -> list[float]:
     """Return the time from the end of each outage of these names to the first record of what came after it, in [s].
 
     An adapter's reset is over at once. The time is inf where no further record came. Outages that did not end are left
@@ -39,7 +38,7 @@ def seconds_to_use(found: Found, told: FaultLog, names: Sequence[str]) -> list[f
     return times
 
 
-def _outages(told: FaultLog) -> Iterator[tuple[str, int, int]]:
+def _outages(told: Told) -> Iterator[tuple[str, int, int]]:
     """Yield stretches without data of any sensor: name, begin and end in [ns]; NEVER_NS without an end."""
     begun: dict[str, tuple[str, int]] = {}
     for event in told.events:

@@ -7,15 +7,15 @@ from typing import Final
 import numpy as np
 from fault_accounts import CONSISTENT, DIFFERENT, EQUAL, Account, accounts
 from fault_judge import Found
+from fault_log import Told
 from fault_outages import LONGEST_BACK_S, seconds_to_use
 from fault_records import Ran
 from fault_run import CALM_S
 from fault_server import GARBAGE_EVERY, ServerFound, ServerRan
+from fault_stretches import LINK_FAULTS
 
 from edge.bench.report import head, line
 from edge.bench.soak import slope
-from firmware_bridge.emulation.fault_log import FaultLog
-from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
 
 EXIT_SINK: Final = 5
 MEMORY_MB_PER_MINUTE: Final = 0.2
@@ -35,7 +35,7 @@ class Promise:
     kept: bool
 
 
-def promises(ran: Ran, found: Found, told: FaultLog) -> list[Promise]:
+def promises(ran: Ran, found: Found, told: Told) -> list[Promise]:
     """Return all promises, in order of weight."""
     books = accounts(found, told, ran.said)
     wrong = [book.name for book in books if book.verdict == DIFFERENT]
@@ -93,7 +93,7 @@ def promises(ran: Ran, found: Found, told: FaultLog) -> list[Promise]:
     ]
 
 
-def show(ran: Ran, found: Found, told: FaultLog, say: Callable[[str], object]) -> bool:
+def show(ran: Ran, found: Found, told: Told, say: Callable[[str], object]) -> bool:
     """Show the whole run; return True where every promise was kept."""
     kept = promises(ran, found, told)
     say("\n## Promises\n\n" + head(("promise", "seen", "kept")))
@@ -166,7 +166,7 @@ def _patterns(found: Found) -> str:
     )
 
 
-def _faults(found: Found, told: FaultLog) -> list[tuple[str, ...]]:
+def _faults(found: Found, told: Told) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     fates, begun = told.accounts["fates"], told.accounts["begun"]
     for name in sorted(begun):
@@ -189,7 +189,7 @@ def _agreement(books: Sequence[Account]) -> str:
     return "; ".join(parts)
 
 
-def _losses(found: Found, told: FaultLog) -> str:
+def _losses(found: Found, told: Told) -> str:
     sent = sum(told.accounts["fates"].values())
     cycles = vanished_scans(found, told)
     return (
@@ -199,7 +199,7 @@ def _losses(found: Found, told: FaultLog) -> str:
     )
 
 
-def vanished_scans(found: Found, told: FaultLog) -> int:
+def vanished_scans(found: Found, told: Told) -> int:
     """Return the cycles of all sensors from their first record to the last, less the records."""
     total = 0
     for sensor in found.first_us:
@@ -209,7 +209,7 @@ def vanished_scans(found: Found, told: FaultLog) -> int:
     return total - found.records
 
 
-def _latencies(found: Found, told: FaultLog) -> list[tuple[str, list[float]]]:
+def _latencies(found: Found, told: Told) -> list[tuple[str, list[float]]]:
     first_ns = min((event["time_ns"] for event in told.events), default=0)
     return [
         (f"first {CALM_S:g} s, without faults", [us for at_ns, us in found.latencies if at_ns < first_ns]),

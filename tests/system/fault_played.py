@@ -51,5 +51,6 @@ def playing_emulator(folder: Path, faults: str, seed: int) -> Iterator[str]:
     link, truth = folder / "usb-adapter", folder / "truth"
     options = ["--loop", "--rate-hz", "100", "--link", str(link), "--truth", str(truth), "--seed", str(seed)]
     options += ["--faults", faults] if faults else []
-    with emulating(*options, *files) as port:
+    emulator = str(Path(__file__).with_name("fault_emulator.py"))
+    with emulating(*options, *files, program=[emulator]) as port:
         yield port

@@ -9,10 +9,10 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 import orjson
+from fault_log import Told
 from numpy.typing import NDArray
 
 from edge.sinks.pipe_capacity import PIPE_BYTES
-from firmware_bridge.emulation.fault_log import FaultLog
 
 
 class Seen(NamedTuple):
@@ -60,7 +60,7 @@ class Ran:
     said: str = ""
     seen: list[Seen] = field(default_factory=list)
     sizes: list[Size] = field(default_factory=list)
-    told: FaultLog | None = None
+    told: Told | None = None
     slow: int = 0
     unwritten: int = 0
     broken: list[str] = field(default_factory=list)

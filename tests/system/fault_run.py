@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from fault_log import EVENTS, read_truth
 from fault_played import playing_emulator
 from fault_records import Ran, Seen, Size, in_thread, keep_lines, read_records
 from fault_sinks import failing_sinks, fill_up, look_into_files, read_and_go, read_slowly
+from fault_stretches import parse_stretches
 
 from edge.bench.errors import BenchError
 from edge.bench.program import CONTROLLERS, REST_COUNTS, environment
 from edge.terminal.progress_bar import SECONDS, Progress
-from firmware_bridge.emulation.fault_log import EVENTS, read_truth
-from firmware_bridge.emulation.faults.stretches import parse_stretches
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 CALM_S: Final = 4.0

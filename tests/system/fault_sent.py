@@ -5,10 +5,10 @@ from collections import defaultdict
 from typing import Final
 
 import numpy as np
+from fault_frames import READ
+from fault_log import Told
+from fault_truth import FATES
 
-from firmware_bridge.emulation.fault_log import FaultLog
-from firmware_bridge.emulation.faults.frames import READ
-from firmware_bridge.emulation.faults.truth import FATES
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 FLIPPED: Final = FATES.index("flipped")
@@ -85,7 +85,7 @@ class SentTaxel:
         return self.rows[self.next][0] == STUCK and self._readings[self.next] == self._readings[self.shown]
 
 
-def handed_on(told: FaultLog) -> dict[tuple[str, int], SentTaxel]:
+def handed_on(told: Told) -> dict[tuple[str, int], SentTaxel]:
     """Return what reached the reader, by sensor and taxel."""
     frames = told.frames[told.frames["fate"] < len(READ)]
     frames = frames[np.isin(frames["can_id"], list(USPA44_MAP.taxels))]

@@ -20,6 +20,7 @@ from fault_server import judge_server, run_against_server
 
 from edge.bench.errors import BenchError
 from edge.bench.live_report import Page
+from edge.bench.program import PROGRAM_SOURCES
 from edge.bench.provenance import provenance
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     page = Page(sys.stdout, sys.stderr)
     command = f"python tests/system/faults.py {options.minutes:g} --seed {options.seed}"
     models = [find_model(DEFAULT_MODEL)]
-    head = provenance(command, [__file__, "edge/__main__.py"], models, options.seed)
+    head = provenance(command, [__file__, *PROGRAM_SOURCES], models, options.seed)
     page.say(f"# Faults\n\n{head}\n\n{_TEXT}")
     try:
         with tempfile.TemporaryDirectory() as folder:

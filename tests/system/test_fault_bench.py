@@ -8,34 +8,38 @@ import subprocess
 import sys
 import time
 
+import fault_sinks
 import numpy as np
 import pytest
 from bridge_samples import make_recording, write_recording
 from edge_samples import ROOT
 from fault_accounts import counted_at_the_end
+from fault_emulator import FaultyEmulator
+from fault_emulator import main as emulate
+from fault_injector import Injector
 from fault_judge import judge
 from fault_page import promises
 from fault_run import run_among_faults
+from fault_stretches import parse_stretches
+from fault_truth import ROW, Truth
 from faults import main
 
 from edge.sinks.npz import gather
-from firmware_bridge.emulation.faults.injector import Injector
-from firmware_bridge.emulation.faults.stretches import parse_stretches
-from firmware_bridge.emulation.faults.truth import ROW, Truth
-from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 # The real thing.
 
 
-def test_a_short_run_keeps_every_promise(tmp_path):
+def test_a_short_run_keeps_every_promise(tmp_path, monkeypatch):
     """All promises except those of time, as the load of this machine is unknown."""
     faults = (
         "lost@1+1,repeated@1+1,foreign@1.2+1,dead=4.3@1.5+.6,stuck=6.9@1.5+.7,garbage=.1@2.2+.5,truncated@2.3+.5,"
         "merged@2.4+.5,non-ascii@2.5+.5,reordered@2.6+.4,flipped@2.7+.3,bursts@3+.4,silent=6@3.2+.3,"
         "rename@3.8+.3,bus-off@5+.3,reset@5.6+.1,vanished=1@7.2+.3,vanished=1@8+60"
     )
+    # Records without patterns fill the disk, too: patterns are most of a record, and a busy machine computes few.
+    monkeypatch.setattr(fault_sinks, "ROOM_BYTES", 400_000)
     ran = run_among_faults(faults, 5, tmp_path)
     assert ran.told is not None
     found = judge(ran.seen, ran.told)
@@ -102,7 +106,7 @@ def until_lost(link: SlcanSerialLink) -> list:
 def test_the_cable_comes_out_and_back(tmp_path, fault):
     path = tmp_path / "usb-adapter"
     faults = spoilt(f"{fault}@.1+.2")
-    with Emulator([make_recording(100)], loop=True, link=path, faults=faults) as emulator:
+    with FaultyEmulator([make_recording(100)], loop=True, link=path, faults=faults) as emulator:
         assert emulator.port == str(path) and path.is_symlink()
         before = path.readlink()
         link = SlcanSerialLink(str(path))
@@ -124,7 +128,7 @@ def test_the_cable_comes_out_and_back(tmp_path, fault):
 def test_what_a_reset_cuts_off_is_no_bad_line(tmp_path):
     """A client that opens again has left before the adapter refuses to close."""
     faults = spoilt("merged=1@0+.1,reset@.1+.1")
-    with Emulator([make_recording(100)], loop=True, faults=faults) as emulator:
+    with FaultyEmulator([make_recording(100)], loop=True, faults=faults) as emulator:
         link = SlcanSerialLink(emulator.port)
         with link:
             read_for(link, 0.4)
@@ -140,7 +144,7 @@ def test_what_a_reset_cuts_off_is_no_bad_line(tmp_path):
 
 def test_an_adapter_that_was_reset_is_silent_until_it_is_opened_again(tmp_path):
     faults = spoilt("reset@.1+.1")
-    with Emulator([make_recording(100)], loop=True, faults=faults) as emulator:
+    with FaultyEmulator([make_recording(100)], loop=True, faults=faults) as emulator:
         link = SlcanSerialLink(emulator.port)
         with link:
             read_for(link, 0.4)
@@ -153,7 +157,7 @@ def test_an_adapter_that_was_reset_is_silent_until_it_is_opened_again(tmp_path):
 
 def test_the_emulator_tells_the_truth_on_disk(tmp_path):
     recording = write_recording(tmp_path / "played.csv", make_recording(20).tracks[0].counts, rate_hz=100)
-    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--faults", "lost=.5@0+1", "--seed", "3"]
+    command = [sys.executable, str(ROOT / "tests/system/fault_emulator.py"), "--faults", "lost=.5@0+1", "--seed", "3"]
     command += ["--truth", str(tmp_path / "truth"), "--link", str(tmp_path / "port"), str(recording)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True
@@ -169,12 +173,13 @@ def test_the_emulator_tells_the_truth_on_disk(tmp_path):
 
 
 def test_the_emulator_refuses_faults_that_cannot_be(tmp_path, capsys):
-    from firmware_bridge.emulation.slcan_main import main as emulate
-
     recording = write_recording(tmp_path / "played.csv", make_recording(20).tracks[0].counts, rate_hz=100)
     with pytest.raises(SystemExit):
         emulate(["--faults", "loss@1+1", str(recording)])
     assert "expected one of: lost" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        emulate(["--truth", "/proc/x", str(recording)])
+    assert "/proc/x: cannot be written: No such file" in capsys.readouterr().err
 
 
 def test_what_came_behind_the_last_record_is_in_the_summary():

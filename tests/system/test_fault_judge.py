@@ -4,8 +4,8 @@ import pytest
 from fault_accounts import CONSISTENT, EQUAL, accounts
 from fault_forged import ALL, Forged, differing
 from fault_page import vanished_scans
+from fault_truth import FATES
 
-from firmware_bridge.emulation.faults.truth import FATES
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 

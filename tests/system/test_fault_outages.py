@@ -6,14 +6,13 @@ import orjson
 import pytest
 from fault_forged import ALL, Forged, outage
 from fault_judge import judge
+from fault_log import Told
 from fault_outages import seconds_to_use
 from fault_page import promises, show, show_server
 from fault_played import telling_counts
 from fault_records import Ran, Seen, Size, read_record
 from fault_server import ServerRan, judge_server
-
-from firmware_bridge.emulation.fault_log import FaultLog
-from firmware_bridge.emulation.faults.stretches import LINK_FAULTS
+from fault_stretches import LINK_FAULTS
 
 
 def test_the_time_until_a_link_is_used_again():
@@ -79,7 +78,7 @@ def test_every_promise_can_be_broken():
     assert kept == [False] * 10
 
 
-def unkept(ran: Ran, told: FaultLog) -> list[str]:
+def unkept(ran: Ran, told: Told) -> list[str]:
     return [promise.text.split(",")[0] for promise in promises(ran, judge(ran.seen, told), told) if not promise.kept]
 
 

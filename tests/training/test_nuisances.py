@@ -8,7 +8,7 @@ import pytest
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from train.physics.hysteresis import frame_weights, maxwell
+from train.physics.hysteresis import frame_weights
 from train.physics.sensor_noise import (
     LARGEST_COUNTS,
     NAMES,
@@ -220,6 +220,17 @@ def test_a_torn_scan_leaves_what_is_not_stale_as_it_was():
     assert np.abs(with_torn[:, :, 1:] - expected).max() <= 1
 
 
+def maxwell(readings, time_s, share, relaxation_s):
+    """Apply hysteresis step by step; the update is exact for readings linear in time, and q begins in equilibrium."""
+    steps = np.maximum(np.diff(time_s) / relaxation_s, 1e-12)
+    keep, mean = np.exp(-steps), -np.expm1(-steps) / steps
+    lagging = np.array(readings, dtype=np.float64)
+    for now in range(1, len(lagging)):
+        k, m = keep[now - 1], mean[now - 1]
+        lagging[now] = k * lagging[now - 1] + (m - k) * readings[now - 1] + (1 - m) * readings[now]
+    return (1 - share) * readings + share * lagging
+
+
 @pytest.mark.parametrize("relaxation", [1e-9, 0.05, 1.0, 30.0, 1e9])
 def test_closed_form_and_steps_are_the_same_hysteresis(relaxation):
     rng = np.random.default_rng(0)
@@ -336,8 +347,6 @@ def test_nuisances_are_switched_by_name():
         (lambda: apply_nuisances(presses(), NONE, 0, tap_s=0.0), "taps last 0 to 0 s"),
         (lambda: apply_nuisances(presses(), NONE, 0, tap_s=[1.0, 2.0]), r"tap_s has shape \(2,\), .* \(5, 3\)"),
         (lambda: read_windows(presses(), 1.1, NONE, 0), "1.1, expected 0 to 1"),
-        (lambda: maxwell(np.zeros(3), np.array([0.0, 1.0, 1.0]), 0.1, 1.0), "ascending"),
-        (lambda: maxwell(np.zeros(3), np.arange(3), 0.1, 0.0), "relaxation 0.0 s"),
     ],
 )
 def test_a_mistake_is_told_in_one_line(mistake, words):

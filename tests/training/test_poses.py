@@ -5,13 +5,11 @@ from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import (
     HELD_OUT_RADIUS_MM,
-    PAPER_ANGLES_DEG,
     POSITION_STEP_MM,
     REACH_MM,
     TARGET_ANGLES_DEG,
     as_poses,
     paper_targets,
-    position_and_angle,
     position_mm,
     positions_of,
     random_targets,
@@ -27,14 +25,6 @@ def test_the_nine_positions_are_a_grid_from_the_top_left():
     for wrong in (-1, 9):
         with pytest.raises(ValueError, match="expected 0 to 8"):
             position_mm(wrong)
-
-
-def test_a_record_is_position_times_nine_plus_rotation():
-    pairs = [position_and_angle(record) for record in range(81)]
-    assert pairs == [(position, angle) for position in range(9) for angle in PAPER_ANGLES_DEG]
-    for wrong in (-1, 81):
-        with pytest.raises(ValueError, match="expected 0 to 80"):
-            position_and_angle(wrong)
 
 
 def test_splits_by_position_share_nothing_and_have_the_papers_sizes():
@@ -57,7 +47,7 @@ def test_every_k_has_the_same_targets_and_each_tap_is_turned_back_one_more_step(
     assert (np.diff(seven[..., :2], axis=1) == 0).all()
     # The paper's own sequence: its 30 deg pose follows 25, 20, ..., 0.
     at_30 = seven[seven[:, 0, 2] == 30][0, :, 2]
-    assert at_30.tolist() == list(PAPER_ANGLES_DEG[:7])[::-1]
+    assert at_30.tolist() == [30, 25, 20, 15, 10, 5, 0]
     assert (np.diff(turned_back(targets, 2, 20.0)[..., 2], axis=1) == -20).all()
 
 

@@ -17,7 +17,7 @@ from train.errors import TrainError
 from train.experiments.support.workbench import Workbench
 
 EXPERIMENTS: Final = {
-    "families": "the shipped model on every family of shapes, next to baselines",
+    "families": "the shipped model on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
@@ -29,16 +29,16 @@ EXPERIMENTS: Final = {
     "force": "error by contact force",
     "force-recovery": "force through press, hold and release",
     "unseen": "surfaces that were not trained on",
-    "real": "real grips: shape of faces, and fit of patterns to readings",
+    "real": "real grips: shape of faces, patterns against readings",
     "robust": "error against the severity of nuisances",
     "dead": "dead taxels, detected and undetected",
-    "identify": "gains and constants of a sensor from its own contacts",
+    "gains-from-contacts": "gains and constants of a sensor from its own contacts",
     "zeroing": "drift followed, holds not absorbed",
     "calibration": "coverage of the deviations",
-    "confidence": "expected error and early stop against the true error",
+    "confidence": "expected error and early stop against true error",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
-    "free_sides": "the pad with its free sides by FEM against the infinite layer",
+    "free_sides": "the pad's free sides by FEM against the infinite layer",
     "curved": "several PSFs by height against FEM",
     "psf_speed": "patterns a second of the PSF by FFT and direct",
 }
@@ -47,14 +47,11 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
-_FILES: Final = {"identify": "gains_from_contacts"}
-"""File names that differ from the experiment's: train.identify is the command of a user's own sensor."""
 
 
 def module_of(name: str) -> str:
     """Return the module of an experiment."""
-    file = _FILES.get(name, name.replace("-", "_"))
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{file}"
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -63,7 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m train.experiments",
         description=(__doc__ or "").splitlines()[0],
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="\n".join(f"  {name:15} {what}" for name, what in EXPERIMENTS.items()),
+        epilog="\n".join(f"  {name:19} {what}" for name, what in EXPERIMENTS.items()),
     )
     parser.add_argument(
         "names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="experiments, run in this order"

@@ -23,7 +23,10 @@ Z: Final = slice(AXES.index("z") * USPA44.taxel_count, (AXES.index("z") + 1) * U
 LEAST_COUNTS: Final = 200.0
 """Largest z of the weakest contact used: in weaker ones, drift is over a fifth of it."""
 _COMPONENTS: Final = 72
+"""Largest number of components; each needs twice as many presses as there are channels."""
 _ROUNDS: Final = 12
+_SEED: Final = 0
+"""Seed of the nuisances and of the components' initial centres."""
 _RIDGE: Final = 1e-4
 """Variance added on each channel: a hundredth of the mean z."""
 _MOST_BYTES: Final = 1 << 26
@@ -104,40 +107,33 @@ def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
     return flat / np.maximum(scale, 1.0), usable
 
 
-def fit_mixture(
-    presses: PressSet, seed: int = 0, components: int = _COMPONENTS, rounds: int = _ROUNDS
-) -> ContactMixture:
+def fit_mixture(presses: PressSet) -> ContactMixture:
     """Fit the mixture by expectation-maximisation to presses read by sensors with even gains.
 
     Args:
         presses: of many pads; the newest press of each sequence is used.
-        seed: of the nuisances and of the components' initial centres.
-        components: largest number; each needs twice as many presses as there are channels.
-        rounds: number of expectation-maximisation rounds.
 
     Raises:
         DatasetError: too few presses for one component.
     """
     nuisances = Nuisances().without("gain_spread")
-    contacts, usable = normalise(read_windows(presses.counts[:, :1, None], 1.0, nuisances, seed)[:, 0])
+    contacts, usable = normalise(read_windows(presses.counts[:, :1, None], 1.0, nuisances, _SEED)[:, 0])
     contacts, design = contacts[usable], np.insert(presses.constants[usable].astype(np.float64), 0, 1.0, axis=1)
-    components = min(components, len(contacts) // (2 * CHANNELS))
+    components = min(_COMPONENTS, len(contacts) // (2 * CHANNELS))
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
-    rng = np.random.default_rng(seed)
-    mixture = _fitted(contacts, design, _nearest(contacts, rng, components, rounds))
-    for _ in range(rounds):
+    rng = np.random.default_rng(_SEED)
+    mixture = _fitted(contacts, design, _nearest(contacts, rng, components))
+    for _ in range(_ROUNDS):
         mixture = _fitted(contacts, design, _given_constants(mixture, contacts, design))
     return mixture
 
 
-def _nearest(
-    contacts: NDArray[np.float64], rng: np.random.Generator, components: int, rounds: int
-) -> NDArray[np.float64]:
+def _nearest(contacts: NDArray[np.float64], rng: np.random.Generator, components: int) -> NDArray[np.float64]:
     """Return weights (n, k), each 0 or 1, of k means."""
     weights = np.zeros((len(contacts), components))
     centres = contacts[rng.choice(len(contacts), components, replace=False)]
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         nearest = (-2 * contacts @ centres.T + (centres**2).sum(axis=1)).argmin(axis=1)
         weights = (nearest[:, None] == np.arange(components)).astype(np.float64)
         centres = weights.T @ contacts / np.maximum(weights.sum(axis=0), 1.0)[:, None]

@@ -3,7 +3,7 @@
 A deviation becomes an interval as that of a Laplace density, which the networks are trained with: errors of patterns
 are mostly small and occasionally large. At 90 % that is 1.63 deviations; a Gaussian's 1.64 is nearly the same. The
 factor is an empirical quantile, so that level is correct on the data of the calibration for any density of the errors;
-the other levels are as accurate as the Laplace density, which `coverages` shows.
+the other levels are as accurate as the Laplace density.
 """
 
 from math import log, sqrt
@@ -35,11 +35,6 @@ def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike
     """
     _errors(truth, pattern, deviation)
     return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation, level)).mean())
-
-
-def coverages(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, levels: ArrayLike) -> NDArray[np.float64]:
-    """Return the share of pixels covered at each of the levels, (m,); equal shares and levels are perfect."""
-    return np.array([interval_coverage(truth, pattern, deviation, float(level)) for level in np.ravel(levels)])
 
 
 def calibrate(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:

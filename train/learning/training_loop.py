@@ -38,6 +38,8 @@ Batches = Callable[[int], Batch]
 Course = list[dict[str, float]]
 """Validation figures at some steps of a training."""
 
+_VALIDATIONS: Final = 5
+"""Number of validations over a run."""
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
@@ -193,7 +195,6 @@ def train(
     identity: str = "",
     log_folder: Path | None = None,
     validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
-    validations: int = 5,
 ) -> Trained:
     """Train a network in place; an interrupted run resumes when this is called again.
 
@@ -206,7 +207,6 @@ def train(
         identity: of network and data; an interrupted run resumes only with the same identity.
         log_folder: for TensorBoard, or None.
         validate: returns figures to log and to keep, of the network in evaluation mode.
-        validations: number of validations over the run.
 
     The state at `resume_path` is left there: the caller deletes it when the result is safe.
 
@@ -227,7 +227,7 @@ def train(
     wait_for_all()  # the first process to finish may delete the state
     clock = _Clock(recipe, spent_s)
     logged = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None)
-    check_at = {round(recipe.steps * (i + 1) / validations) for i in range(validations)} if validate else set()
+    check_at = {round(recipe.steps * (i + 1) / _VALIDATIONS) for i in range(_VALIDATIONS)} if validate else set()
     loss = torch.inf
     with closing(logged) as log, closing(drawn_ahead(batches, step, recipe.steps)) as drawn:
         while (progress := clock.progress(step)) < 1:

@@ -196,13 +196,10 @@ class CompactNet(PatternNet):
 class HeteroscedasticError:
     """Objective of a network that predicts a pattern and its deviation: see `heteroscedastic_loss`."""
 
-    def __init__(self, beta: float = 1.0) -> None:
-        self._beta = beta
-
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
         """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
         pattern, deviation, traction = net(batch.window, batch.pad)
-        loss = heteroscedastic_loss(pattern, deviation, batch.pattern, self._beta)
+        loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.traction is not None:
             size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)
             loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()

@@ -18,6 +18,10 @@ from train.networks.srcnn import TactileSRCNN
 
 _CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
+_PENALTY: Final = 10.0
+"""Weight of the discriminator's gradient penalty."""
+_CRITIC_STEPS: Final = 2
+"""Steps of the discriminator to one of the network."""
 _TINY: Final = 1e-12
 
 
@@ -51,8 +55,6 @@ class SrganObjective:
     Args:
         device: of the network.
         adversarial_share: weight of the discriminator's score relative to the error.
-        penalty: weight of the discriminator's gradient penalty.
-        critic_steps: steps of the discriminator to one of the network.
         learning_rate: of the discriminator's Adam.
         seed: of the discriminator's weights and of the points where the penalty is evaluated.
 
@@ -63,8 +65,6 @@ class SrganObjective:
         self,
         device: torch.device | str = "cpu",
         adversarial_share: float = 1e-3,
-        penalty: float = 10.0,
-        critic_steps: int = 2,
         learning_rate: float = 1e-4,
         seed: int = 0,
     ) -> None:
@@ -72,7 +72,7 @@ class SrganObjective:
             torch.manual_seed(seed)
             self.critic = Discriminator().to(device)
         self._optimizer = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, betas=(0.0, 0.9))
-        self._adversarial_share, self._penalty, self._critic_steps = adversarial_share, penalty, critic_steps
+        self._adversarial_share = adversarial_share
         self._rng = torch.Generator().manual_seed(seed)
         self._seen: tuple[Tensor, Tensor] | None = None
 
@@ -89,7 +89,7 @@ class SrganObjective:
         if self._seen is None:
             return
         self.critic.requires_grad_(True)
-        for _ in range(self._critic_steps):
+        for _ in range(_CRITIC_STEPS):
             self._optimizer.zero_grad()
             self.critic_loss(*self._seen).backward()
             _average_gradients(self.critic)
@@ -103,7 +103,7 @@ class SrganObjective:
         (slope,) = torch.autograd.grad(self.critic(between).sum(), between, create_graph=True)
         steepness = (slope.square().sum(dim=(1, 2)) + _TINY).sqrt()  # keeps the slope of the root finite at 0
         penalty = (steepness - 1).square().mean()
-        return self.critic(false).mean() - self.critic(true).mean() + self._penalty * penalty
+        return self.critic(false).mean() - self.critic(true).mean() + _PENALTY * penalty
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the discriminator, its optimizer, and the random draws."""

@@ -29,6 +29,8 @@ _WIDTHS: Final = (256, 1024, 256)
 _SMALLEST: Final = 1e-6
 """Least length: softplus of a very negative number is 0, and the lengths are divisors."""
 _GAMMA_START: Final = 0.8
+_RATE: Final = 1e-3
+"""Learning rate of Adam; it falls to nothing on a half cosine."""
 _GAMMA_HASTE: Final = 20.0
 """Learning rate of the single gamma over the network's.
 
@@ -192,7 +194,6 @@ def fit_psf_net(
     *,
     epochs: int = 100,
     batch: int = 64,
-    rate: float = 1e-3,
     seed: int = 0,
 ) -> list[float]:
     """Train the network on scans and their depth images, and return the loss of every epoch.
@@ -204,7 +205,6 @@ def fit_psf_net(
         indentation_mm: (n,), in [mm], or None; sets k_scale.
         epochs: passes over the scans.
         batch: scans in a step.
-        rate: Adam's learning rate; it falls to nothing on a half cosine.
         seed: of the weights and of the order of the scans.
 
     Raises:
@@ -220,8 +220,8 @@ def fit_psf_net(
                 layer.reset_parameters()
     order = torch.Generator().manual_seed(seed)
     lone = [] if net.gamma is None else [net.gamma]
-    groups = [{"params": net.layers.parameters()}, {"params": lone, "lr": _GAMMA_HASTE * rate}]
-    optimizer = torch.optim.Adam(groups, rate)
+    groups = [{"params": net.layers.parameters()}, {"params": lone, "lr": _GAMMA_HASTE * _RATE}]
+    optimizer = torch.optim.Adam(groups, _RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)
     losses: list[float] = []
     for _ in tracked(range(epochs), "PSF network", "epoch"):

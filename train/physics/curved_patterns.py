@@ -27,14 +27,13 @@ def heights_pattern(
     pixel_mm: float,
     planes: int = PLANES,
     beta_mm: float = BETA_MM,
-    edge_beta_mm: float = EDGE_BETA_MM,
     kernel: Kernel = "gaussian",
 ) -> NDArray[np.float32]:
     """Return the surface deformation under rigid surfaces of any shape, (n, H, W) in [mm].
 
     The planes divide the indentation into equal slices; only planes with touching pixels are computed. A plane at a
     share s of the indentation has an alpha that would lift the whole contact to that height, and a beta between
-    edge_beta_mm, at s = 0, and beta_mm, at s = 1.
+    EDGE_BETA_MM, at s = 0, and beta_mm, at s = 1.
 
     Args:
         depth_mm: (n, H, W), depth of each pixel below the highest point, in [mm].
@@ -43,7 +42,6 @@ def heights_pattern(
         pixel_mm: pixel size, in [mm].
         planes: largest number of planes, at least 1.
         beta_mm: reach of the kernel of a plane at the top, > 0, in [mm].
-        edge_beta_mm: reach of the kernel of a plane that just touches, > 0, in [mm].
         kernel: see `train.physics.tpsf.spread`.
 
     Raises:
@@ -69,7 +67,7 @@ def heights_pattern(
             continue
         slices = members[taps].float()
         height = (share[taps] * slices).sum(dim=(1, 2)) / slices.sum(dim=(1, 2))
-        beta = beta_mm + (edge_beta_mm - beta_mm) * (1.0 - height)
+        beta = beta_mm + (EDGE_BETA_MM - beta_mm) * (1.0 - height)
         full = spread(area[taps].float(), beta, pixel_mm, kernel).amax(dim=(1, 2))
         around[taps] += (height / full)[:, None, None] * spread(slices, beta, pixel_mm, kernel)
     return (total_mm * torch.where(area, share, around)).numpy()

@@ -58,17 +58,14 @@ class Verdict:
     run_s: NDArray[np.float32]
 
 
-def press_or_recall(
-    surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path, pose: Pose = CENTRE
-) -> Verdict:
-    """Press a surface into the finite elements, or load the kept result.
+def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path) -> Verdict:
+    """Press a surface into the middle of the finite elements, or load the kept result.
 
     Args:
         surface: its name.
         mesh: fineness of the elements.
         indentation_mm: (s,), rising, in [mm].
         folder: where results are kept, made if absent.
-        pose: where the pad taps.
 
     Raises:
         NoEquilibriumError: a step did not converge.
@@ -79,7 +76,7 @@ def press_or_recall(
         "edition": _EDITION,
         "surface": surface,
         "mesh": mesh,
-        "pose": asdict(pose),
+        "pose": asdict(CENTRE),
         "indentation_mm": np.round(indentation_mm, 6).tolist(),
         "layer": asdict(layer),
         "c2_share": C2_SHARE,
@@ -88,7 +85,7 @@ def press_or_recall(
     path = folder / f"fem-{hashlib.sha256(json.dumps(question).encode()).hexdigest()[:16]}.npz"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        _keep(path, _work_out(surface, mesh, indentation_mm, pose, layer))
+        _keep(path, _work_out(surface, mesh, indentation_mm, layer))
     with np.load(path, allow_pickle=False) as kept:
         return Verdict(kept["patterns_mm"].astype(np.float32), *(kept[name] for name in _FIGURES))
 
@@ -103,11 +100,11 @@ LAYER: Final = replace(Layer(), poisson=REFERENCE_POISSON)
 _FIGURES: Final = ("force_n", "newton_steps", "residual", "run_s")
 
 
-def _work_out(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], pose: Pose, layer: Layer) -> Verdict:
+def _work_out(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], layer: Layer) -> Verdict:
     from train.physics.fem_reference import FemPad  # here, because kept results need no FElupe
 
     pad = FemPad(*mesh, layer)
-    presses = pad.press(depth_image(relief(surface), pose, pad.size, pad.cell_mm), indentation_mm)
+    presses = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
     return Verdict(
         pad.pattern(presses.displacement_mm, SCALE),
         presses.force_n.astype(np.float32),

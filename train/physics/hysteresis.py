@@ -1,6 +1,8 @@
 """Hysteresis: a share of every reading lags, as in a spring parallel to one Maxwell element.
 
-Two routes to the same readings: step by step over any course of time, and in closed form for any moment of a press.
+With c the elastic reading, a reading is (1 - share) c + share q with dq/dt = (c - q) / relaxation_s.
+
+Source: the standard linear solid, a spring parallel to one Maxwell element.
 """
 
 from typing import Final
@@ -18,38 +20,6 @@ class NuisanceError(TrainError, ValueError):
     """Invalid nuisances, or readings that they cannot act on."""
 
 
-def maxwell(
-    readings: NDArray[np.floating], time_s: NDArray[np.floating], share: float, relaxation_s: float
-) -> NDArray[np.float64]:
-    """Apply hysteresis over any course of time: (1 - share) c + share q, with dq/dt = (c - q) / relaxation_s.
-
-    The update is exact for readings linear in time, and so stable for any step; q starts in equilibrium.
-
-    Args:
-        readings: c, (t, ...).
-        time_s: of the readings, (t,), ascending, in [s].
-        share: lagging share, 0 to 1.
-        relaxation_s: above 0, in [s].
-
-    Raises:
-        NuisanceError: one of these is out of range.
-
-    Source: the standard linear solid, a spring parallel to one Maxwell element.
-    """
-    step_s = np.diff(time_s)
-    if len(time_s) != len(readings) or not len(time_s) or not (step_s > 0).all():
-        raise NuisanceError(f"{len(time_s)} times for {len(readings)} readings: expected one each, ascending")
-    if not (0 <= share <= 1 and relaxation_s > 0):
-        raise NuisanceError(f"share is {share}, relaxation {relaxation_s} s: expected 0 to 1, and above 0")
-    steps = np.maximum(step_s / relaxation_s, 1e-12)
-    keep, mean = np.exp(-steps), -np.expm1(-steps) / steps
-    lagging = np.array(readings, dtype=np.float64)
-    for now in range(1, len(lagging)):
-        k, m = keep[now - 1], mean[now - 1]
-        lagging[now] = k * lagging[now - 1] + (m - k) * readings[now - 1] + (1 - m) * readings[now]
-    return (1 - share) * readings + share * lagging
-
-
 def frame_weights(
     frame: NDArray[np.float64],
     frames: int,
@@ -57,7 +27,7 @@ def frame_weights(
     share: NDArray[np.float64],
     relaxation_s: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the weight of each frame of a press in a reading at any moment of it, `maxwell` in closed form.
+    """Return the weight of each frame of a press in a reading at any moment of it, in closed form.
 
     Readings are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second
     difference of the responses to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).

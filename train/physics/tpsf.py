@@ -64,7 +64,6 @@ def tpsf(
     pixel_mm: float,
     kernel: Kernel = "gaussian",
     plateau: Plateau = "response",
-    touching: Tensor | None = None,
 ) -> Tensor:
     """Return HR patterns (n, H, W) of depth images, in alpha's unit times [mm^2], differentiable in alpha and beta.
 
@@ -77,7 +76,6 @@ def tpsf(
         plateau: value in the contact: "response", the largest response anywhere, as printed in Eq. 6;
             "outside", the largest outside the contact, as in the authors' code (anywhere, if all of the face
             touches); "none", no plateau: the plain PSF.
-        touching: (n, H, W) bool; by default where depth is at least 0.5.
 
     Raises:
         ValueError: the kernel or the plateau is unknown, or beta is not positive.
@@ -85,8 +83,7 @@ def tpsf(
     Source: Wu and Liu 2024, Eq. 4-6.
     """
     response = alpha[:, None, None] * spread(depth, beta_mm, pixel_mm, kernel)
-    if touching is None:
-        touching = depth >= 0.5
+    touching = depth >= 0.5
     level = _level(response, touching, plateau)
     return response if plateau == "none" else torch.where(touching, level, response)
 

@@ -18,7 +18,6 @@ from train.surfaces.named_surfaces import SURFACES
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7
 POSITIONS: Final = 9
-PAPER_ANGLES_DEG: Final = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 60.0, 90.0)
 TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
 POSITION_STEP_MM: Final = 2.5
 TEST_POSITION: Final = 0
@@ -60,20 +59,6 @@ def position_mm(index: int) -> tuple[float, float]:
     if not 0 <= index < POSITIONS:
         raise ValueError(f"position {index}: expected 0 to {POSITIONS - 1}")
     return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
-
-
-def position_and_angle(record: int) -> tuple[int, float]:
-    """Return position and angle in [deg] of one of the paper's 81 records of a surface.
-
-    Raises:
-        ValueError: not one of the 81.
-
-    Source: Wu and Liu 2024, Fig. 1 and the order of the records in their files.
-    """
-    if not 0 <= record < POSITIONS * len(PAPER_ANGLES_DEG):
-        raise ValueError(f"record {record}: expected 0 to {POSITIONS * len(PAPER_ANGLES_DEG) - 1}")
-    position, rotation = divmod(record, len(PAPER_ANGLES_DEG))
-    return position, PAPER_ANGLES_DEG[rotation]
 
 
 def positions_of(split: Split) -> tuple[int, ...]:

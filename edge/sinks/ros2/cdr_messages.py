@@ -1,11 +1,11 @@
 """Encoding of results and events as ROS 2 messages, of the usual types where one fits, else of our own. No I/O.
 
-The texts of sensor_msgs, geometry_msgs, std_msgs, builtin_interfaces and rcl_interfaces are those of ROS 2's interface
-definitions (Apache-2.0), without their comments. A value that is not available is NaN, never made up.
+The texts of sensor_msgs, geometry_msgs, diagnostic_msgs, std_msgs, builtin_interfaces and rcl_interfaces are those of
+ROS 2's interface definitions (Apache-2.0), without their comments. A value that is not available is NaN, never made up.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from edge.perception.event import Event, EventKind
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
+from edge.sinks.ros2.diagnostics import Diagnosis
 from firmware_bridge.recording.cdr import STD_HEADER, TIME, MessageType, stamp
 
 IMAGE: Final = MessageType(
@@ -37,6 +38,18 @@ LOG: Final = MessageType(
     "rcl_interfaces/msg/Log",
     "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line",
     TIME,
+)
+STRING: Final = MessageType("std_msgs/msg/String", "string data")
+_KEY_VALUE: Final = MessageType("diagnostic_msgs/msg/KeyValue", "string key\nstring value")
+_DIAGNOSTIC_STATUS: Final = MessageType(
+    "diagnostic_msgs/msg/DiagnosticStatus",
+    "byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values",
+    _KEY_VALUE,
+)
+DIAGNOSTIC_ARRAY: Final = MessageType(
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status",
+    *(STD_HEADER, _DIAGNOSTIC_STATUS),
 )
 _FIELDS: Final = tuple(field for field in FIELDS if Out.ROS in field.out)
 _NAMES: Final = tuple(name for field in _FIELDS for name in field.names)
@@ -90,7 +103,7 @@ def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
     height, width = pixels.shape[:2]
     return IMAGE.encode(
         {
-            "header": {"stamp": stamp(unix_ns), "frame_id": frame},
+            "header": _header(frame, unix_ns),
             "height": height,
             "width": width,
             "encoding": "32FC1" if values.ndim == 2 else "32FC3",
@@ -122,17 +135,36 @@ def wrench(result: Result, unix_ns: int) -> bytes | None:
     known = force_and_torque(result)
     if known is None:
         return None
-    header = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
-    force, torque = (dict(zip("xyz", vector, strict=True)) for vector in known)
-    return WRENCH_STAMPED.encode({"header": header, "wrench": {"force": force, "torque": torque}})
+    return wrench_message(*known, frame_of(result), unix_ns)
+
+
+def wrench_message(force_n: Vector, torque_n_m: Vector, frame: str, unix_ns: int) -> bytes:
+    """Return a force in [N] and a torque in [N m] as a message."""
+    force, torque = (dict(zip("xyz", vector, strict=True)) for vector in (force_n, torque_n_m))
+    return WRENCH_STAMPED.encode({"header": _header(frame, unix_ns), "wrench": {"force": force, "torque": torque}})
 
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
     """Return a result without its maps as a message; `record` is its record from edge.sinks.json_encoding."""
     values = dict(zip(_NAMES, _COLUMNS.flat(result), strict=True))
-    values["header"] = {"stamp": stamp(unix_ns), "frame_id": frame_of(result)}
+    values["header"] = _header(frame_of(result), unix_ns)
     values["record"] = orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode()
     return RESULT.encode(values)
+
+
+def diagnostics_message(statuses: Iterable[tuple[str, str, Diagnosis]], unix_ns: int) -> bytes:
+    """Return the states of sensors, each with its name and its sensor, as a message."""
+    status = [
+        {
+            "level": said.level,
+            "name": name,
+            "message": said.text,
+            "hardware_id": sensor,
+            "values": [{"key": key, "value": value} for key, value in said.values.items()],
+        }
+        for name, sensor, said in statuses
+    ]
+    return DIAGNOSTIC_ARRAY.encode({"header": _header("", unix_ns), "status": status})
 
 
 def log_message(event: Event, unix_ns: int) -> bytes:
@@ -148,3 +180,7 @@ def log_message(event: Event, unix_ns: int) -> bytes:
             "line": 0,
         }
     )
+
+
+def _header(frame: str, unix_ns: int) -> dict[str, Any]:
+    return {"stamp": stamp(unix_ns), "frame_id": frame}

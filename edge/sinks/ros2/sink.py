@@ -5,12 +5,11 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import orjson
 from cyclonedds.core import DDSException
-from cyclonedds.idl import IdlStruct
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
@@ -21,23 +20,23 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import event_record
-from edge.sinks.ros2.cdr_messages import Vector, force_and_torque, frame_of
-from edge.sinks.ros2.dds_domain import join
-from edge.sinks.ros2.dds_types import (
-    TYPE_HASHES,
-    DiagnosticArray,
-    DiagnosticStatus,
-    Header,
-    Image,
-    KeyValue,
-    String,
-    Time,
-    Vector3,
-    Wrench,
-    WrenchStamped,
+from edge.sinks.ros2.cdr_messages import (
+    DIAGNOSTIC_ARRAY,
+    IMAGE,
+    STRING,
+    WRENCH_STAMPED,
+    Vector,
+    diagnostics_message,
+    force_and_torque,
+    frame_of,
+    image,
+    wrench_message,
 )
+from edge.sinks.ros2.dds_domain import join
+from edge.sinks.ros2.dds_types import TYPE_HASHES, dds_type
 from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose
 from edge.sinks.ros2.topic_names import base_topic, sensor_topic
+from firmware_bridge.recording.cdr import MessageType
 
 DIAGNOSTICS_S: Final = 1.0
 _DIAGNOSTICS_TOPIC: Final = "diagnostics"
@@ -46,7 +45,7 @@ _EVENTS_KEPT: Final = 100
 _UNKNOWN: Final = math.nan
 _VECTOR_UNKNOWN: Final = (_UNKNOWN, _UNKNOWN, _UNKNOWN)
 _OUTAGES: Final = ("lost", "silent")
-_Message = TypeVar("_Message", bound=IdlStruct)
+_Writer = DataWriter[Any]
 
 
 @dataclass(slots=True)
@@ -59,12 +58,12 @@ class _Sensor:
         trouble: what the link has reported and not withdrawn, by the kind of event.
     """
 
-    pattern: "DataWriter[Image]"
-    deviation: "DataWriter[Image]"
+    pattern: _Writer
+    deviation: _Writer
     frame: str
     last: Result
-    shown: "dict[DataWriter[Image], tuple[int, ...]]" = field(default_factory=dict)
-    wrench: "DataWriter[WrenchStamped] | None" = None
+    shown: dict[_Writer, tuple[int, ...]] = field(default_factory=dict)
+    wrench: _Writer | None = None
     force_shown: bool = False
     trouble: dict[str, str] = field(default_factory=dict)
 
@@ -111,8 +110,8 @@ class Ros2Sink(Sink):
         self._counters_before: Mapping[str, int] = {}
         self._diagnosed_ns = clock_ns()
         self._domain, self._participant = join(environment)
-        self._diagnostics = self._writer(_DIAGNOSTICS_TOPIC, DiagnosticArray)
-        self._events = self._writer(f"{self._base}/events", String, _EVENTS_KEPT)
+        self._diagnostics = self._writer(_DIAGNOSTICS_TOPIC, DIAGNOSTIC_ARRAY)
+        self._events = self._writer(f"{self._base}/events", STRING, _EVENTS_KEPT)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Publish one result: its pattern if it has one, and its force if that is available in newtons.
@@ -146,7 +145,7 @@ class Ros2Sink(Sink):
         """Publish an event; values that an outage makes unknown are published as NaN."""
         self._counters = counters
         for name, sensor in self._sensors.items():
-            if event.sensor not in (None, name):
+            if event.sensor not in (None, name) or not name.startswith(event.sensors):
                 continue
             if event.kind in _OUTAGES:
                 self._withdraw_all(sensor, event.time_ns)
@@ -173,53 +172,43 @@ class Ros2Sink(Sink):
     def _begin(self, result: Result) -> _Sensor:
         name = result.scan.sensor
         return _Sensor(
-            pattern=self._writer(sensor_topic(self._base, name, "pattern"), Image),
-            deviation=self._writer(sensor_topic(self._base, name, "deviation"), Image),
+            pattern=self._writer(sensor_topic(self._base, name, "pattern"), IMAGE),
+            deviation=self._writer(sensor_topic(self._base, name, "deviation"), IMAGE),
             frame=frame_of(result),
             last=result,
         )
 
-    def _writer(self, topic: str, kind: type[_Message], depth: int = 1) -> "DataWriter[_Message]":
+    def _writer(self, topic: str, kind: MessageType, depth: int = 1) -> _Writer:
         qos = Qos(
             Policy.Reliability.Reliable(max_blocking_time=0),
             Policy.Durability.Volatile,
             Policy.History.KeepLast(depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.Userdata(f"typehash=RIHS01_{TYPE_HASHES[kind]};".encode()),
+            Policy.Userdata(f"typehash=RIHS01_{TYPE_HASHES[kind.name]};".encode()),
         )
         try:
-            return DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), qos)
+            return DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", dds_type(kind)), qos)
         except DDSException as error:
             raise SinkError(f"cannot publish on /{topic}: {error}") from error
 
-    def _publish(self, writer: "DataWriter[_Message]", message: _Message) -> None:
+    def _publish(self, writer: _Writer, message: bytes) -> None:
         try:
-            writer.write(message)
+            writer.write(writer.data_type(message))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise SinkError(f"cannot publish on {writer.topic.name.removeprefix('rt')}: {error}") from error
             self.unwritten += 1
 
-    def _header(self, time_ns: int, frame: str) -> Header:
-        sec, nanosec = divmod(time_ns + self._unix_offset_ns, 10**9)
-        return Header(Time(sec, nanosec), frame)
-
-    def _image(self, sensor: _Sensor, time_ns: int, values: NDArray[np.float32]) -> Image:
-        height, width = values.shape
-        pixels = np.ascontiguousarray(values, "<f4")
-        return Image(
-            self._header(time_ns, sensor.frame), height, width, "32FC1", 0, width * pixels.itemsize, pixels.tobytes()
-        )
-
-    def _show(self, sensor: _Sensor, writer: "DataWriter[Image]", time_ns: int, values: NDArray[np.float32]) -> None:
-        self._publish(writer, self._image(sensor, time_ns, values))
+    def _show(self, sensor: _Sensor, writer: _Writer, time_ns: int, values: NDArray[np.float32]) -> None:
+        self._publish(writer, image(values, sensor.frame, time_ns + self._unix_offset_ns))
         sensor.shown[writer] = values.shape
 
     def _withdraw(self, sensor: _Sensor, time_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold."""
         for writer, shape in sensor.shown.items():
             value = pattern_value if writer is sensor.pattern else _UNKNOWN
-            self._publish(writer, self._image(sensor, time_ns, np.full(shape, value, dtype=np.float32)))
+            values = np.full(shape, value, dtype=np.float32)
+            self._publish(writer, image(values, sensor.frame, time_ns + self._unix_offset_ns))
         sensor.shown.clear()
 
     def _withdraw_force(self, sensor: _Sensor, time_ns: int) -> None:
@@ -235,13 +224,14 @@ class Ros2Sink(Sink):
     def _publish_wrench(self, sensor: _Sensor, time_ns: int, force_n: Vector, torque_n_m: Vector) -> None:
         if sensor.wrench is None:
             topic = sensor_topic(self._base, sensor.last.scan.sensor, "wrench")
-            sensor.wrench = self._writer(topic, WrenchStamped)
-        wrench = Wrench(Vector3(*force_n), Vector3(*torque_n_m))
-        self._publish(sensor.wrench, WrenchStamped(self._header(time_ns, sensor.frame), wrench))
+            sensor.wrench = self._writer(topic, WRENCH_STAMPED)
+        unix_ns = time_ns + self._unix_offset_ns
+        self._publish(sensor.wrench, wrench_message(force_n, torque_n_m, sensor.frame, unix_ns))
         sensor.force_shown = True
 
     def _tell(self, event: Event) -> None:
-        self._publish(self._events, String(orjson.dumps(event_record(event, self._counters, self._source)).decode()))
+        text = orjson.dumps(event_record(event, self._counters, self._source)).decode()
+        self._publish(self._events, STRING.encode({"data": text}))
 
     def _diagnose_if_due(self) -> None:
         if self._clock_ns() - self._diagnosed_ns >= DIAGNOSTICS_S * 1e9:
@@ -254,18 +244,13 @@ class Ros2Sink(Sink):
             trouble = "; ".join(sensor.trouble.values()) or None
             silence_s = (now_ns - sensor.last.scan.time_ns) / 1e9 if self._of_now else None
             diagnosis = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
-            statuses.append(
-                self._status(name, Diagnosis(Level.STALE, "ended", diagnosis.values) if ended else diagnosis)
-            )
+            diagnosis = Diagnosis(Level.STALE, "ended", diagnosis.values) if ended else diagnosis
+            statuses.append((f"{self._base}: {name}", name, diagnosis))
         self._counters_before = self._counters
-        self._publish(self._diagnostics, DiagnosticArray(self._header(now_ns, ""), statuses))
+        self._publish(self._diagnostics, diagnostics_message(statuses, now_ns + self._unix_offset_ns))
 
     def _now_ns(self) -> int:
         """Return the time on the scans' clock; where that is of another time, the time of the newest scan."""
         if self._of_now:
             return self._clock_ns()
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
-
-    def _status(self, sensor: str, diagnosis: Diagnosis) -> DiagnosticStatus:
-        values = [KeyValue(key, value) for key, value in diagnosis.values.items()]
-        return DiagnosticStatus(int(diagnosis.level), f"{self._base}: {sensor}", diagnosis.text, sensor, values)

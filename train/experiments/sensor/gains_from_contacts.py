@@ -42,7 +42,7 @@ _EVEN_MPA: Final = 0.02
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `identify`.
+    """Write the report `gains-from-contacts`.
 
     Raises:
         DatasetError: presses cannot be made or read.
@@ -54,7 +54,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     mixture = mixture_beside(presses)
     name = "quick-sensors.npz" if bench.quick else "sensors.npz"
     sensors = make_presses(world, bench.data_folder / name)
-    report = Report("identify", folder, __file__, bench.used, quick=bench.quick)
+    report = Report("gains-from-contacts", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "A place's gain is that of its chip's axis, N(1, .075), times what its magnet's seat and moment do to z under "
         "an even load. Errors are of log-gains: in truth z's mean is 0, in the estimate each axis'. Intervals: 90 %. "

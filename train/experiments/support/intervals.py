@@ -33,9 +33,9 @@ class Intervals:
         """Return a mask (n, H, W), true where the truth lies within the interval."""
         return np.abs(self.truth - self.pattern) <= half_width_mm(self.deviation, level)
 
-    def width_percent(self, level: float = LEVEL) -> NDArray[np.floating]:
+    def width_percent(self) -> NDArray[np.floating]:
         """Return the width of the intervals, (n, H, W), in [% of the frame's indentation]."""
-        return 200 * half_width_mm(self.deviation, level) / self.frozen.indentation_mm[:, None, None]
+        return 200 * half_width_mm(self.deviation) / self.frozen.indentation_mm[:, None, None]
 
     def cells(self) -> Row:
         """Return coverage and mean width of the 90 % interval, each with its interval by tap, as cells of a row."""

@@ -35,13 +35,13 @@ class Inferred:
     run_time_us: float
 
 
-def load_shipped(folder: Path, name: str = DEFAULT_MODEL) -> ModelSession:
-    """Load the shipped model of that name.
+def load_shipped(folder: Path) -> ModelSession:
+    """Load the shipped model.
 
     Raises:
         ModelError: it does not exist, or cannot be used.
     """
-    return ModelSession(folder / f"{name}.onnx")
+    return ModelSession(folder / f"{DEFAULT_MODEL}.onnx")
 
 
 def known_pads(frozen: FrozenPresses, known: str) -> list[Pad | None]:

@@ -94,10 +94,10 @@ def all_sweeps(bench: Workbench, plain: FrozenSet) -> list[Sweep]:
     ]
 
 
-def with_dead_taxels(frozen: FrozenSet, dead: float, seed: int = SEED) -> FrozenSet:
+def with_dead_taxels(frozen: FrozenSet, dead: float) -> FrozenSet:
     """Return the set with exactly `dead` taxels at rest on each tap's sensor; fewer are a subset of more."""
     rows, cols = frozen.newest.shape[-2:]
-    rank = np.random.default_rng([seed, 1]).random((len(frozen.surface), rows * cols)).argsort(axis=1)
+    rank = np.random.default_rng([SEED, 1]).random((len(frozen.surface), rows * cols)).argsort(axis=1)
     alive = (rank >= dead).reshape(-1, rows, cols)
     return replace(
         frozen,
@@ -106,9 +106,9 @@ def with_dead_taxels(frozen: FrozenSet, dead: float, seed: int = SEED) -> Frozen
     )
 
 
-def with_lost_scans(frozen: FrozenSet, chance: float, seed: int = SEED) -> FrozenSet:
+def with_lost_scans(frozen: FrozenSet, chance: float) -> FrozenSet:
     """Return the set with random scans replaced by the scan before; the first frame of a tap is never lost."""
-    came = np.random.default_rng([seed, 2]).random(len(frozen)) >= chance
+    came = np.random.default_rng([SEED, 2]).random(len(frozen)) >= chance
     came |= np.diff(frozen.tap, prepend=-1) != 0
     latest = np.maximum.accumulate(np.where(came, np.arange(len(frozen)), 0))
     return replace(frozen, newest=frozen.newest[latest])

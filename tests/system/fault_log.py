@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+from fault_injector import Injector
+from fault_stretches import Stretch
+from fault_truth import ROW, Truth
 from numpy.typing import NDArray
-
-from firmware_bridge.emulation.faults.injector import Injector
-from firmware_bridge.emulation.faults.stretches import Stretch
-from firmware_bridge.emulation.faults.truth import ROW, Truth
 
 FRAMES: Final = "frames.bin"
 EVENTS: Final = "events.jsonl"
@@ -57,7 +56,7 @@ class TruthFiles:
         self._events.write(json.dumps(event) + "\n")
 
 
-class FaultLog(NamedTuple):
+class Told(NamedTuple):
     """Content of a folder: frames as ROW, in the order in which they were handed on; events; accounts."""
 
     frames: NDArray[Any]
@@ -65,9 +64,9 @@ class FaultLog(NamedTuple):
     accounts: dict[str, Any]
 
 
-def read_truth(folder: Path) -> FaultLog:
+def read_truth(folder: Path) -> Told:
     """Read the folder of an emulator that has ended."""
-    return FaultLog(
+    return Told(
         np.fromfile(folder / FRAMES, dtype=ROW),
         [json.loads(line) for line in (folder / EVENTS).read_text().splitlines()],
         json.loads((folder / ACCOUNTS).read_text()),

@@ -12,9 +12,9 @@ from itertools import takewhile
 from typing import Final
 
 import numpy as np
+from fault_frames import READ, BusFrame
+from fault_lines import LINE_ENDS, Piece
 
-from firmware_bridge.emulation.faults.frames import READ, BusFrame
-from firmware_bridge.emulation.faults.lines import LINE_ENDS, Piece
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 FATES: Final = (

@@ -5,13 +5,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+from fault_frames import FRAME_FAULTS, BusFrame, FrameFault
+from fault_frames import through as through_frame_faults
+from fault_lines import LINE_FAULTS, LineFault, Piece
+from fault_lines import through as through_line_faults
+from fault_stretches import BURSTS, RENAME, RESET, UNPLUG, Stretch
+from fault_truth import Truth
+
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.faults.frames import FRAME_FAULTS, BusFrame, FrameFault
-from firmware_bridge.emulation.faults.frames import through as through_frame_faults
-from firmware_bridge.emulation.faults.lines import LINE_FAULTS, LineFault, Piece
-from firmware_bridge.emulation.faults.lines import through as through_line_faults
-from firmware_bridge.emulation.faults.stretches import BURSTS, RENAME, RESET, UNPLUG, Stretch
-from firmware_bridge.emulation.faults.truth import Truth
 
 BURST_S = 0.016
 

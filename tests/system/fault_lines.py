@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from firmware_bridge.emulation.faults.frames import BusFrame, share
+from fault_frames import BusFrame, share
 
 LINE_ENDS: Final = b"\r\a"
 SHORTEST_NOISE: Final = 12

@@ -13,8 +13,8 @@ import random
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from firmware_bridge.emulation.faults.frames import FRAME_FAULTS
-from firmware_bridge.emulation.faults.lines import LINE_FAULTS
+from fault_frames import FRAME_FAULTS
+from fault_lines import LINE_FAULTS
 
 BURSTS: Final = "bursts"
 """Fault of an adapter that holds bytes back for 16 ms, the default of an FTDI chip."""

@@ -1,0 +1,158 @@
+"""Linear forward model of a sensor: readings that a pattern and its tangential traction make, and the way back.
+
+Made by train.trust from the simulated world, kept in the model's contract, in network units. It explains a contact
+only in part (`unexplained`), because pads, gains and large deformations differ; what it leaves is weighed by that.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.familiarity import QUIET_UNITS
+from edge.inference.small_network import packed, unpacked
+from firmware_bridge.pad_geometry import AXES
+
+GRID: Final = 8
+"""Cells of the pattern along a side: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
+_DRAG_GRID: Final = 4
+KPA: Final = 30.0
+"""Tangential traction that counts as 1, in [kPa]."""
+FEATURES: Final = GRID**2 + 2 * _DRAG_GRID**2
+_KEYS: Final = ("operator", "inverse", "spread", "noise", "model_error")
+
+
+@dataclass(frozen=True, slots=True)
+class ForwardModel:
+    """Operator from pattern and traction to the readings of a 4 x 4 sensor, linear in the pad's constants.
+
+    Attributes:
+        operator: (1 + p, 48, FEATURES), of the middle pad, then the change by one spread of each constant.
+        inverse: (GRID^2, 48), the smooth pattern of readings: the best linear estimate of a pattern.
+        spread: (GRID^2,), its RMS error, over the amplitude of the readings.
+        noise: (3,), deviation of a reading of x, y, z from drift, field and noise.
+        model_error: (3,), RMS of what the operator leaves of true patterns' readings, over their amplitude.
+        unexplained: share of the readings' energy that it leaves of true patterns on pads of which nothing is known.
+        limit: mismatch that one in two hundred patterns of simulated contacts exceeds; infinite before it is set.
+    """
+
+    operator: NDArray[np.float32]
+    inverse: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    noise: NDArray[np.float32]
+    model_error: NDArray[np.float32]
+    unexplained: float
+    limit: float = math.inf
+
+    def of_pad(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the operator (48, FEATURES) of a pad by its constants (p,) over their spread, 0 where unknown."""
+        return np.tensordot(values, self.operator[1:], 1).astype(np.float32) + self.operator[0]
+
+    def mismatch(
+        self,
+        operator: NDArray[np.float32],
+        tap: NDArray[np.float32],
+        pattern: NDArray[np.float32],
+        traction: NDArray[np.float32],
+        gain_error: float,
+    ) -> float:
+        """Return the share of the energy of a tap's readings that its pattern leaves unexplained.
+
+        Readings count less where noise, drift, gains and the operator itself make them uncertain.
+
+        Args:
+            operator: of the pad.
+            tap: (3, rows, cols) in network units.
+            pattern: (H, W) in [mm].
+            traction: (3, h, w) in [kPa].
+            gain_error: standard deviation of the gains that remain.
+        """
+        readings = tap.reshape(-1)
+        z = tap[2].reshape(-1)
+        square = float(z @ z) / z.size
+        variance = readings * readings
+        variance *= np.float32(gain_error**2)
+        per_axis = self.noise * self.noise + self.model_error * self.model_error * np.float32(square)
+        variance.reshape(len(AXES), -1)[...] += per_axis[:, None]
+        left = operator @ features(pattern, traction) - readings
+        left *= left
+        left /= variance
+        return float(left.sum()) / max(float((readings * readings / variance).sum()), 1e-12)
+
+    def smooth(
+        self, tap: NDArray[np.float32], shape: tuple[int, int]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the smooth pattern of a tap's readings, and its deviation, both (H, W) in [mm].
+
+        Args:
+            tap: (3, rows, cols) in network units.
+            shape: (H, W).
+        """
+        z = tap[2].reshape(-1)
+        size = math.sqrt(float(z @ z) / z.size) + QUIET_UNITS
+        tall, wide = _enlarging(shape[0]), _enlarging(shape[1])
+        cells = np.maximum(self.inverse @ tap.reshape(-1), 0).reshape(GRID, GRID)
+        spread = (self.spread * np.float32(size)).reshape(GRID, GRID)
+        smooth, deviation = tall @ cells @ wide.T, tall @ spread @ wide.T
+        return smooth.astype(np.float32, copy=False), deviation.astype(np.float32, copy=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as JSON."""
+        return {name: packed(getattr(self, name)) for name in _KEYS} | {
+            "unexplained": self.unexplained,
+            "limit": self.limit,
+        }
+
+
+def forward_model(value: Any, constants: int) -> ForwardModel:
+    """Return the forward model of a value that `ForwardModel.to_json` has made, for a model that takes `constants`.
+
+    Raises:
+        ValueError: it is none, or of other constants.
+    """
+    if not isinstance(value, dict) or set(value) != {*_KEYS, "unexplained", "limit"}:
+        raise ValueError(f"expected {', '.join(_KEYS)}, unexplained and limit")
+    arrays = {name: unpacked(value[name]) for name in _KEYS}
+    readings = arrays["inverse"].shape[-1]
+    expected = {
+        "operator": (1 + constants, readings, FEATURES),
+        "inverse": (GRID**2, readings),
+        "spread": (GRID**2,),
+        "noise": (len(AXES),),
+        "model_error": (len(AXES),),
+    }
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} is {arrays[name].shape}, expected {shape}")
+    numbers = {name: value[name] for name in ("unexplained", "limit")}
+    if not all(isinstance(number, float) and 0 < number < math.inf for number in numbers.values()):
+        raise ValueError(f"{numbers}, expected numbers above 0")
+    if not ((arrays["noise"] > 0).all() and (arrays["model_error"] > 0).all() and (arrays["spread"] > 0).all()):
+        raise ValueError("noise, model_error and spread, expected above 0")
+    return ForwardModel(**arrays, **numbers)
+
+
+def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what the operator is applied to, (FEATURES,): means of the pattern's cells, then of the drag's."""
+    down = _pooling(pattern.shape[0], GRID) @ pattern @ _pooling(pattern.shape[1], GRID).T
+    drag = _pooling(traction.shape[1], _DRAG_GRID) @ traction[:2] @ _pooling(traction.shape[2], _DRAG_GRID).T
+    return np.concatenate([down.ravel(), drag.ravel() / np.float32(KPA)], dtype=np.float32)
+
+
+@lru_cache
+def _pooling(length: int, cells: int) -> NDArray[np.float32]:
+    """Return the matrix (cells, length) of means over equal parts of a side."""
+    edges = np.linspace(0, length, cells + 1)
+    places = np.arange(length)
+    share = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
+    return (share.clip(0) / (length / cells)).astype(np.float32)
+
+
+@lru_cache
+def _enlarging(length: int) -> NDArray[np.float32]:
+    """Return the matrix (length, GRID) of linear interpolation between the cells' centres."""
+    places = ((np.arange(length) + 0.5) / length * GRID - 0.5).clip(0, GRID - 1)
+    return (1 - np.abs(places[:, None] - np.arange(GRID))).clip(0).astype(np.float32)

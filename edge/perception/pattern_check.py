@@ -1,0 +1,154 @@
+"""Decision whether a pattern is to be believed, by its own readings, its earlier taps and the contacts before.
+
+Two things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
+do not), and does it explain them? Of each earlier tap: does it belong to the contact that goes on? What repeats over
+contacts speaks against the sensor, not the contact.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.contract import Contract
+from edge.inference.familiarity import contact_features, tap_features
+from edge.inference.trust import Trust
+
+Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor"]
+"""Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
+its readings; readings of one contact after another are unfamiliar, so the sensor or its file is wrong."""
+REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor")
+
+LEAST_COUNTS: Final = 100.0
+"""Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
+REPEATS: Final = 5
+"""Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
+longer than 3."""
+GAIN_SPREAD: Final = 0.075
+"""Standard deviation of the gains of a sensor that is not calibrated."""
+SAME_STRENGTH: Final = 0.85
+"""Strength of a press, over that of an earlier tap, from which the two are compared for good."""
+_SUSPICION: Final = 1.5
+_STEP: Final = 4.5
+_LIMIT: Final = 12.0
+_MOST: Final = 20.0
+
+
+@dataclass(slots=True)
+class Verdict:
+    """Outcome of the checks of one pattern.
+
+    Attributes:
+        mismatch: share of the readings' energy that the pattern does not explain; None without traction.
+        reason: why it is not to be believed; None if it is, or nothing could be checked.
+        checked: False for a contact that is too light to tell.
+    """
+
+    mismatch: float | None = None
+    reason: Reason | None = None
+    checked: bool = True
+
+    @property
+    def trusted(self) -> bool | None:
+        """Whether the pattern is to be believed; None if nothing could be checked."""
+        return self.reason is None if self.checked or self.reason is not None else None
+
+
+class PatternCheck:
+    """Checks of one sensor's patterns, with what its contacts have shown so far.
+
+    Args:
+        trust: of the model.
+        contract: of the model.
+        pad_row: the sensor's pad as model input.
+    """
+
+    def __init__(self, trust: Trust, contract: Contract, pad_row: NDArray[np.float32]) -> None:
+        count = len(contract.pad_inputs)
+        self._trust = trust
+        self._least = LEAST_COUNTS / contract.counts_per_unit[2]
+        self._pad_row = pad_row
+        self._operator = trust.forward.of_pad(pad_row[:count])
+        certainty = float(pad_row[-1]) if contract.takes_gains else 0.0
+        self._gain_error = GAIN_SPREAD * (1 - certainty)
+        self._evidence = 0.0
+        self._tap: int | None = None
+        self._strongest, self._score = -math.inf, 0.0
+        self.suspected = False
+
+    def belonging(self, window: NDArray[np.float32], taps: int) -> list[float]:
+        """Return how little each earlier tap belongs to the newest one: 0 to 1, and from .5 it does not.
+
+        Args:
+            window: (K, 3, rows, cols) in network units, newest tap first.
+            taps: taps in it; the rest is empty.
+        """
+        check = self._trust.tap
+        scores = (check.network(tap_features(window[0], window[step], step)) for step in range(1, taps))
+        return [_share(score - check.limit) for score in scores]
+
+    def judge(
+        self,
+        tap: int,
+        newest: NDArray[np.float32],
+        pattern: NDArray[np.float32],
+        traction: NDArray[np.float32] | None,
+        repeats: int,
+    ) -> Verdict:
+        """Return the verdict on a pattern, and remember what its contact shows of the sensor.
+
+        Args:
+            tap: number of the contact.
+            newest: (3, rows, cols) in network units, the readings that it was made from.
+            pattern: (H, W) in [mm].
+            traction: (3, h, w) in [kPa].
+            repeats: scans for which some taxel has repeated itself while most others were new.
+        """
+        strength = float(newest[2].max())
+        if strength < self._least:
+            return Verdict(checked=False, reason="stuck" if repeats >= REPEATS else None)
+        trust = self._trust
+        score = trust.contact.network(contact_features(newest, self._pad_row)) - trust.contact.limit
+        self._weigh(tap, strength, score + trust.contact.limit)
+        mismatch = None
+        if traction is not None:
+            mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
+        reason: Reason | None = None
+        if repeats >= REPEATS:
+            reason = "stuck"
+        elif score > 0:
+            reason = "unfamiliar"
+        elif mismatch is not None and mismatch > trust.forward.limit:
+            reason = "unexplained"
+        elif self.suspected:
+            reason = "sensor"
+        return Verdict(mismatch, reason)
+
+    def smooth(
+        self, newest: NDArray[np.float32], shape: tuple[int, int]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the smooth pattern of readings (3, rows, cols) in network units, and its deviation, both (H, W)."""
+        return self._trust.forward.smooth(newest, shape)
+
+    def _weigh(self, tap: int, strength: float, score: float) -> None:
+        """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
+        if tap != self._tap:
+            if self._tap is not None:
+                step = min(max(self._score - _SUSPICION, -_STEP), _STEP)
+                self._evidence = min(max(self._evidence + step, 0.0), _MOST)
+                self.suspected = self._evidence > (_LIMIT / 2 if self.suspected else _LIMIT)
+            self._tap, self._strongest = tap, -math.inf
+        if strength > self._strongest:
+            self._strongest, self._score = strength, score
+
+
+def first_stranger(belonging: Sequence[float]) -> int | None:
+    """Return the number, from 1, of the newest earlier tap that does not belong; None if all do."""
+    return next((number for number, share in enumerate(belonging, 1) if share >= 0.5), None)
+
+
+def _share(log_odds: float) -> float:
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))

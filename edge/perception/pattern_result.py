@@ -1,0 +1,110 @@
+"""Result of a scan with a pattern: which taps it is made from, whether it is believed, and what follows from it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.contract import Contract
+from edge.inference.expected_error import Expected, expect
+from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.dead_taxel_fill import widening
+from edge.perception.pattern_check import SAME_STRENGTH, first_stranger
+from edge.perception.result import Result
+from edge.perception.sensor_state import Sensor
+from edge.perception.wrench import wrench_of
+from firmware_bridge.pad_geometry import SensorGeometry
+
+
+def with_taps_that_belong(
+    result: Result, sensor: Sensor, counts: NDArray[np.float32], window: NDArray[np.float32]
+) -> Result:
+    """Return the result with fewer taps where an earlier one does not belong to the contact.
+
+    A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
+
+    Args:
+        result: still without a pattern.
+        sensor: its state.
+        counts: (K, 3, rows, cols), the window in zeroed counts.
+        window: the same in network units.
+    """
+    if sensor.check is None or result.taps_used < 2:
+        return result
+    belonging = tuple(sensor.check.belonging(window, result.taps_used))
+    stranger = first_stranger(belonging)
+    if stranger is None:
+        return replace(result, tap_mismatch=belonging)
+    if window[0, 2].sum() >= SAME_STRENGTH * window[stranger, 2].sum():
+        sensor.taps.keep(stranger - 1)
+        which = "the tap before does" if stranger == 1 else f"taps from the {stranger}. before on do"
+        sensor.report("tap_dropped", f"{which} not belong to this contact, and is forgotten")
+    return replace(result, tap_mismatch=belonging, taps_used=stranger, window=counts[:stranger])
+
+
+def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32], *, fallback: bool) -> Result:
+    """Return the result with the verdict on its pattern; one that is not to be believed is replaced.
+
+    Args:
+        result: with the model's pattern.
+        sensor: its state.
+        tap: number of the contact.
+        newest: (3, rows, cols) in network units, the readings that the pattern was made from.
+        fallback: replace the pattern by the smooth one where it is not to be believed.
+    """
+    pattern, deviation = result.pattern, result.deviation
+    if deviation is not None and result.dead:
+        deviation = deviation * np.float32(widening(len(result.dead) / newest[0].size))
+        result = replace(result, deviation=deviation)
+    if sensor.check is None or pattern is None:
+        return result
+    suspected = sensor.check.suspected
+    verdict = sensor.check.judge(tap, newest, pattern, result.traction, sensor.watch.most_repeats)
+    if sensor.check.suspected != suspected:
+        sensor.report("cleared" if suspected else "suspected")
+    result = replace(result, mismatch=verdict.mismatch, trusted=verdict.trusted, untrusted_reason=verdict.reason)
+    if verdict.reason is None or not fallback:
+        return result
+    height, width = pattern.shape
+    smooth, spread = sensor.check.smooth(newest, (height, width))
+    deviation = None if deviation is None else np.maximum(deviation, spread)
+    return replace(result, pattern=smooth, deviation=deviation, estimate="smooth")
+
+
+class Describer:
+    """Computation of everything that follows from a pattern: area, interval, expected error, wrench."""
+
+    def __init__(self, contract: Contract, geometry: SensorGeometry) -> None:
+        self._contract, self._geometry = contract, geometry
+        self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
+
+    def __call__(self, result: Result, sensor: Sensor) -> Result:
+        """Return the result with what follows from its pattern, which it must have."""
+        contract, pattern, deviation = self._contract, result.pattern, result.deviation
+        if pattern is None:
+            raise ValueError("the result has no pattern")
+        touching = touched(pattern, contract.contact_level)
+        area_mm2, centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
+        interval_mm = expected = None
+        if deviation is not None:
+            if result.estimate == "smooth":
+                expected = Expected(math.sqrt(float(np.vdot(deviation, deviation)) / deviation.size), None)
+            else:
+                expected = expect(contract.confidence, result.taps_used, pattern, deviation)
+            if contract.interval_factor is not None and touching.any():
+                interval_mm = contract.interval_factor * float(deviation[touching].mean())
+        wrench = wrench_origin = None
+        if (traction := result.traction) is not None:
+            wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
+            wrench_origin = sensor.wrench_origin
+        return replace(
+            result,
+            area_mm2=area_mm2,
+            centroid_mm=centroid_mm,
+            interval_mm=interval_mm,
+            expected_rmse_mm=None if expected is None else expected.rmse,
+            another_tap=None if expected is None else expected.another_tap,
+            wrench=wrench,
+            wrench_origin=wrench_origin,
+        )

@@ -1,0 +1,117 @@
+"""Emulated controller and slcan adapter as of firmware_bridge.emulation.slcan_main, with faults between bus and client.
+
+    python tests/system/fault_emulator.py FILE [FILE] --faults lost@2+3
+
+The first line it prints is the port.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+from fault_injector import Injector
+from fault_lines import Piece
+from fault_log import TruthFiles
+from fault_stretches import parse_stretches
+from fault_truth import Truth
+
+from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.pty_port import COUNTED_LATE_NS
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.slcan_main import argument_parser, play
+from firmware_bridge.recording.tracks import Recording
+
+_LONGEST_DRAIN_S: Final = 0.5
+
+
+class FaultyEmulator(Emulator):
+    """Emulator with faults between bus and client, which also pull the cable and reset the adapter."""
+
+    def __init__(self, recordings: Sequence[Recording], *, faults: Injector, **usual: Any) -> None:
+        super().__init__(recordings, **usual)
+        self._faults = faults
+        self._truth = faults.truth
+        self._resets = 0
+        self._elsewhere = False
+
+    def tell(self, line: bytes) -> None:
+        self._send([Piece(line, None, answer=True)], time.monotonic_ns())
+
+    def _unplug(self) -> None:
+        self._truth.close_channel(self._line.unread_bytes())
+        super()._unplug()
+
+    def _latency_at(self, time_s: float) -> float:
+        return self._faults.latency_s(time_s, self._latency_s)
+
+    def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
+        faults, truth, pieces = self._faults, self._truth, list[Piece]()
+        now_ns = time.monotonic_ns()
+        for time_s, frame in frames:
+            for sent in faults.disturb(time_s, frame):
+                if sent.lost:
+                    truth.lose(sent, now_ns)
+                elif not (self._line.plugged and self.adapter.hears_the_bus):
+                    truth.lose(sent._replace(fate="unheard"), now_ns)
+                else:
+                    pieces += faults.corrupt(self.adapter.encode(sent.frame, sent.time_s), sent)
+        truth.settle(self._line.unread_bytes(), now_ns - COUNTED_LATE_NS)
+        self._send(pieces, now_ns)
+        if faults.resets > self._resets:
+            self._resets = faults.resets
+            self.adapter.begin_anew()
+        if faults.unplugged and self._line.plugged:
+            self._drain(time.monotonic() + _LONGEST_DRAIN_S)
+            truth.close_channel(self._line.unread_bytes())
+            self._line.unplug()
+            self._elsewhere = faults.renamed
+        elif not faults.unplugged and not self._line.plugged:
+            self.adapter.begin_anew()
+            self._line.plug(elsewhere=self._elsewhere)
+
+    def _send(self, pieces: Sequence[Piece], now_ns: int) -> None:
+        """Write pieces, and report to the truth how much of each went out."""
+        room = self._line.write(b"".join(piece.data for piece in pieces))
+        for piece in pieces:
+            written = min(max(room, 0), len(piece.data))
+            room -= len(piece.data)
+            self._truth.hand_on(piece, written, now_ns)
+            self.sent_frames += room >= 0 and piece.sent is not None
+            self.lost_frames += room < 0 and piece.sent is not None
+
+    def _obey(self, received: bytes) -> None:
+        was_open = self.adapter.channel_open
+        unread_bytes = self._line.left_bytes() if b"C" in received else self._line.unread_bytes()
+        answer = self.adapter.feed(received)
+        if self.adapter.channel_open != was_open:  # closing and opening drop old bytes, answers as well
+            self._truth.close_channel(unread_bytes)
+        if not self.adapter.channel_open:
+            self._line.write(answer)
+            return
+        if not was_open:
+            self._truth.open_channel()
+        self._send([Piece(answer, None, answer=True)], time.monotonic_ns())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argument_parser("python tests/system/fault_emulator.py", __doc__)
+    parser.add_argument("--faults", default="", metavar="F", help="such as lost@2+3 or mixed@5+600; see docs/run.md")
+    parser.add_argument("--truth", type=Path, metavar="DIR", help="what became of each frame")
+    return play(parser, arguments, _emulator)
+
+
+def _emulator(
+    recordings: Sequence[Recording], usual: Mapping[str, Any], options: argparse.Namespace, closing: ExitStack
+) -> FaultyEmulator:
+    truth = closing.enter_context(TruthFiles(options.truth)) if options.truth else None
+    stretches = parse_stretches(options.faults, options.seed) if options.faults else []
+    faults = truth.injector(stretches, options.seed) if truth else Injector(stretches, Truth(), options.seed)
+    return FaultyEmulator(recordings, faults=faults, **usual)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""Check that tells readings of contacts from readings that no contact makes."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.familiarity import Check, contact_features
+from edge.inference.small_network import SmallNetwork
+from train.data.batches import COUNTS_PER_UNIT
+from train.data.press_batches import read_presses
+from train.data.presses import PressSet
+from train.learning.small_classifier import fit_classifier
+from train.learning.wrong_readings import spoiled
+from train.networks.symmetric import symmetries
+from train.physics.pad_draws import known_numbers
+from train.physics.sensor_noise import Nuisances
+
+LEAST_COUNTS: Final = 100.0
+"""Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
+_WIDTHS: Final = (160, 128)
+_CERTAINTIES: Final = (0.0, 0.0, 0.5, 0.8)
+_UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
+
+
+def fit_contact_network(presses: PressSet, seed: int = 0, steps: int = 20_000, rounds: int = 2) -> SmallNetwork:
+    """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled.
+
+    Args:
+        presses: the newest press of each sequence is used.
+        seed: of nuisances, faults and weights.
+        steps: of the optimizer.
+        rounds: readings of each press.
+    """
+    rng = np.random.default_rng([seed, 3])
+    right, wrong = [], []
+    for number in range(rounds):
+        readings, pads = drawn_readings(presses, seed + number)
+        strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
+        readings, pads = moved(rng, readings[strong]), pads[strong]
+        right.append(features_of(readings, pads))
+        for _ in range(2):
+            faulty, _ = spoiled(rng, readings)
+            changed = (faulty != readings).any(axis=(1, 2, 3))
+            wrong.append(features_of(faulty[changed], pads[changed]))
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed)
+
+
+def drawn_readings(presses: PressSet, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return readings (n, 3, rows, cols) in counts by sensors of several certainties, and the pad inputs."""
+    rng = np.random.default_rng([seed, 4])
+    certainty = np.array(_CERTAINTIES, dtype=np.float32)[rng.integers(len(_CERTAINTIES), size=len(presses))]
+    readings = np.empty(presses.counts[:, 0].shape, dtype=np.float32)
+    for one in sorted(set(_CERTAINTIES)):
+        part = certainty == np.float32(one)
+        if part.any():
+            nuisances = Nuisances(gain_spread=Nuisances().gain_spread * (1 - one))
+            readings[part] = read_presses(presses.pick(part).with_taps(1), nuisances, int(rng.integers(2**62)))[:, 0]
+    known = rng.random(presses.constants.shape) < rng.choice([0, 0, 0.5, 1], size=(len(presses), 1))
+    return readings, known_numbers(presses.constants, known, certainty)
+
+
+def features_of(counts: NDArray[np.float32], pads: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the features of readings (n, 3, rows, cols) in counts, with the pad inputs (n, p)."""
+    return np.stack([contact_features(tap, pad) for tap, pad in zip(counts / _UNIT, pads, strict=True)])
+
+
+def moved(rng: np.random.Generator, counts: NDArray[np.float32], *, mirror: bool = True) -> NDArray[np.float32]:
+    """Turn each sequence of readings (n, ..., 3, rows, cols) as a whole, axes and all, and mirror half of them."""
+    which = rng.integers(8 if mirror else 4, size=len(counts))
+    result = counts.copy()
+    for number, move in enumerate(symmetries("p4m")):
+        part = which == number
+        result[part] = _as_vectors(
+            np.array(move(counts[part]), dtype=np.float32), turns=number % 4, mirrored=number >= 4
+        )
+    return result
+
+
+def _as_vectors(maps: NDArray[np.float32], turns: int, *, mirrored: bool) -> NDArray[np.float32]:
+    """Turn the axes x, y of maps (..., 3, rows, cols) with their places: x to the right, y down."""
+    x, y = maps[..., 0, :, :].copy(), maps[..., 1, :, :].copy()
+    if mirrored:
+        x = -x
+    for _ in range(turns):  # np.rot90 turns counter-clockwise: right becomes up, which is -y, and down becomes right
+        x, y = y, -x
+    maps[..., 0, :, :], maps[..., 1, :, :] = x, y
+    return maps
+
+
+def limit_of(scores: NDArray[np.floating], false_alarms: float) -> float:
+    """Return the score that a share of right rows exceeds."""
+    return float(np.quantile(scores, 1 - false_alarms, method="higher"))
+
+
+def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+    """Return the check whose limit a share of these presses exceeds, read by sensors of several certainties."""
+    readings, pads = drawn_readings(presses, seed)
+    strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
+    scores = np.array([network(row) for row in features_of(readings[strong], pads[strong])])
+    return Check(network, limit_of(scores, false_alarms))

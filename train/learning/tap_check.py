@@ -1,0 +1,80 @@
+"""Check that tells earlier taps of the same contact from taps of another contact or another pose."""
+
+from dataclasses import replace
+from itertools import permutations
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.familiarity import Check, tap_features
+from edge.inference.small_network import SmallNetwork
+from train.data.batches import COUNTS_PER_UNIT
+from train.data.press_batches import read_presses
+from train.data.presses import PressSet
+from train.learning.contact_check import LEAST_COUNTS, limit_of, moved
+from train.learning.small_classifier import fit_classifier
+from train.physics.sensor_noise import Nuisances
+
+_WIDTHS: Final = (128, 64)
+_DEPTHS: Final = (0.85, 1.15)
+_UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
+
+
+def fit_tap_network(presses: PressSet, seed: int = 0, steps: int = 20_000, rounds: int = 6) -> SmallNetwork:
+    """Fit the network to taps turned as the schedule says, and to others.
+
+    Args:
+        presses: sequences of several taps.
+        seed: of nuisances, draws and weights.
+        steps: of the optimizer.
+        rounds: readings of each sequence, each by another sensor.
+    """
+    rng = np.random.default_rng([seed, 5])
+    right, wrong = [], []
+    for number in range(rounds):
+        windows = read_twice(presses, seed + number)
+        # Turns keep the direction of the schedule, mirror images would not.
+        windows = turned(rng, windows)
+        taps = presses.taps
+        for steps_claimed in range(1, taps):
+            right.append(pair_features(windows[:, 0], windows[:, steps_claimed], steps_claimed))
+            other = windows[rng.permutation(len(windows)), steps_claimed]
+            wrong.append(pair_features(windows[:, 0], other, steps_claimed))
+            wrong.append(pair_features(windows[:, 0], windows[:, taps], steps_claimed))  # not turned
+            wrong.append(pair_features(windows[:, steps_claimed], windows[:, 0], steps_claimed))  # turned back
+        for claimed, true in permutations(range(1, taps), 2):
+            if abs(claimed - true) > 1 or claimed == 1:
+                wrong.append(pair_features(windows[:, 0], windows[:, true], claimed))
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed)
+
+
+def read_twice(presses: PressSet, seed: int) -> NDArray[np.float32]:
+    """Return windows (n, K + 1, 3, rows, cols) in counts; the last tap is the newest again, at another depth.
+
+    Only sequences whose taps are all strong enough are kept.
+    """
+    depth = np.random.default_rng([seed, 6]).uniform(*_DEPTHS, (len(presses), 1, 1, 1)).astype(np.float32)
+    counts = np.concatenate([presses.counts, (presses.counts[:, 0] * depth)[:, None]], axis=1)
+    angles = np.concatenate([presses.angle_deg, presses.angle_deg[:, :1]], axis=1)
+    windows = read_presses(replace(presses, counts=counts, angle_deg=angles), Nuisances(), seed)
+    return windows[(windows[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS).all(axis=1)]
+
+
+def turned(rng: np.random.Generator, windows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Turn each window (K, 3, rows, cols) by a quarter turn or several, axes and all."""
+    return moved(rng, windows, mirror=False)
+
+
+def pair_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:
+    """Return the features (n, inputs) of pairs of taps, both (n, 3, rows, cols) in counts."""
+    pairs = zip(newest / _UNIT, earlier / _UNIT, strict=True)
+    return np.stack([tap_features(one, other, steps) for one, other in pairs])
+
+
+def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+    """Return the check whose limit a share of the earlier taps of these presses exceeds."""
+    windows = read_twice(presses, seed)
+    rows = [pair_features(windows[:, 0], windows[:, steps], steps) for steps in range(1, presses.taps)]
+    scores = np.array([network(row) for row in np.concatenate(rows)])
+    return Check(network, limit_of(scores, false_alarms))

@@ -1,0 +1,71 @@
+"""Fit what a model needs to say when its pattern is not to be believed: forward model and checks, into one file.
+
+    python -m train.trust checkpoints/trust.json --data data/gripped.npz data/gripped4.npz
+
+`export.to_onnx` puts them into the contract of every model of the same folder, with limits set on validation presses.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from firmware_bridge.in_place import write_in_place
+from train.data.files import load_taps
+from train.data.presses import PressSet
+from train.errors import DatasetError, TrainError
+from train.learning.contact_check import fit_contact_network
+from train.learning.forward_operator import fit_forward_model
+from train.learning.tap_check import fit_tap_network
+
+NAME: Final = "trust.json"
+"""File beside the checkpoints."""
+_NO_LIMIT: Final = 1.0
+
+
+def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
+    """Fit forward model, check of contacts and check of earlier taps; their limits are set at export.
+
+    Raises:
+        DatasetError: no sequence has several taps.
+    """
+    several = presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps > 1)
+    if not several.any():
+        raise DatasetError("no sequences of several taps: add a file of 'python -m train.data.make_presses --taps 4'")
+    steps = max(20_000 // shorten, 1)
+    forward = fit_forward_model(presses, seed)
+    return {
+        "forward": forward.to_json() | {"limit": _NO_LIMIT},
+        "contact": fit_contact_network(presses, seed, steps).to_json(),
+        "tap": fit_tap_network(presses.pick(np.flatnonzero(several)), seed, steps).to_json(),
+        "data_sha256": presses.sha256(),
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m train.trust", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", type=Path, metavar="OUT.json", help=f"{NAME} in the folder of the checkpoints")
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
+    parser.add_argument("--shorten", type=int, default=1, help="divide the steps, to try things out (1)")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args(arguments)
+    try:
+        data = load_taps(options.data)
+        if not isinstance(data, PressSet):
+            raise DatasetError("files of train.generate, expected presses of train.data.make_presses")
+        text = json.dumps(fit_trust(data, options.seed, options.shorten)) + "\n"
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        write_in_place(options.out, lambda draft: draft.write_text(text), lambda draft: json.loads(draft.read_text()))
+    except TrainError as error:
+        sys.exit(f"trust: {error}")
+    except OSError as error:
+        sys.exit(f"trust: {error.filename or options.out}: {error.strerror}")
+    sys.stdout.write(f"{options.out}: {len(text) / 1e3:.0f} kB\n")
+
+
+if __name__ == "__main__":
+    main()
