@@ -156,7 +156,7 @@ FIELDS: Final = (
     Field("reused_from", _NUMBER_OR_NOT, "reused_from",
           "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
     Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
-          "a contact that is too light to tell, and for models without checks", byte=592),
+          "a contact that is too light to check, and for models without checks", byte=592),
     Field("untrusted_reason", _one_of(*REASONS, unknown=""), "untrusted_reason",
           "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
     Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
@@ -176,13 +176,14 @@ FIELDS: Final = (
           "it was stored", decimals=1, byte=160),
     Field("drift_counts", _OBJECT, "drift", "followed since: `common` on x, y, z, and the largest of a taxel's `own` "
           "beyond it; `step`: the largest step in rest level that was not followed", json=_drift, out=Out.RECORD),
-    Field("dead", _BITS, "dead", "taxels that are not believed, and why: `{\"3\": \"stuck\", \"7\": \"silent\"}`, "
+    Field("dead", _BITS, "dead", "dead taxels, whose readings are not used, and why: "
+          "`{\"3\": \"stuck\", \"7\": \"silent\"}`, "
           "`saturated`, `far`, `unzeroed`; elsewhere bit i: taxel i. A pattern is then made without them",
           make=_dead_bits, json=_dead_reasons, out=_RECORD_NPZ, byte=80),
     Field("filled", _one_of("rest", "neighbours", unknown=""), "filled",
           "what stands for the dead taxels: an estimate from their `neighbours` "
-          "(`rest` only by earlier releases); unknown while none "
-          "is dead, or no pattern can be made",
+          "(`rest` only by earlier releases); unknown while no "
+          "taxel is dead, or no pattern can be made",
           out=_RECORD_NPZ, byte=76),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),

@@ -192,7 +192,7 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
     for arguments, words in (
         ([str(tmp_path / "gone.csv")], "cannot be read"),
         ([str(path)], "--rate-hz"),
-        ([str(path), "--controller", "x"], "'x' are no controller ids, such as 4,6"),
+        ([str(path), "--controller", "x"], "'x' are not controller ids, such as 4,6"),
         ([str(path), "--rate-hz", "9", "--link", "/nonexist/x"], "link is /nonexist/x, expected a path in a folder"),
         ([str(path), "--rate-hz", "9", "--link", str(path)], "a.csv, expected a path that is free or a link"),
         ([str(path), "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),

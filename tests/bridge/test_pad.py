@@ -165,7 +165,10 @@ class TestSession:
                 {"with_traction": False},
                 r"output is pattern [^,]*, 40, 40\], but .* traction tensor\(float\) \[1, 3, 8, 8\]",
             ),
-            ({"contract": make_contract(), "pad_width": 5}, r"pad tensor\(float\) \[1, 5\], but .* says window [^p]*$"),
+            (
+                {"contract": make_contract(), "pad_width": 5},
+                r"pad tensor\(float\) \[1, 5\], but .* states window [^p]*$",
+            ),
             ({"contract": make_contract(), "with_traction": True}, r"traction tensor\(float\) \[1, 3, 4, 4\], but"),
             (
                 {"metadata": make_pad_contract(traction_scale=3).to_metadata()},
@@ -173,7 +176,7 @@ class TestSession:
             ),
             (
                 {"metadata": make_contract(version=4).to_metadata()},
-                r"pad tensor\(float\) \[1, 5\], but its contract says window tensor\(float\) \[1, 12, 4, 4\]$",
+                r"pad tensor\(float\) \[1, 5\], but its contract states window tensor\(float\) \[1, 12, 4, 4\]$",
             ),
         ],
     )

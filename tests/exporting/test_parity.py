@@ -243,7 +243,7 @@ def test_the_table_shows_of_extreme_windows_the_worst():
 def test_integers_alone_ask_for_what_they_are_of(tmp_path):
     path = tmp_path / "stsr-int8.onnx"
     path.write_bytes(find_model("stsr-int8").read_bytes())
-    with pytest.raises(SystemExit, match=r"stsr\.onnx, of which these are the integers, is not beside it"):
+    with pytest.raises(SystemExit, match=r"the float32 model stsr\.onnx is not in the folder of its int8 model"):
         main([str(path)])
 
 

@@ -206,11 +206,11 @@ def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks
         ({"output_name": "out"}, r"graph output is out tensor\(float\) \[1, 40, 40\], .* pattern tensor"),
         (
             {"with_deviation": True},
-            r"output is pattern .*, deviation tensor\(float\) \[1, 40, 40\], but .* says pattern [^,]*, 40, 40\]$",
+            r"output is pattern .*, deviation tensor\(float\) \[1, 40, 40\], but .* states pattern [^,]*, 40, 40\]$",
         ),
         (
             {"with_deviation": False, "contract": make_contract(interval_factor=1.6)},
-            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract says pattern .*, deviation tensor",
+            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract states pattern .*, deviation tensor",
         ),
         ({"element_type": TensorProto.DOUBLE}, r"graph input is window tensor\(double\)"),
         ({"input_shape": ["n", 12, 4, 4]}, r"graph input is window tensor\(float\) \['n', 12, 4, 4\]"),
@@ -224,10 +224,10 @@ def test_a_graph_that_breaks_its_contract_is_refused_naming_the_tensor(tmp_path,
 
 def test_a_contract_for_other_shapes_is_refused(tmp_path):
     metadata = make_contract(taps=2).to_metadata()
-    with pytest.raises(ModelError, match=r"input is window.*12, 4, 4.*contract says.*6, 4, 4"):
+    with pytest.raises(ModelError, match=r"input is window.*12, 4, 4.*contract states.*6, 4, 4"):
         ModelSession(write_model(tmp_path / "a.onnx", metadata=metadata))
     metadata = make_contract(scale=5).to_metadata()
-    with pytest.raises(ModelError, match=r"output is pattern.*1, 40, 40.*contract says.*1, 20, 20"):
+    with pytest.raises(ModelError, match=r"output is pattern.*1, 40, 40.*contract states.*1, 20, 20"):
         ModelSession(write_model(tmp_path / "b.onnx", metadata=metadata))
 
 

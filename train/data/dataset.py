@@ -189,26 +189,26 @@ def load_sequences(path: Path) -> Sequences:
     try:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
         if str(about.get("schema")) != SCHEMA:
-            raise DatasetError(f"{path} is no file of sequences: make one with 'python -m train.generate'")
+            raise DatasetError(f"{path} is not a file of sequences: make one with 'python -m train.generate'")
         if (version := int(about["version"])) > VERSION:
             raise DatasetError(f"{path} has schema version {version}, newer than {VERSION}: update this program")
         facts: Any = json.loads(str(about["facts"]))
         found = read_npz(path, _AXES, path.stat().st_size)  # nothing in it is compressed
         arrays = {name: found[name] for name in _AXES}
         arrays["touching"] = _unpacked(arrays["touching"], arrays["unit_patterns"])
-        told: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
+        stated: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
         hashed = str(facts.get("sha256"))[:64]
     except DatasetError:
         raise
     except FileNotFoundError:
         raise DatasetError(f"{path}: no such file; make one with 'python -m train.generate {path}'") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise DatasetError(f"{path} is no file of sequences, or a damaged one ({error}): make it again") from error
+        raise DatasetError(f"{path} is not a file of sequences, or a damaged one ({error}): make it again") from error
     _check_axes(path, arrays)
-    loaded = Sequences(**arrays, **told)
+    loaded = Sequences(**arrays, **stated)
     if (found := loaded.sha256()) != hashed:
-        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it says {hashed}: make it again")
-    _check_facts(path, told)
+        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed}: make it again")
+    _check_facts(path, stated)
     return loaded
 
 
@@ -290,7 +290,7 @@ def _unpacked(touching: NDArray[np.uint8], patterns: NDArray[np.float16]) -> NDA
     if not patterns.ndim:
         raise ValueError("unit_patterns has no axes")
     if touching.ndim != patterns.ndim or touching.shape[-1] != -(-patterns.shape[-1] // 8):
-        raise ValueError(f"touching is {touching.shape}, which is no mask of {patterns.shape}")
+        raise ValueError(f"touching is {touching.shape}, which is not a mask of {patterns.shape}")
     return np.unpackbits(touching, axis=-1, count=patterns.shape[-1]).astype(bool)
 
 

@@ -140,7 +140,7 @@ def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
     except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         if isinstance(error, DatasetError):
             raise
-        raise DatasetError(f"{path} is no file of presses, or a damaged one ({error}): make it again") from error
+        raise DatasetError(f"{path} is not a file of presses, or a damaged one ({error}): make it again") from error
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
     return loaded

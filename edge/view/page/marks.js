@@ -64,17 +64,17 @@ function thumb(tap) {
 // ---- Numbers of a sensor ----
 
 const NUMBERS = {
-  Touch: [
+  Contact: [
     ["force", "force", "big"], ["area", "area", "big"], ["centre", "centroid_mm"], ["taps used", "taps_used"], ["another tap", "another_tap"],
   ],
   Wrench: [
-    ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure at", "centre_of_pressure_mm"],
+    ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure centre", "centre_of_pressure_mm"],
     ["sensitivity", "wrench_origin"],
   ],
-  Doubt: [["90 % within", "interval_mm"], ["expected RMSE", "expected_rmse_mm"], ["pattern", "reused_from"]],
-  Pace: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["model", "model"]],
+  Uncertainty: [["90 % within", "interval_mm"], ["expected RMSE", "expected_rmse_mm"], ["pattern", "reused_from"]],
+  Timing: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["model", "model"]],
   Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
-  Baseline: [["which", "baseline"], ["from", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["own, step", "own"]],
+  Baseline: [["id", "baseline"], ["origin", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["taxel, step", "own"]],
 };
 const LOSSES = new Set(["dropped", "missed", "late", "torn_wire", "unwritten"]);
 const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand" };
