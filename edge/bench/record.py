@@ -12,7 +12,6 @@ from edge.bench.accuracy import ErrorRow
 from edge.bench.errors import BenchError
 from edge.bench.gate_savings import Saving
 from edge.bench.machine import Machine
-from edge.bench.pareto import front
 from edge.bench.ratios import Ratio
 from edge.bench.soak import Soak
 from edge.bench.system import StartUp, SystemRow
@@ -236,3 +235,12 @@ def read_record(path: Path) -> dict[str, Any]:
             f"{path} is of version {repr(kind[1])[:40]}, expected {VERSION}: run that bench again with this release"
         )
     return content
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return, for each point, True if no other point is at least as small in both numbers and smaller in one."""
+    return [not any(_beats(other, point) for other in points) for point in points]
+
+
+def _beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return one != other and one[0] <= other[0] and one[1] <= other[1]

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.emulation.xela_controller import playing_rate_hz
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
@@ -177,16 +178,10 @@ def sim_recording() -> Recording:
 def _player(recording: Recording, track: Track, rate_hz: float | None) -> _Player:
     if track.counts.shape[1:] != USPA44.scan_shape:
         raise RecordingError(f"{recording.path}: scans of shape {track.counts.shape[1:]}, expected {USPA44.scan_shape}")
-    known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
-    own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
-    if own_rate_hz is None:
-        raise RecordingError(f"{recording.path} does not state its rate: pass --rate-hz")
-    if not 0 < own_rate_hz < math.inf:
-        raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
     counts = track.counts.reshape(len(track.counts), 3, -1).copy()
     present = counts[:, 0] != ABSENT
     # The server repeats the last reading of an absent taxel; before its first reading it sends 0.
     counts[0][:, ~present[0]] = 0
     for scan in range(1, len(counts)):
         counts[scan][:, ~present[scan]] = counts[scan - 1][:, ~present[scan]]
-    return _Player(counts, present, own_rate_hz)
+    return _Player(counts, present, playing_rate_hz(recording, track, rate_hz))

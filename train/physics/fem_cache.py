@@ -34,9 +34,9 @@ class Mesh(NamedTuple):
 
 
 FINEST: Final = Mesh(10, 8)
+"""Mesh whose nodes are the pixels of the 40 x 40 pattern."""
 REFERENCE_POISSON: Final = 0.495
 """Poisson's ratio of rubber. The layer's own value is lower to account for free sides, which the elements have."""
-"""The nodes of FINEST are the pixels of the 40 x 40 pattern."""
 
 
 @dataclass(frozen=True, slots=True)
