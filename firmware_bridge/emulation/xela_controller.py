@@ -89,7 +89,7 @@ def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -
     known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
     own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
     if own_rate_hz is None:
-        raise RecordingError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
+        raise RecordingError(f"{recording.path} does not state its rate: pass --rate-hz")
     if not 0 < own_rate_hz < math.inf:
         raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
     return own_rate_hz
