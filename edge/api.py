@@ -252,6 +252,7 @@ def open_runtime(
     every_scan: bool = False,
     every_tap: bool = False,
     follow_drift: bool = True,
+    fallback: bool = True,
 ) -> Runtime:
     """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
 
@@ -270,6 +271,7 @@ def open_runtime(
         every_scan: infer also where nothing has changed since the last pattern.
         every_tap: use also taps that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
+        fallback: replace a pattern that is not to be believed by the smooth one.
 
     Raises:
         ModelError: the model does not exist, cannot be used, or is for another sensor.
@@ -288,7 +290,7 @@ def open_runtime(
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,
         options=RuntimeOptions(
-            contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift
+            contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift, fallback
         ),
         unix_time_s=source.unix_time_s,
     )

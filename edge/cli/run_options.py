@@ -252,6 +252,12 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     )
     add("--every-scan", action="store_true", help="run the inference even if nothing has changed")
     add("--every-tap", action="store_true", help="use all taps, even those not expected to help")
+    add(
+        "--no-fallback",
+        dest="fallback",
+        action="store_false",
+        help="keep an untrusted pattern, instead of the smooth one",
+    )
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:
