@@ -256,7 +256,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         "--no-fallback",
         dest="fallback",
         action="store_false",
-        help="keep a pattern that is not to be believed, instead of the smooth one",
+        help="keep an untrusted pattern, instead of the smooth one",
     )
 
 
