@@ -53,6 +53,7 @@ class Emulator:
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
         faults: Injector | None = None,
         link: Path | None = None,
+        waits: bool = False,
     ) -> None:
         """Prepare to play; nothing is opened yet.
 
@@ -73,6 +74,7 @@ class Emulator:
             on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
             faults: faults between bus and client.
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
+            waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
 
         Raises:
             ValueError: an option is out of range.
@@ -95,6 +97,7 @@ class Emulator:
         self._on_scan = on_scan
         self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
         self._faults = faults
+        self._waits = waits
         self._resets = 0
         self._elsewhere = False
         self._line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
@@ -161,7 +164,12 @@ class Emulator:
             if frame.can_id in self._last_frames:
                 ended.append(self._last_frames[frame.can_id])
         now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
-        room = self._line.write(b"".join(lines))
+        data = b"".join(lines)
+        room = self._line.write(data)
+        while self._waits and room < len(data) and self._obey_until(time.monotonic() + _DRAIN_POLL_S):
+            if not self.adapter.channel_open:
+                break
+            room += self._line.write(data[room:])
         for line in lines:
             room -= len(line)
             self.sent_frames += room >= 0

@@ -82,7 +82,7 @@ def test_a_pad_that_is_held_over_eight_real_sensors_on_one_pseudo_terminal():
         tracks.append(Track(str(number), np.concatenate([free, noise + moved]), None))
     recording = Recording(Path("made.csv"), tuple(tracks), 200.0)
     with (
-        Emulator([recording], controllers=range(8), frame_s=0, jitter_s=0) as emulator,
+        Emulator([recording], controllers=range(8), frame_s=0, jitter_s=0, waits=True) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         scans = read_until_lost(link)
