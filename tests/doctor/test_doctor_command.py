@@ -220,7 +220,9 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
         asked = ("--rate-hz", 400, "--weight-g", 200, "--out", file)
         done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
     assert f"taxel order: {turn.split()[0]}" in done.out, done.out
-    assert max(map(len, (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines())) <= 40
+    shown = (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines()
+    # One word alone may be longer: the path of the latency timer, which a reader that comes late is told of.
+    assert [line for line in shown if len(line) > 40 and len(line.split()) > 1] == []
     known = load_sensor_file(file)
     entry = known.sensors["4"]
     assert entry.mounting == sits and known.model == "uSPa44" and known.adapter is None
