@@ -10,7 +10,8 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from edge_samples import ROOT, ended, make_contract, write_model
+from cli_samples import write_recording
+from edge_samples import BASELINE, ROOT, ended, make_contract, write_model
 from onnx import helper, numpy_helper
 
 from edge.cli import main as cli
@@ -20,6 +21,7 @@ from edge.inference import timed_loading as loading
 from edge.inference.bundled import bundled_models
 from edge.inference.onnx_guard import OPERATORS, check_plain
 from edge.inference.onnx_session import ModelSession, load_session
+from firmware_bridge.zeroing.baseline import save_baselines
 
 
 def of_nodes(*nodes: onnx.NodeProto, numbers: dict[str, np.ndarray] | None = None) -> onnx.ModelProto:
@@ -137,7 +139,11 @@ class TestFailing:
     def test_edge_sr_ends_with_4_and_one_line(self, tmp_path, capsys):
         path = tmp_path / "m.onnx"
         path.write_bytes(failing_when_pressed().SerializeToString())
-        code = cli.main(["--source", "demo", "--model", str(path), "--sink", f"jsonl:{tmp_path / 'out.jsonl'}"])
+        # A press that lasts, over a stored baseline: on a busy machine the demo may lose what it would be zeroed by.
+        taps = write_recording(tmp_path / "taps.npz", [0] * 5 + [3000] * 200)
+        save_baselines(tmp_path / "zero.json", [BASELINE])
+        known = ["--source", f"replay:{taps}", "--baseline", str(tmp_path / "zero.json")]
+        code = cli.main([*known, "--model", str(path), "--sink", f"jsonl:{tmp_path / 'out.jsonl'}"])
         lines = [line for line in capsys.readouterr().err.splitlines() if "cannot be run" in line]
         assert code == 4 and len(lines) == 1 and lines[0].startswith(f"edge-sr: {path}: cannot be run: ")
 
