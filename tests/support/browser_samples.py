@@ -73,7 +73,6 @@ def open_page(browser):
     assert asked and strangers == []
     # That nobody answers, or not as wanted, is Chromium's to tell, and what some of these tests are about.
     told = ("ERR_CONNECTION_REFUSED", "403 (Forbidden)", "Unexpected response code: 403", "503")
-    told += ("is closed before the connection is established",)  # where a test leaves the page while it tries again
     unexpected = [text for text in wrong if not any(words in text for words in told)]
     assert unexpected == [], unexpected
 
