@@ -209,9 +209,9 @@ def test_force_grows_with_depth():
 
 @pytest.mark.parametrize("thickness_mm", [1e-3, 1e3])
 def test_extreme_layers_stay_finite(thickness_mm):
-    # Every other cell: so thick a layer takes thousands of steps, and coarse cells are no easier on it.
-    depth = np.ascontiguousarray(scenes()[:, ::2, ::2])
-    result = ContactSolver(Layer(thickness_mm), SIZE // 2, 2 * CELL_MM).solve(depth, 0.3)
+    # Every third cell: the response of so thick a layer takes a grid as wide, which is worked out cell by cell.
+    depth = np.ascontiguousarray(scenes()[:, ::3, ::3])
+    result = ContactSolver(Layer(thickness_mm), SIZE // 3, 3 * CELL_MM).solve(depth, 0.3)
     assert np.isfinite(result.pressure_mpa).all()
     assert np.isfinite(result.displacement_mm).all()
     assert result.residual.max() < 1e-3
