@@ -13,7 +13,7 @@ from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences
 from train.experiments.support.methods import classical_methods
 from train.experiments.support.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
-from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells, thinned
+from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
 from train.report import Report, Row, bootstrap_interval
 
@@ -44,7 +44,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Train absent networks, evaluate all methods, and write table and plot."""
     data = mixed(bench)
     sets = {split: bench.frozen(split) for split in ("validation", "test")}
-    evaluated = {split: thinned(frozen, ONE_IN) for split, frozen in sets.items()}
+    evaluated = {split: frozen.thinned(ONE_IN) for split, frozen in sets.items()}
     rows, test_psnr = [], {}
     for row, figures in (*_classical(bench, data, evaluated), *_networks(bench, data, sets["validation"], evaluated)):
         rows.append(row)

@@ -34,7 +34,7 @@ from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.generation_config import SEED
 from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
-from train.experiments.support.workbench import Workbench, thinned
+from train.experiments.support.workbench import Workbench
 from train.physics.sensor_noise import LARGEST_COUNTS
 from train.report import Report, Row, with_interval
 
@@ -72,7 +72,7 @@ class Played:
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `dead`; the full run takes a few minutes."""
     frozen = load_frozen_set(bench.use(BUNDLE_DIR / "frozen.npz"))
-    frozen = thinned(frozen, len(frozen) // 4 if bench.quick else _FRAMES_APART)
+    frozen = frozen.thinned(len(frozen) // 4 if bench.quick else _FRAMES_APART)
     estimator = load_estimator(bench.use(TAXELS), (USPA44.rows, USPA44.cols))
     report = Report("dead", folder, __file__, bench.used, quick=bench.quick)
     report.say(
