@@ -159,8 +159,8 @@ class Contract:
         version = _value(metadata, "version")
         # Before the other keys, which another version may lack.
         if version not in (CONTRACT_VERSION, *EARLIER_VERSIONS):
-            earlier = ", ".join(map(str, EARLIER_VERSIONS))
-            expected = f"expected {CONTRACT_VERSION}, or {earlier}: export the model again with this release"
+            earlier = " or ".join(map(str, EARLIER_VERSIONS))
+            expected = f"expected {CONTRACT_VERSION}, {earlier}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
         values = {key: _value(metadata, key) for key in _keys(version)}
         _check(values)

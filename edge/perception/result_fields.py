@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
-from edge.perception.pattern_check import REASONS
+from edge.perception.pattern_check import REASONS, dropped_taps
 from edge.perception.result import Result, mask_bits
 from edge.perception.wrench import Wrench
 from firmware_bridge.scans.scan import Scan, VendorReading
@@ -35,6 +35,7 @@ _REAL: Final = Kind("number", "<f4", "d", "float64", math.nan)
 _NUMBER: Final = Kind("integer", "<i8", "q", "int64")
 _NUMBER_OR_NOT: Final = Kind("integer", "<i8", "q", "int64", -1)
 _SMALL: Final = Kind("integer", "<i2", "i", "int32")
+_SMALL_OR_NOT: Final = Kind("integer", "<i2", "i", "int32", -1)
 _BITS: Final = Kind("integer", "<u8", "Q", "uint64")
 _YES_OR_NO: Final = Kind("boolean", "|i1", "i", "int8", -1)
 _IS_THERE: Final = Kind("boolean", "|b1", "i", "bool", False)
@@ -161,6 +162,8 @@ FIELDS: Final = (
           "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
     Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
           "linear estimate that replaces one that is not to be believed", byte=600),
+    Field("taps_dropped", _SMALL_OR_NOT, "tap_mismatch", "earlier taps that the pattern is made "
+          "without, because they do not belong to this contact; unknown without earlier taps", make=dropped_taps, out=_RECORD_NPZ, byte=604),
     Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
           "noise, gains and drift", decimals=4, byte=584),
     Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "

@@ -172,6 +172,7 @@ BROKEN_VALUES = {
     "pad_inputs": [["thickness", 4.5, 1.0]],
     "takes_gains": 1,
     "traction_scale": 2.0,
+    "trust": {"forward": {}},
 }
 
 
@@ -195,7 +196,7 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
     metadata = make_contract(version=1).to_metadata()
     del metadata[KEY_PREFIX + "interval_factor"]
-    with pytest.raises(ModelError, match=r"'version' is 1, expected 5 or 4: export the model again"):
+    with pytest.raises(ModelError, match=r"'version' is 1, expected 6, 4 or 5: export the model again"):
         ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
 
 
