@@ -163,7 +163,8 @@ FIELDS: Final = (
     Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
           "linear estimate that replaces one that is not to be believed", byte=600),
     Field("taps_dropped", _SMALL_OR_NOT, "tap_mismatch", "earlier taps that the pattern is made "
-          "without, because they do not belong to this contact; unknown without earlier taps", make=dropped_taps, out=_RECORD_NPZ, byte=604),
+          "without, because they do not belong to this contact; unknown without earlier taps", make=dropped_taps,
+          out=_RECORD_NPZ, byte=604),
     Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
           "noise, gains and drift", decimals=4, byte=584),
     Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "
