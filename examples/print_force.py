@@ -37,8 +37,10 @@ def tell(event: Event) -> None:
 def main() -> None:
     """Open a source, iterate over its results, and print them."""
     parser = argparse.ArgumentParser(description="Print the force on each pad.")
-    parser.add_argument("--source", action="append", default=[], help="as of edge-sr; may be repeated, with names")
-    parser.add_argument("--sensor", help="what edge-sr doctor wrote")
+    parser.add_argument(
+        "--source", action="append", default=[], help="source, as for edge-sr; repeated for two fingers, with names"
+    )
+    parser.add_argument("--sensor", help="sensor file of edge-sr doctor")
     parser.add_argument("--duration-s", type=float, help="stop after this time")
     options = parser.parse_args()
     try:

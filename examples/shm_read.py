@@ -52,12 +52,12 @@ def main(name: str, sensor: str, pretend: bool) -> None:
     while True:
         memory = attach(name)
         half = latest(memory, sensor, pretend=pretend)
-        told = "nothing to act on"
+        shown = "nothing to act on"
         if half is not None:
             height, width, _, _, pattern_at = unpack_from("<5I", memory, 40)
             pattern = np.frombuffer(half, "<f4", height * width, pattern_at).reshape(height, width)  # NaN without one
-            told = f"{unpack_from('<d', half, 104)[0]:.0f} counts, {pattern.max():.3f} mm at most"
-        print(told, flush=True)
+            shown = f"{unpack_from('<d', half, 104)[0]:.0f} counts, {pattern.max():.3f} mm at most"
+        print(shown, flush=True)
         time.sleep(0.1)
 
 

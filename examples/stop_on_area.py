@@ -76,7 +76,7 @@ class Grip:
             oldest_ms: age of a reading, or time without one, at which to stop.
             name: of the one sensor to use; None for all.
         """
-        self.why = "it never began: nothing was heard"
+        self.why = "it never began: no scan arrived"
         self.reached = False
         self._gripper = gripper
         self._area_mm2 = area_mm2
@@ -85,7 +85,7 @@ class Grip:
         self._name = name
         self._missing = frozenset[str]() if name is None else frozenset({name})
         self._first_ns: int | None = None
-        self._heard_ns: dict[str, int] = {}
+        self._received_ns: dict[str, int] = {}
         self._free: set[str] = set()
         self._closing = False
         self._ended = threading.Event()
@@ -98,7 +98,7 @@ class Grip:
         stream = Stream(
             source,
             runtime,
-            on_event=self._hear,
+            on_event=self._on_event,
             on_wait=self._mind_silence,
             stop=self._ended,
             duration_s=duration_s,
@@ -118,7 +118,7 @@ class Grip:
         if self._name not in (None, scan.sensor):
             return
         self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
-        self._heard_ns[scan.sensor] = scan.time_ns if scan.device_ns is None else scan.device_ns
+        self._received_ns[scan.sensor] = scan.time_ns if scan.device_ns is None else scan.device_ns
         self._free.discard(scan.sensor)
         wrong = self._what_is_wrong(result)
         if wrong is not None:
@@ -132,12 +132,12 @@ class Grip:
 
     def _begin(self, after_ns: int) -> None:
         """Close if every sensor has sent readings, and every pad is free."""
-        settled = after_ns >= SETTLING_NS and self._heard_ns.keys() >= self._missing
-        if settled and self._free == self._heard_ns.keys() and not self._closing:
+        settled = after_ns >= SETTLING_NS and self._received_ns.keys() >= self._missing
+        if settled and self._free == self._received_ns.keys() and not self._closing:
             self._closing = True
             self._gripper.close()
 
-    def _hear(self, event: Event) -> None:
+    def _on_event(self, event: Event) -> None:
         """End on any event (lost, silent, in trouble) unless it is of a sensor that is not used."""
         if self._name is None or event.sensor in (None, self._name):
             self._end(event.text)
@@ -166,13 +166,13 @@ class Grip:
 
     def _silent(self) -> str | None:
         """Return a message about the first sensor that is silent for too long, or None."""
-        for sensor in self._heard_ns:
+        for sensor in self._received_ns:
             if self._age_ms(sensor) > self._oldest_ms:
                 return f"no reading of sensor {sensor} for {self._age_ms(sensor):.0f} ms"
         return None
 
     def _age_ms(self, sensor: str) -> float:
-        return (time.monotonic_ns() - self._heard_ns[sensor]) / 1e6
+        return (time.monotonic_ns() - self._received_ns[sensor]) / 1e6
 
     def _end(self, why: str) -> None:
         if not self._closing:  # not closing yet; it waits until all sensors are ready
@@ -198,17 +198,17 @@ def positive(text: str) -> float:
 
 def main() -> None:
     """Open a source, grip, and print the reason for the stop."""
-    parser = argparse.ArgumentParser(description="Close a gripper until enough of it touches.")
-    source_help = "as of edge-sr; may be repeated, with names (default: the adapter that is plugged in)"
+    parser = argparse.ArgumentParser(description="Close a gripper until the touched area is large enough.")
+    source_help = "source, as for edge-sr; repeated for two fingers, with names (default: the adapter plugged in)"
     parser.add_argument("--source", action="append", default=[], help=source_help)
-    parser.add_argument("--name", help="of the one sensor to go by, such as 4 or left/4 (default: all)")
-    parser.add_argument("--sensor", help="what edge-sr doctor wrote")
-    parser.add_argument("--model", default="stsr-int8", help="file, or bundled model")
+    parser.add_argument("--name", help="name of the only sensor to use, such as 4 or left/4 (default: all)")
+    parser.add_argument("--sensor", help="sensor file of edge-sr doctor")
+    parser.add_argument("--model", default="stsr-int8", help="model file, or bundled model")
     parser.add_argument("--area-mm2", type=positive, required=True, help="touched area at which to stop")
     parser.add_argument("--most-counts", type=positive, default=20_000, help="summed z at which to stop in any case")
     parser.add_argument("--oldest-ms", type=positive, default=100, help="age of a reading at which to stop in any case")
     parser.add_argument("--duration-s", type=positive, default=60, help="stop after this time in any case")
-    parser.add_argument("--pretend", action="store_true", help="go also by a sensor that is none")
+    parser.add_argument("--pretend", action="store_true", help="accept an emulated sensor or a recording")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, end)
     limits = {"most_counts": options.most_counts, "oldest_ms": options.oldest_ms}
@@ -216,7 +216,7 @@ def main() -> None:
     try:
         with open_source(*options.source, sensor=options.sensor) as source:
             if source.kind != "device" and not options.pretend:
-                sys.exit(f"stop_on_area: {source.name} is {source.kind}, no sensor: --pretend goes by it all the same")
+                sys.exit(f"stop_on_area: {source.name} is {source.kind}, not a sensor: pass --pretend to accept it")
             grip.run(source, options.model, options.duration_s)
         print(f"why: {grip.why}", flush=True)
     except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit

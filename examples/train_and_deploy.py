@@ -68,15 +68,15 @@ def deploy(model: Path, source_text: str | None, duration_s: float) -> None:
 
 def main() -> None:
     """Train, then run."""
-    parser = argparse.ArgumentParser(description="Train on an object of your own, and run what came of it.")
+    parser = argparse.ArgumentParser(description="Train on an object of your own, and run the model.")
     parser.add_argument("mesh", type=Path, help="STL, OBJ or PLY, in millimetres")
     parser.add_argument("--out", type=Path, required=True, help="folder for everything; its name is the model's")
     parser.add_argument("--sequences", type=int, default=9000, help="simulated presses (9000)")
-    parser.add_argument("--figures", type=int, default=0, help="presses of as many random figures beside them (0)")
-    parser.add_argument("--steps", type=int, default=16_000, help="of training (16000)")
-    parser.add_argument("--seed", type=int, default=1, help="of everything random (1)")
-    parser.add_argument("--source", help="as of edge-sr, to try it on (default: the adapter that is plugged in)")
-    parser.add_argument("--duration-s", type=float, default=10, help="try it for so long (10)")
+    parser.add_argument("--figures", type=int, default=0, help="number of random figures to press in addition (0)")
+    parser.add_argument("--steps", type=int, default=16_000, help="training steps (16000)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of everything random (1)")
+    parser.add_argument("--source", help="source to try it on, as for edge-sr (default: the adapter plugged in)")
+    parser.add_argument("--duration-s", type=float, default=10, help="seconds to try it (10)")
     options = parser.parse_args()
     model = train(
         options.mesh,

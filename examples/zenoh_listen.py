@@ -51,8 +51,8 @@ def main(key: str, endpoint: str = "tcp/127.0.0.1:7447") -> None:
             elif what == "pattern":
                 header, maps = unpack(sample.payload.to_bytes())
                 # "source" must be "device" before a robot acts on it.
-                told = f"{header['sensor']} {header['source']} scan {header['scan']}"
-                tell(f"{told}: {header['force_counts']} counts, {maps['pattern'].max():.3f} mm at most")
+                place = f"{header['sensor']} {header['source']} scan {header['scan']}"
+                tell(f"{place}: {header['force_counts']} counts, {maps['pattern'].max():.3f} mm at most")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A network of the registry with random weights as an ONNX file, to hold run times against.
+"""A network of the registry with random weights as an ONNX file, for comparisons of run times.
 
 python -m export.peer mtsr4 --out seed-mtsr4.onnx
 edge-sr bench --against seed-mtsr4.onnx
@@ -56,8 +56,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.peer", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("network", choices=NETWORKS, metavar="NETWORK", help=f"one of {', '.join(NETWORKS)}")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .onnx file to write")
-    parser.add_argument("--seed", type=int, default=0, help="of the weights (default: 0)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".onnx file to write")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the weights (default: 0)")
     parser.add_argument("--scale", type=int, default=SCALE, help=f"pixels per taxel pitch (default: {SCALE})")
     options = parser.parse_args(arguments)
     try:

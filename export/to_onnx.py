@@ -153,7 +153,7 @@ def export(
         contract = replace(contract, training_sha256=mixed_sha256)
         model = well.model if batch == 1 else to_model(well.net, geometry, batch)
         parity = check_parity(well.net, model, frozen, contract)
-        facts = [f"parity {parity:.1e}", "the float32 of what was trained on for integers"]
+        facts = [f"parity {parity:.1e}", "float32 after fine-tuning for int8"]
         lines.append(writer.write(checkpoint.stem, model, well.model, contract, facts))
     in_float = writer.error(well.model, contract)
     model = well.integers if batch == 1 else quantised(to_model(well.net, geometry, batch), seen, every=every)
@@ -161,7 +161,7 @@ def export(
     contract = replace(contract, arithmetic="int8", test_error={}, confidence={})
     in_integers = writer.error(well.integers, contract)
     facts = [
-        f"{integer} of {convs} convolutions in integers",
+        f"{integer} of {convs} convolutions in int8",
         *_cost(in_float, in_integers),
         *[well.said] * bool(well.said),
     ]
@@ -174,7 +174,7 @@ def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> li
     if not in_float:
         return []
     lost_db = in_float["psnr_db"] - in_integers["psnr_db"]
-    facts = [f"{lost_db:.3f} dB lost to them"]
+    facts = [f"{lost_db:.3f} dB lost to quantisation"]
     if lost_db > MOST_LOSS_DB:
         facts.append(_COSTLY)
     if "coverage_90" in in_float and abs(in_integers["coverage_90"] - in_float["coverage_90"]) > MOST_COVERAGE_CHANGE:
@@ -189,25 +189,29 @@ def _batch(text: str) -> int | str:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.to_onnx", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("checkpoints", type=Path, nargs="+", help="NAME.pt of train.fit")
+    parser.add_argument("checkpoints", type=Path, nargs="+", help="NAME.pt, written by train.fit")
     parser.add_argument("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
     parser.add_argument(
-        "--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}', as given"
+        "--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them"
     )
-    parser.add_argument("--validation", type=Path, metavar="FILE", help="presses that nothing is trained on")
     parser.add_argument(
         "--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust"
     )
-    parser.add_argument("--int8", type=Path, nargs="+", metavar="DATA", help="NAME-int8.onnx, ranges of these taps")
     parser.add_argument(
-        "--all-integers", action="store_true", help="with --int8: all convolutions, not the large alone"
+        "--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training"
+    )
+    parser.add_argument(
+        "--int8", type=Path, nargs="+", metavar="DATA", help="write NAME-int8.onnx too, with ranges from these taps"
+    )
+    parser.add_argument(
+        "--all-integers", action="store_true", help="with --int8: quantise all convolutions, not only the large ones"
     )
     parser.add_argument(
         "--fine-tune-steps",
         type=int,
         metavar="N",
-        help=f"with --int8: train on for them (default: {FINE_TUNE_STEPS}, where they cost over {MOST_LOSS_DB} dB; "
-        "0: never)",
+        help=f"with --int8: fine-tune for so many steps (default: {FINE_TUNE_STEPS}, if quantisation costs over "
+        f"{MOST_LOSS_DB} dB; 0: never)",
     )
     options = parser.parse_args(arguments)
     steps: int | None = options.fine_tune_steps
@@ -252,9 +256,11 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:
         sys.exit(f"export: {error.filename}: {error.strerror}")
     costly = {line.partition(":")[0]: [cost for cost in (_COSTLY, _UNSURE) if cost in line] for line in lines}
-    told = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
-    if told:
-        sys.exit(f"export: integers cost too much in {', '.join(told)}: use the float32 model, or fine-tune for longer")
+    lossy = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
+    if lossy:
+        sys.exit(
+            f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model or fine-tune longer"
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Do models compute what their networks compute? A table; exit code 1 where a bound is broken.
+"""Compare models with their networks in a table; the exit code is 1 where a bound is broken.
 
 python -m export.verify edge/models/*.onnx
 
@@ -197,7 +197,7 @@ def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints
         source = in_float(path)
         if not source.exists():
             raise ExportError(
-                f"{source.name}, of which these are the integers, is not beside it: put it there, or name the "
+                f"the float32 model {source.name} is not in the folder of its int8 model: put it there, or name the "
                 "folder of its checkpoint with --checkpoints"
             )
         graph = _load(source)
@@ -253,11 +253,11 @@ def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os
     parser = argparse.ArgumentParser(prog="python -m export.verify", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
     parser.add_argument("--checkpoints", type=Path, help="folder of NAME.pt (default: the graphs' own weights)")
-    told = environment.get("TACTILE_RECORDINGS")
+    folder = environment.get("TACTILE_RECORDINGS")
     parser.add_argument(
         "--recordings",
         type=Path,
-        default=Path(told) if told else None,
+        default=Path(folder) if folder else None,
         help="folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)",
     )
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")

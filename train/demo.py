@@ -113,11 +113,11 @@ def _magnet() -> NDArray[np.float32]:
     coming = np.linspace(0, 1, MAGNET_FRAMES)
     course = np.concatenate([coming, np.ones(MAGNET_ALONE_FRAMES + TAP_FRAMES), coming[::-1], np.zeros(GAP_FRAMES)])
     distance_mm = (far + (near - far) * course)[:, None, None]
-    place_mm = [distance_mm * part / math.hypot(*_TOWARDS) for part in _TOWARDS]
-    x_mm = (np.arange(USPA44.cols) - (USPA44.cols - 1) / 2) * USPA44.pitch_mm
-    y_mm = (np.arange(USPA44.rows) - (USPA44.rows - 1) / 2)[:, None] * USPA44.pitch_mm
-    away_mm = (x_mm - place_mm[0], y_mm - place_mm[1], -place_mm[2])
-    axis = tuple(np.array(part / math.hypot(*_MOMENT)) for part in _MOMENT)
-    field = np.stack(np.broadcast_arrays(*dipole_mt(Magnet(), away_mm, axis)), axis=1)
+    x_mm, y_mm, z_mm = (distance_mm * part / math.hypot(*_TOWARDS) for part in _TOWARDS)
+    east, south, up = (np.array(part / math.hypot(*_MOMENT)) for part in _MOMENT)
+    chip_x_mm = (np.arange(USPA44.cols) - (USPA44.cols - 1) / 2) * USPA44.pitch_mm
+    chip_y_mm = (np.arange(USPA44.rows) - (USPA44.rows - 1) / 2)[:, None] * USPA44.pitch_mm
+    field_mt = dipole_mt(Magnet(), (chip_x_mm - x_mm, chip_y_mm - y_mm, -z_mm), (east, south, up))
+    field = np.stack(np.broadcast_arrays(*field_mt), axis=1)
     field -= field[-1]
     return (field * (MAGNET_COUNTS / np.abs(field).max())).astype(np.float32)

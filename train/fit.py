@@ -103,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (TrainError, ValueError) as error:
         sys.exit(f"fit: {error}")
     except KeyboardInterrupt:
-        sys.exit("fit: stopped; the same command goes on where it was")
+        sys.exit("fit: stopped; the same command continues")
     _say(f"all in {(time.monotonic() - started_s) / 60:.1f} min")
     leave_group()
 
@@ -137,21 +137,21 @@ def _name(network: str) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.fit", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="where to write the checkpoints")
+    parser.add_argument("folder", type=Path, help="folder for the checkpoints")
     parser.add_argument(
         "--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses, or of train.generate"
     )
-    parser.add_argument("--validation", type=Path, help="presses that nothing is trained on")
-    parser.add_argument("--shorten", type=int, default=1, help="divide the bundled networks' steps, to try things out")
+    parser.add_argument("--validation", type=Path, help="presses of the validation set, not used for training")
+    parser.add_argument("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
     one = parser.add_argument_group("one network instead of the bundled ones")
     one.add_argument("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))
     one.add_argument(
-        "--name", help="of the checkpoint (default: the network's, with seed- before it for those of the paper)"
+        "--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)"
     )
     one.add_argument("--start", metavar="NAME", help="checkpoint in the same folder to start from")
     one.add_argument("--scale", type=int, default=10, help="pattern pixels per taxel pitch")
     one.add_argument("--steps", type=int, default=9000)
-    one.add_argument("--minutes", type=float, help="end by the clock where that comes first")
+    one.add_argument("--minutes", type=float, help="end after this time, if the steps take longer")
     one.add_argument("--batch", type=int, default=64, help="windows in a batch, shared by all devices")
     one.add_argument("--learning-rate", type=float, default=2e-3)
     one.add_argument("--bf16", action="store_true", help="multiply in bfloat16")

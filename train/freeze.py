@@ -1,4 +1,4 @@
-"""Make what comes with the models: the frozen test set, classical methods, taxels' covariance, a recording.
+"""Make the data that come with the models: the frozen test set, classical methods, taxels' covariance, a recording.
 
 python -m train.freeze edge/models --data data/gripped.npz data/gripped4.npz
 
@@ -108,9 +108,13 @@ def drawn(taps: PressSet | Sequences, windows: int) -> tuple[NDArray[np.float32]
 def main(arguments: list[str] | None = None) -> None:
     """Write classical.npz, taxels.npz, demo.npz, and frozen.npz where it does not exist."""
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="where to write frozen.npz, classical.npz, taxels.npz and demo.npz")
+    parser.add_argument("folder", type=Path, help="folder for frozen.npz, classical.npz, taxels.npz and demo.npz")
     parser.add_argument(
-        "--data", type=Path, nargs="+", required=True, help="taps that classical methods and taxels are fitted on"
+        "--data",
+        type=Path,
+        nargs="+",
+        required=True,
+        help="taps to fit the classical methods and the taxels' covariance on",
     )
     options = parser.parse_args(arguments)
     folder: Path = options.folder

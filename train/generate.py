@@ -1,4 +1,4 @@
-"""Make a dataset of taps on all cores, or on a cluster; a run that was cut short goes on where it was.
+"""Make a dataset of taps on all cores, or on a cluster; an interrupted run continues.
 
     python -m train.generate data/train.npz --glyphs 2000 --polygons 2000 --count 9000
 
@@ -66,7 +66,7 @@ def generate(
     """
     if path.exists():
         if (there := load_sequences(path)).config != config.facts():
-            raise DatasetError(f"{path} is there and was made otherwise: delete it, or write to another file")
+            raise DatasetError(f"{path} exists and was made with other settings: delete it, or write to another file")
         progress(len(there) * there.taps)
         return there
     if jobs == 0:
@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"train.generate: {error}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("train.generate: interrupted; the same command goes on from here\n")
+        sys.stderr.write("train.generate: interrupted; the same command continues\n")
         return _INTERRUPTED
     rate = total / (time.monotonic() - started_s)
     sys.stdout.write(
@@ -181,25 +181,26 @@ def _config(options: argparse.Namespace) -> Generation:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.generate", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, metavar="OUT.npz")
-    parser.add_argument(
-        "--surfaces", default="all", help="all, plate1, plate2, none, or names with commas between them (all)"
-    )
+    parser.add_argument("--surfaces", default="all", help="all, plate1, plate2, none, or names with commas (all)")
     parser.add_argument("--glyphs", type=int, default=0, help="random stroke figures to add (0)")
     parser.add_argument("--polygons", type=int, default=0, help="random polygons to add (0)")
     parser.add_argument(
-        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="an STL, OBJ or PLY to add"
+        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add"
     )
-    parser.add_argument("--poses", choices=("random", "paper"), default="random", help="how they are chosen (random)")
+    parser.add_argument("--poses", choices=("random", "paper"), default="random", help="choice of the poses (random)")
     parser.add_argument(
-        "--split", choices=("train", "validation", "test"), default="train", help="of the paper's positions (train)"
+        "--split",
+        choices=("train", "validation", "test"),
+        default="train",
+        help="split of the paper's positions (train)",
     )
     parser.add_argument("--count", type=int, default=9000, help="sequences with random poses (9000)")
-    parser.add_argument("--taps", type=int, default=MAX_TAPS, help=f"in a sequence ({MAX_TAPS})")
-    parser.add_argument("--angle-step-deg", type=float, default=ANGLE_STEP_DEG, help="turn between taps (5)")
-    parser.add_argument("--force-n", type=float, default=FORCE_N, help="at which presses end (9.2)")
+    parser.add_argument("--taps", type=int, default=MAX_TAPS, help=f"taps in a sequence ({MAX_TAPS})")
+    parser.add_argument("--angle-step-deg", type=float, default=ANGLE_STEP_DEG, help="rotation between taps (5)")
+    parser.add_argument("--force-n", type=float, default=FORCE_N, help="force at the end of a press (9.2)")
     parser.add_argument("--pad", choices=[pad.name for pad in PADS], default=USPA44.name, help="sensor model (uSPa44)")
-    parser.add_argument("--seed", type=int, default=1, help="of poses and random figures (1)")
-    parser.add_argument("--jobs", type=int, default=-1, help="processes, -1 for one on each core (-1)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of poses and random figures (1)")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
     return parser
 
 

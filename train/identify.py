@@ -1,4 +1,4 @@
-"""Identify a sensor from its own recordings: the gains of its channels, and what contacts tell of its pad.
+"""Identify a sensor from its own recordings: the gains of its channels, and constants of its pad.
 
     python -m train.identify recordings --out sensor.toml
 
@@ -78,10 +78,10 @@ def found_pad(found: Estimate) -> Pad:
     constants: dict[str, float] = {}
     intervals: dict[str, tuple[float, float]] = {}
     for number, (name, centre, spread) in enumerate(input_scale()):
-        if found.told[number]:
+        if found.determined[number]:
             constants[name] = float(f"{centre + spread * found.constants[number]:.4g}")
             ends = np.clip(
-                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.told)], -1, 1
+                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.determined)], -1, 1
             )
             intervals[name] = (float(f"{centre + spread * ends[0]:.4g}"), float(f"{centre + spread * ends[1]:.4g}"))
     return Pad(**constants, intervals=intervals, gains=tuple(np.exp(found.log_gains).round(4).tolist()))
@@ -108,7 +108,7 @@ def table(sensor: str, found: Estimate) -> str:
         known = (
             f"{pad.constants[name]:10.4g}  {pad.intervals[name][0]:.4g} .. {pad.intervals[name][1]:.4g}"
             if (name in pad.constants)
-            else f"{'-':>10}  not told by these contacts"
+            else f"{'-':>10}  not determined by these contacts"
         )
         lines.append(f"{name:18} {f'{low:.4g} .. {high:.4g}':>18} {known}")
     gains = np.asarray(pad.gains).reshape(len(AXES), USPA44.rows, USPA44.cols)
@@ -141,13 +141,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
-    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
+    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="folder of TRIAL/xela_SENSOR.csv")
+    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="sensor file to extend or to write")
     parser.add_argument(
         "--presses",
         type=Path,
         default=Path("data/gripped.npz"),
-        help="simulated presses of many pads; the mixture fitted to them is kept beside (data/gripped.npz)",
+        help="simulated presses of many pads; the mixture fitted to them is stored next to them (data/gripped.npz)",
     )
     return parser
 

@@ -126,8 +126,8 @@ def run(settings: Settings, out: TextIO, err: TextIO) -> int:
 
 def _tried_load() -> str:
     """Return the description of the load, tried before minutes are spent; later it runs only next to its own rows."""
-    with busy_core() as told:
-        return told
+    with busy_core() as answer:
+        return answer
 
 
 def _make_folder(folder: Path | None) -> None:
@@ -194,15 +194,15 @@ def _run_time(
 ) -> RunTimeRow:
     job = {"subject": asdict(subject), "threads": threads}
     start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, threads)
-    told = measured(job | {"do": "time", "rate_hz": settings.rate_hz, "ticks": settings.ticks}, threads)
-    back_to_back = _times(told["back_to_back"])
+    answer = measured(job | {"do": "time", "rate_hz": settings.rate_hz, "ticks": settings.ticks}, threads)
+    back_to_back = _times(answer["back_to_back"])
     gmac_s = fact.macs / (back_to_back.p50_us * 1e3)
     return RunTimeRow(
         name=subject.name,
         threads=threads,
         load=load,
         back_to_back=back_to_back,
-        paced=Pace(**(told["paced"] | {"times": _times(told["paced"]["times"])})),
+        paced=Pace(**(answer["paced"] | {"times": _times(answer["paced"]["times"])})),
         gmac_s=gmac_s,
         peak_percent=100 * gmac_s / peak_gmac_s,
         start_up_ms=start_up_ms,
@@ -210,8 +210,8 @@ def _run_time(
     )
 
 
-def _times(told: dict[str, Any]) -> Times:
-    figures: dict[str, Any] = told | {"block_p50_us": tuple(told["block_p50_us"])}
+def _times(answer: dict[str, Any]) -> Times:
+    figures: dict[str, Any] = answer | {"block_p50_us": tuple(answer["block_p50_us"])}
     return Times(**figures)
 
 
@@ -228,8 +228,8 @@ def _against(everyone: Sequence[Subject], peer: Subject, record: Record, page: P
     page.section("Against a peer", text, tables.head(tables.AGAINST_COLUMNS))
     for subject in page.tracked(everyone, "against"):
         page.progress(f"{subject.name} against {peer.name}")
-        told = measured(against.job(asdict(subject), asdict(peer)))
-        ratio = intervals.ratio_of(told["subject_us"], told["peer_us"], paired=True)
+        answer = measured(against.job(asdict(subject), asdict(peer)))
+        ratio = intervals.ratio_of(answer["subject_us"], answer["peer_us"], paired=True)
         record.against.setdefault(peer.name, {})[subject.name] = ratio
         page.say(tables.against_line(subject.name, ratio))
 

@@ -59,8 +59,8 @@ def compared(new: Record, old: dict[str, Any], path: Path) -> Comparison:
         peaks = {int(threads): peak for threads, peak in old["peak_gmac_s"].items()}
         return Comparison(
             rows=rows,
-            only_old=tuple(told(*key) for key in olds if key not in news),
-            only_new=tuple(told(*key) for key in news if key not in olds),
+            only_old=tuple(row_text(*key) for key in olds if key not in news),
+            only_new=tuple(row_text(*key) for key in news if key not in olds),
             differences=tuple(_differences(new, old)),
             peak={threads: peak / peaks[threads] for threads, peak in new.peak_gmac_s.items() if threads in peaks},
         )
@@ -68,7 +68,7 @@ def compared(new: Record, old: dict[str, Any], path: Path) -> Comparison:
         raise BenchError(f"{path} is damaged ({repr(error)[:200]}): run that bench again") from error
 
 
-def told(name: str, threads: int, load: bool) -> str:
+def row_text(name: str, threads: int, load: bool) -> str:
     """Return a row in words."""
     return f"{name}, {threads} thread{'s' * (threads > 1)}{', under load' * load}"
 

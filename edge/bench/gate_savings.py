@@ -145,9 +145,11 @@ def _measured(
         if idle and not results[-1].contact:
             counted.run(nothing)
     cpu_us = 1e6 * (time.process_time() - before_s) / len(scans)
-    judged = [(frame, result) for frame, result in zip(frames, results, strict=True) if frame >= 0 and result.contact]
-    truth = frozen.patterns()[[frame for frame, _ in judged]]
-    patterns = np.stack([result.pattern for _, result in judged if result.pattern is not None])
+    with_pattern = [
+        (frame, result) for frame, result in zip(frames, results, strict=True) if frame >= 0 and result.contact
+    ]
+    truth = frozen.patterns()[[frame for frame, _ in with_pattern]]
+    patterns = np.stack([result.pattern for _, result in with_pattern if result.pattern is not None])
     error_db = float(np.mean(psnr_db(patterns, truth, frozen.full_scale_mm)))
-    taps_used = float(np.mean([result.taps_used for _, result in judged]))
+    taps_used = float(np.mean([result.taps_used for _, result in with_pattern]))
     return Saving(left_out, model.name, len(scans), counted.windows, cpu_us, taps_used, error_db)

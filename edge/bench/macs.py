@@ -96,13 +96,13 @@ def counted(events: Sequence[dict[str, Any]]) -> Macs:
     """Return the multiply-accumulates in the events of a profile."""
     count, uncounted = 0, set[str]()
     for event in events:
-        told = event.get("args", {})
+        details = event.get("args", {})
         # Only the event of a node's own work holds shapes.
-        if "input_type_shape" not in told:
+        if "input_type_shape" not in details:
             continue
-        operator = told["op_name"]
+        operator = details["op_name"]
         if operator in _COUNTED:
-            inputs, outputs = _shapes(told["input_type_shape"]), _shapes(told["output_type_shape"])
+            inputs, outputs = _shapes(details["input_type_shape"]), _shapes(details["output_type_shape"])
             count += _COUNTED[operator](inputs, outputs[0])
         elif operator in _UNCOUNTED:
             uncounted.add(operator)

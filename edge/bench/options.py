@@ -7,10 +7,10 @@ from typing import Final
 from edge.terminal.argument_types import Parser, positive, whole
 
 BENCH_HELP: Final = """\
-Run time is taken back to back, and one
-inference a tick, idle in between, as on
-a robot. Half a minute a row: nothing
-else should run meanwhile.
+Run time is measured back to back, and
+paced: one inference a tick, as on a
+robot. A row takes half a minute. No
+other program should run meanwhile.
 
 examples:
   edge-sr bench --out today
@@ -18,8 +18,8 @@ examples:
   edge-sr bench --threads 1 \\
           --compare before/bench.json
 
-Ctrl-C ends it with exit code 130; what
-was measured is written.
+Ctrl-C ends it with exit code 130, after
+the rows measured so far are written.
 """
 
 
@@ -32,17 +32,29 @@ def bench_parser() -> argparse.ArgumentParser:
         epilog=BENCH_HELP,
     )
     add = parser.add_argument
-    add("--out", metavar="DIR", type=Path, help="write bench.json, .csv, .md and .png there")
-    add("--rate-hz", metavar="R", type=positive, default=100.0, help="pace (default 100)")
+    add("--out", metavar="DIR", type=Path, help="folder for bench.json, .csv, .md and .png")
+    add("--rate-hz", metavar="R", type=positive, default=100.0, help="paced ticks a second (default 100)")
     add("--ticks", metavar="N", type=whole(10), default=3000, help="paced ticks a row (default 3000)")
-    add("--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="threads of one run (default 1 2)")
-    add("--load", action="store_true", help="each row again with the last core busy")
-    add("--models", metavar="DIR", type=Path, help="your own models too")
-    against_help = "ratios to the run times of any ONNX files on floats"
+    add(
+        "--threads",
+        metavar="N",
+        type=whole(1),
+        nargs="+",
+        default=[1, 2],
+        help="numbers of threads to measure (default 1 2)",
+    )
+    add("--load", action="store_true", help="measure each row again with the last core busy")
+    add("--models", metavar="DIR", type=Path, help="folder of your own models, measured as well")
+    against_help = "ratios to the run times of these ONNX files, with float inputs"
     add("--against", metavar="FILE", type=Path, nargs="+", default=[], help=against_help)
-    add("--compare", metavar="OLD.json", type=Path, help="ratios to an earlier bench of --out")
-    add("--by-surface", action="store_true", help="PSNR of each surface")
-    add("--system", action="store_true", help="the whole program and nothing else: 6 minutes with 3000 ticks")
-    add("--soak", metavar="MINUTES", type=positive, help="with --system: run it for so long, does it grow or drift?")
-    add("--only", metavar="NAME", nargs="+", help="these methods alone")
+    add("--compare", metavar="OLD.json", type=Path, help="ratios to an earlier bench")
+    add("--by-surface", action="store_true", help="report the PSNR of each surface")
+    add("--system", action="store_true", help="measure the whole program only: 6 minutes with 3000 ticks")
+    add(
+        "--soak",
+        metavar="MINUTES",
+        type=positive,
+        help="with --system: also run it this long, for growth of memory and drift of latency",
+    )
+    add("--only", metavar="NAME", nargs="+", help="measure only these methods")
     return parser

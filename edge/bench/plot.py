@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.bench.errors import BenchError
-from edge.bench.pareto import front
-from edge.bench.record import FrontRow
+from edge.bench.record import FrontRow, front
 from firmware_bridge.extras import how_to_install
 
 _LABELS: Final = 34

@@ -32,11 +32,11 @@ def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
         BenchError: the child failed; its last line is in the message.
     """
     with _child(threads) as child:
-        said, complaint = child.communicate(json.dumps(job))
+        output, complaint = child.communicate(json.dumps(job))
     if child.returncode != 0:
         last = (complaint.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
         raise BenchError(f"{job['do']} of {job.get('subject', {}).get('name', 'the machine')} failed: {last}")
-    return json.loads(said)
+    return json.loads(output)
 
 
 def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None]:
@@ -49,10 +49,10 @@ def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None
     resident_mb: list[float] = []
     for _ in range(STARTS):
         spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
-        told = measured(job, threads)
-        took_ms.append((told["first_ns"] - spawned_ns) / 1e6)
-        if told["resident_mb"] is not None:
-            resident_mb.append(told["resident_mb"])
+        answer = measured(job, threads)
+        took_ms.append((answer["first_ns"] - spawned_ns) / 1e6)
+        if answer["resident_mb"] is not None:
+            resident_mb.append(answer["resident_mb"])
     return float(np.median(took_ms)), float(np.median(resident_mb)) if resident_mb else None
 
 
@@ -70,10 +70,10 @@ def busy_core() -> Iterator[str]:
         raise UsageError("--load keeps another core busy, but this process may use one: bench without it")
     pinned = hasattr(os, "sched_setaffinity")
     with _child(1) as child:
-        asked, said = cast(TextIO, child.stdin), cast(TextIO, child.stdout)
+        asked, output = cast(TextIO, child.stdin), cast(TextIO, child.stdout)
         asked.write(json.dumps({"do": "spin", "core": cores[-1] if pinned else None}))
         asked.close()
-        if not said.readline():
+        if not output.readline():
             raise BenchError("the load could not be started: its process ended at once")
         yield f"core {cores[-1]} kept busy" if pinned else "a process that keeps a core busy, not held to one"
 

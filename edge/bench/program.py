@@ -97,7 +97,7 @@ class Program:
             BenchError: the program ended.
         """
         if self._process.stdout is None:
-            raise ValueError("the program's stdout is no pipe")
+            raise ValueError("the program's stdout is not a pipe")
         got: list[tuple[int, bytes]] = []
         end_ns = time.monotonic_ns() + int(seconds * 1e9)
         now_ns = 0
@@ -126,8 +126,8 @@ class Program:
 
     def preemptions(self) -> int:
         """Count the times that one of its threads lost its processor against its will."""
-        told = [(task / "status").read_text() for task in (self._folder / "task").iterdir()]
-        return sum(int(text.rpartition("nonvoluntary_ctxt_switches:")[2]) for text in told)
+        texts = [(task / "status").read_text() for task in (self._folder / "task").iterdir()]
+        return sum(int(text.rpartition("nonvoluntary_ctxt_switches:")[2]) for text in texts)
 
     def resident_mb(self) -> float:
         """Return its resident memory, in [MB]."""

@@ -12,7 +12,6 @@ from edge.bench.accuracy import ErrorRow
 from edge.bench.errors import BenchError
 from edge.bench.gate_savings import Saving
 from edge.bench.machine import Machine
-from edge.bench.pareto import front
 from edge.bench.ratios import Ratio
 from edge.bench.soak import Soak
 from edge.bench.system import StartUp, SystemRow
@@ -139,8 +138,8 @@ class Record:
             return []
         fewest = min(row.threads for row in self.run_times)
         times = {row.name: row for row in self.run_times if row.threads == fewest and not row.load}
-        judged = [row for row in self.errors if row.name in times]
-        points = [(row.error["rmse_percent"], times[row.name].paced.times.p50_us) for row in judged]
+        timed = [row for row in self.errors if row.name in times]
+        points = [(row.error["rmse_percent"], times[row.name].paced.times.p50_us) for row in timed]
         rows = [
             FrontRow(
                 name=row.name,
@@ -151,15 +150,15 @@ class Record:
                 back_to_back_p50_us=times[row.name].back_to_back.p50_us,
                 on_front=on_front,
             )
-            for row, on_front in zip(judged, front(points), strict=True)
+            for row, on_front in zip(timed, front(points), strict=True)
         ]
         return sorted(rows, key=lambda row: row.paced_p50_us)
 
     def to_json(self) -> str:
         """Return the record as JSON, with the front in it."""
-        told = {"format": FORMAT, "version": VERSION} | asdict(self)
-        told["front"] = [asdict(row) for row in self.front_rows()]
-        return json.dumps(told, indent=1) + "\n"
+        content = {"format": FORMAT, "version": VERSION} | asdict(self)
+        content["front"] = [asdict(row) for row in self.front_rows()]
+        return json.dumps(content, indent=1) + "\n"
 
     def to_csv(self) -> str:
         """Return a flat line for each error and run time, each row of the whole program and each saving.
@@ -221,16 +220,27 @@ def read_record(path: Path) -> dict[str, Any]:
         BenchError: no such file, no bench, or one of another version.
     """
     try:
-        told = json.loads(read_bounded(path, MOST_FILE_BYTES))
+        content = json.loads(read_bounded(path, MOST_FILE_BYTES))
     except (OSError, ValueError, RecursionError) as error:
         raise BenchError(
             f"{path} cannot be read ({error}): expected the bench.json of 'edge-sr bench --out'"
         ) from error
-    kind: Sequence[object] = (told.get("format"), told.get("version")) if isinstance(told, dict) else (None, None)
+    kind: Sequence[object] = (
+        (content.get("format"), content.get("version")) if isinstance(content, dict) else (None, None)
+    )
     if kind[0] != FORMAT:
-        raise BenchError(f"{path} is no bench: expected the bench.json of 'edge-sr bench --out'")
+        raise BenchError(f"{path} is not a bench: expected the bench.json of 'edge-sr bench --out'")
     if kind[1] != VERSION:
         raise BenchError(
             f"{path} is of version {repr(kind[1])[:40]}, expected {VERSION}: run that bench again with this release"
         )
-    return told
+    return content
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return, for each point, True if no other point is at least as small in both numbers and smaller in one."""
+    return [not any(_beats(other, point) for other in points) for point in points]
+
+
+def _beats(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return one != other and one[0] <= other[0] and one[1] <= other[1]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow
-from edge.bench.compare import Compared, Comparison, told
+from edge.bench.compare import Compared, Comparison, row_text
 from edge.bench.ratios import Ratio
 from edge.bench.record import Facts, FrontRow, Record, RunTimeRow
 from edge.bench.timing import Times
@@ -34,7 +34,7 @@ def head(columns: Sequence[str]) -> str:
 def about(record: Record) -> str:
     """Describe the date, the command, the machine and the settings."""
     settings = record.settings
-    few = "" if settings["ticks"] >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses say little)"
+    few = "" if settings["ticks"] >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses mean little)"
     return (
         f"{record.date}, `{record.command}`\n\n{record.machine}. {settings['ticks']} ticks a row at "
         f"{settings['rate_hz']:g} Hz{few}; threads {' and '.join(map(str, settings['threads']))}; "
@@ -121,8 +121,8 @@ def front_text(rows: Sequence[RunTimeRow]) -> str:
     """Describe the table of the front."""
     threads = min(row.threads for row in rows)
     return (
-        f"On {threads} thread{'s' * (threads > 1)}, the other core idle. * is on the Pareto front: none is at least as "
-        "good in both RMSE and paced p50."
+        f"On {threads} thread{'s' * (threads > 1)}, the other core idle. * is on the Pareto front: no other is at "
+        "least as good in both RMSE and paced p50."
     )
 
 
@@ -143,7 +143,7 @@ def front_line(row: FrontRow) -> str:
 
 def against_text(peer: str, weights: str | None) -> str:
     """Describe the table of ratios to the peer."""
-    nobody = f" Its weights are {weights}: its run time is what it is, its patterns are nothing." if weights else ""
+    nobody = f" Its weights are {weights}: its run time is valid, its patterns are not." if weights else ""
     return (
         f"Against {peer}, run time only.{nobody} Both in one process, block by block in turn, back to back on one "
         "thread; medians with 95 % intervals."
@@ -180,7 +180,7 @@ def compare_line(row: Compared) -> str:
 
 def progress_text(name: str, threads: int, load: bool) -> str:
     """Name the row that is being measured."""
-    return f"run time of {told(name, threads, load)}"
+    return f"run time of {row_text(name, threads, load)}"
 
 
 def _percentiles(times: Times) -> tuple[str, str, str, str]:

@@ -1,4 +1,4 @@
-"""The whole program for minutes, taking turns between rest and contact: does memory grow, or latency drift?
+"""The whole program for minutes, taking turns between rest and contact, for growth of memory and drift of latency.
 
     python -m edge.bench.soak MINUTES
 
@@ -80,10 +80,10 @@ def soak(minutes: float) -> Soak:
         program.lines(WARM_UP_S)
         count = max(3, round(60 * minutes / WINDOW_S))
         windows = list(tracked(_windows(program, count), "soak", "window", count))
-    return judged(windows)
+    return evaluated(windows)
 
 
-def judged(windows: Sequence[Window]) -> Soak:
+def evaluated(windows: Sequence[Window]) -> Soak:
     """Compute the result of a soak from its windows, three at least."""
     third = len(windows) // 3
     first, last = (np.median([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))
@@ -114,7 +114,7 @@ def slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 when done, 1 on a clear error."""
     parser = argparse.ArgumentParser(prog="python -m edge.bench.soak", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("minutes", type=float, metavar="MINUTES", help="how long; a quarter of one at least")
+    parser.add_argument("minutes", type=float, metavar="MINUTES", help="length of the run, .25 at least")
     minutes: float = parser.parse_args(arguments).minutes
     if not 0 < minutes < math.inf:
         parser.error(f"MINUTES is {minutes:g}, expected a positive number")

@@ -67,7 +67,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     summary = (__doc__ or "").splitlines()[0]
     parser = argparse.ArgumentParser(prog="python -m edge.bench.stale_reports", description=summary)
-    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "reports", help="default: reports")
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=ROOT / "reports", help="folder of the reports (default: reports)"
+    )
     for line in lines(parser.parse_args(arguments).folder):
         sys.stdout.write(f"{line}\n")
 

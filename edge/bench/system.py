@@ -178,13 +178,13 @@ def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, li
     first, last = lines[0].record["counters"], lines[-1].record["counters"]
     lost = {key: last[key] - first[key] for key in ("late", "dropped", "overruns", "torn_wire")}
     run_times_us = [line.record["run_time_us"] for line in lines if line.record["run_time_us"] is not None]
-    told_apart = not (last["overruns"] or last["missing_taxels"] or last["duplicates"])
+    distinguishable = not (last["overruns"] or last["missing_taxels"] or last["duplicates"])
     return _row(
         name,
         len(lines),
         used,
         run_time=summary([round(1e3 * run_time_us) for run_time_us in run_times_us]) if run_times_us else None,
-        latency=summary(latencies_ns(lines, stamps_ns)) if told_apart else None,
+        latency=summary(latencies_ns(lines, stamps_ns)) if distinguishable else None,
         losses=Losses(lost["late"], lost["dropped"], lost["overruns"], lost["torn_wire"]),
     )
 

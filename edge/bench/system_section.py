@@ -32,22 +32,22 @@ def show_system(scans: int, soak_minutes: float | None, record: Record, page: Pa
         BenchError: a process ended.
         UsageError: there is no second core to keep busy.
     """
-    told = record.system = SystemRecord()
+    system = record.system = SystemRecord()
     page.section("The whole program", _TEXT, head(COLUMNS))
     for row in page.tracked(rows(scans, page.progress), "the program", total=ROWS):
-        told.rows.append(row)
+        system.rows.append(row)
         page.say(row_line(row))
     page.progress("start-up")
-    told.start_up = start_up()
-    starts = ", ".join(f"{took_s:.2f}" for took_s in told.start_up.first_pattern_s)
-    page.say(f"\nStart to the record of the first pattern: {starts} s; {told.start_up.resident_mb:.0f} MB by then.")
-    told.verdicts += verdicts({row.name: row for row in told.rows}, told.start_up)
+    system.start_up = start_up()
+    starts = ", ".join(f"{took_s:.2f}" for took_s in system.start_up.first_pattern_s)
+    page.say(f"\nStart to the record of the first pattern: {starts} s; {system.start_up.resident_mb:.0f} MB by then.")
+    system.verdicts += verdicts({row.name: row for row in system.rows}, system.start_up)
     page.section("Targets", "Measured in this run.", head(("target", "measured", "held", "limited by")))
-    for verdict in told.verdicts:
+    for verdict in system.verdicts:
         page.say(verdict_line(verdict))
     if soak_minutes is not None:
-        told.soak = soak(soak_minutes)
-        page.say(f"\n## Soak\n\n{soak_text(told.soak)}")
+        system.soak = soak(soak_minutes)
+        page.say(f"\n## Soak\n\n{soak_text(system.soak)}")
 
 
 def row_line(row: SystemRow) -> str:

@@ -22,11 +22,11 @@ def main() -> int:
     """Do the job; returns 1, with a line on stderr, where it cannot be done."""
     job = json.load(sys.stdin)
     try:
-        told = JOBS[job.pop("do")](**job)
+        measured = JOBS[job.pop("do")](**job)
     except EdgeError as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")
         return 1
-    sys.stdout.write(json.dumps(told))
+    sys.stdout.write(json.dumps(measured))
     return 0
 
 

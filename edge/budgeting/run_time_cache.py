@@ -61,7 +61,7 @@ class CalibrationCache:
             return None
         p50_us, p99_us, unix_s = (_positive(entry, key) for key in ("p50_us", "p99_us", "unix_s"))
         if p50_us is None or p99_us is None or unix_s is None or p50_us > p99_us:
-            self.notes.append(f"{self._path} is damaged at {model.stem}: measured anew")
+            self.notes.append(f"{self._path} is damaged at {model.stem}: measured again")
             return None
         return RunTime(p50_us, p99_us), max(self._unix_time_s() - unix_s, 0.0)
 
@@ -102,7 +102,7 @@ class CalibrationCache:
         except (ValueError, RecursionError):
             entries = None
         if not isinstance(entries, dict):
-            self.notes.append(f"{self._path} is damaged: measured anew")
+            self.notes.append(f"{self._path} is damaged: measured again")
             return {}
         return entries
 

@@ -9,10 +9,10 @@ from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.discovery import Found, devices
 
 NOTHING = (
-    "no adapter found: check both plugs of a VScom (the second is the sensor's power), what `dmesg` said when it was "
-    "plugged in, and that this user is in the group dialout"
+    "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
+    "it was plugged in, and that this user is in the group dialout"
 )
-SERVER_HINT = "The vendor's server, where one runs, is not looked for: --source xela-server:ws://HOST:5000"
+SERVER_HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
 
 
 def run(*, as_json: bool, stdout: TextIO) -> int:

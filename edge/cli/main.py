@@ -106,7 +106,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _follow(options: argparse.Namespace, statistics: Statistics | None = None) -> None:
     if options.recalibrate and options.budget_us is None:
-        raise UsageError("--recalibrate measures for --budget-us, which is not there: add it, or leave both")
+        raise UsageError("--recalibrate requires --budget-us")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
     from edge.cli.run_command import run
 
@@ -147,7 +147,7 @@ def _models(arguments: Sequence[str]) -> int:
     if not models:
         raise ModelError("no models are bundled with this installation")
     widest = max(len(path.stem) for path in models)
-    print(f"{'model':{widest}s} taps scale    size arithmetic  error on the frozen test set, all taps given")
+    print(f"{'model':{widest}s} taps scale    size arithmetic  error on the frozen test set, with all taps")
     for path in models:
         contract = load_model(path).contract
         error = contract.test_error.get(str(contract.taps), {})

@@ -13,7 +13,7 @@ from edge.sinks.registry import check_apart
 
 _NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
 """Suffixes of other formats, which a recording must not be named after."""
-_RECORDS: Final = "records in JSON are edge-sr --sink jsonl:FILE"
+_RECORDS: Final = "for records in JSON use edge-sr --sink jsonl:FILE"
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
     if path.suffix.lower() in _NOT_WRITTEN:
-        raise UsageError(f"no {path.suffix} is recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
+        raise UsageError(f"{path.suffix} cannot be recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
     if path.suffix not in (".mcap", ".npz"):
         path = path.with_name(path.name + ".mcap")
     if path.exists():  # checked before anything is begun

@@ -30,7 +30,7 @@ def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> I
     """Run in real time as far as is permitted, and as before afterwards.
 
     Args:
-        tell: called with one line for each part that is refused; the run goes on without it.
+        tell: called with one line for each part that is refused; the run continues without it.
         thread_ids: system's numbers of the threads that the caller's waits for, which get the same priority. Other
             threads started before stay as they are; one begun meanwhile is ordinary, but on the caller's processor.
     """

@@ -158,7 +158,7 @@ def _open_view(
         for name in ("view_host", "view_token", "view_record_dir"):
             if getattr(options, name) is not None:
                 option = f"--{name.replace('_', '-')}"
-                raise UsageError(f"{option} is of the live page, which was not asked for: add --view")
+                raise UsageError(f"{option} requires --view")
         return contextlib.nullcontext()
     from edge.view.live_view import LOOPBACK, LiveView
 
@@ -190,14 +190,14 @@ def _open_scenes(watching: Sequence[Sink]) -> Sink:
 
 def _silence_hint(sources: Sequence[str]) -> str:
     source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
-    return f"is the sensor powered and its cable in? edge-sr doctor{source} says what is wrong"
+    return f"is the sensor powered and its cable in? edge-sr doctor{source} shows what is wrong"
 
 
 def _go_on(stream: TextIO, view: "LiveView | None", score: "DemoScore") -> None:
     """Print the score of a complete round while the demo goes on, and where else to look."""
     _print_score(score, stream)
     page = "" if view is None else f"live page: {view.url}; "
-    print(f"\n{page}the demo goes on until Ctrl-C", file=sys.stderr)
+    print(f"\n{page}the demo continues until Ctrl-C", file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -233,7 +233,7 @@ def _print_score(score: "DemoScore", stream: TextIO) -> None:
     if not scores:
         print(f"\nnone of {score.taps} taps scored: the run ended before a tap had a pattern", file=stream)
         return
-    print(f"\n{len(scores)} of {score.taps} taps scored at their peak, against the known truth:", file=stream)
+    print(f"\n{len(scores)} of {score.taps} taps scored at their peak, against the simulated truth:", file=stream)
     palette = choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)
     columns = shutil.get_terminal_size().columns
     print(score_table(scores), file=stream)

@@ -42,28 +42,28 @@ sinks:
                 memory
   zenoh:KEY[?connect=tcp/HOST:7447]
   ros2:TOPIC  ROS 2 messages over DDS
---view shows it in a browser as well
+--view adds a live page for a browser
 
-While it runs, these lines on stdin:
+Lines on stdin during a run:
   {"cmd": "reset"}  forget earlier taps,
                     as for a new object
   {"cmd": "zero"}   zero again; also
-      "sensor": "4"  one alone,
+      "sensor": "4"  only this sensor
       "force": true  even in contact
-On a terminal: r resets, z zeroes, Z
-does even in contact. SIGUSR1 is z.
+Keys on a terminal: r reset, z zero,
+Z zero even in contact. SIGUSR1: z.
 
 other commands:
   edge-sr demo      no hardware; with
-                    --view it goes on
-  edge-sr record FILE  the same, kept
-  edge-sr replay FILE  made anew
+                    --view endless
+  edge-sr record FILE  run and record
+  edge-sr replay FILE  compute again
   edge-sr models    bundled models
-  edge-sr baseline  zero, and keep it
+  edge-sr baseline  zero into a file
   edge-sr bench     error and run time
   edge-sr devices   what is plugged in
-  edge-sr doctor    what is wrong, and
-                    what to do
+  edge-sr doctor    faults, and their
+                    remedies
 
 examples:
   edge-sr --source demo
@@ -76,12 +76,12 @@ exit codes: 2 usage, 3 device, 4 model,
 """
 
 BASELINE_HELP: Final = """\
-Keep the pad still and free meanwhile.
+Keep the pad still and free.
 
 example:
   edge-sr baseline --out zero.json
   edge-sr --baseline zero.json
-of a recording that begins in contact:
+For a recording that begins in contact:
   edge-sr baseline --out zero.json \\
           --source replay:f.csv \\
           --skip 190 --scans 60
@@ -99,9 +99,9 @@ example:
 """
 
 REPLAY_HELP: Final = """\
-Every scan gets its result, as fast as
-the machine goes, with the time of the
-recording; begins with the baseline
+Computes a result for every scan, as
+fast as possible, with the times of the
+recording, and begins with the baseline
 that was in use at its first scan.
 
 example:
@@ -131,10 +131,10 @@ def record_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="edge-sr record",
         usage="edge-sr record FILE [options]",
-        description="Runs as edge-sr does, and records\nscans, patterns and events.",
+        description="Runs like edge-sr, and records\nscans, patterns and events.",
         epilog=RECORD_HELP,
     )
-    parser.add_argument("file", metavar="FILE", help="new file: .npz, else .mcap")
+    parser.add_argument("file", metavar="FILE", help="new file, .npz or .mcap")
     _add_run(parser)
     return parser
 
@@ -144,26 +144,26 @@ def replay_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="edge-sr replay",
         usage="edge-sr replay FILE [options]",
-        description="Makes patterns of a recording anew.",
+        description="Computes the patterns of a recording\nagain.",
         epilog=REPLAY_HELP,
     )
-    parser.add_argument("file", metavar="FILE", help=".mcap, .npz or .csv; or several, FILE,FILE, of a sensor each")
-    parser.add_argument("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL})")
+    parser.add_argument("file", metavar="FILE", help=".mcap, .npz or .csv; or one file for each sensor, FILE,FILE")
+    parser.add_argument("--model", metavar="M", help=f"model file, or bundled model (default {DEFAULT_MODEL})")
     zeroing = parser.add_mutually_exclusive_group()
-    zeroing.add_argument("--baseline", metavar="FILE", type=Path, help="another baseline")
+    zeroing.add_argument("--baseline", metavar="FILE", type=Path, help="stored baseline, instead of the recorded one")
     zeroing.add_argument("--zero", action="store_true", help="zero from the first 100 scans that are free and still")
-    parser.add_argument("--sink", metavar="S", action="append", default=[], help="where results go; may be repeated")
+    parser.add_argument("--sink", metavar="S", action="append", default=[], help="output for results; may be repeated")
     parser.add_argument(
-        "--paced", action="store_true", help="at the speed it was made, in time of now; --view implies it"
+        "--paced", action="store_true", help="play at the original speed, with current times; --view implies it"
     )
-    parser.add_argument("--sensor", metavar="FILE", type=Path, help="of edge-sr doctor, instead of what was recorded")
+    parser.add_argument("--sensor", metavar="FILE", type=Path, help="sensor file, instead of the recorded mounting")
     parser.add_argument(
         "--rate-hz",
         metavar="R",
         type=positive,
-        help="scans a second: where the file does not tell, or with --paced",
+        help="scans a second, if the file does not state it or with --paced",
     )
-    parser.add_argument("--duration-s", metavar="T", type=positive, help="stop after so much of the recording")
+    parser.add_argument("--duration-s", metavar="T", type=positive, help="stop after T seconds of the recording")
     _add_results(parser)
     _add_view(parser)
     parser.set_defaults(source=[], id_map=None, budget_us=None, recalibrate=False, give_up_s=None, realtime=False)
@@ -196,61 +196,67 @@ def runtime_options(options: argparse.Namespace) -> RuntimeOptions:
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--model", metavar="M", help=f"file, or bundled model (default {DEFAULT_MODEL}; for the demo {DEMO_MODEL})")
+    add(
+        "--model",
+        metavar="M",
+        help=f"model file, or bundled model (default {DEFAULT_MODEL}; for the demo {DEMO_MODEL})",
+    )
     add(
         "--budget-us",
         metavar="N",
         type=positive,
-        help="run time a pattern may take: of models with no more taps than M, the best that fits",
+        help="choose the most accurate model, with no more taps than M, that is faster than N us",
     )
-    add("--recalibrate", action="store_true", help="measure run times anew for --budget-us")
+    add("--recalibrate", action="store_true", help="with --budget-us: measure run times again")
     add_source(parser)
-    add("--sink", metavar="S", action="append", default=[], help="where results go; may be repeated")
-    add("--duration-s", metavar="T", type=positive, help="stop after this time")
+    add("--sink", metavar="S", action="append", default=[], help="output for results; may be repeated")
+    add("--duration-s", metavar="T", type=positive, help="stop after T seconds")
     add(
         "--give-up-s",
         metavar="T",
         type=not_negative,
-        help="end when a lost source is away for so long; 0 at once (default: wait for ever)",
+        help="end when a source has been lost for T s; 0: at once (default: never)",
     )
     add("--baseline", metavar="FILE", type=Path, help="stored baseline, instead of zeroing at the start")
     _add_results(parser)
-    add("--realtime", action="store_true", help="SCHED_FIFO, a processor of its own, locked memory; as permitted")
+    add(
+        "--realtime", action="store_true", help="use SCHED_FIFO, a processor of its own and locked memory, as permitted"
+    )
     _add_view(parser)
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
     """Add the options of making results from scans, whatever their source."""
     add = parser.add_argument
-    add("--counts-per-newton", metavar="C", type=positive, help="summed z per newton; gives forces in N")
+    add("--counts-per-newton", metavar="C", type=positive, help="summed z per newton, for forces in N")
     add(
         "--contact-on-counts",
         metavar="N",
         type=positive,
         default=DEFAULTS.contact_on_counts,
-        help=f"summed z that begins a tap (default {DEFAULTS.contact_on_counts:g})",
+        help=f"summed z at which a tap begins (default {DEFAULTS.contact_on_counts:g})",
     )
     add(
         "--contact-off-counts",
         metavar="N",
         type=positive,
         default=DEFAULTS.contact_off_counts,
-        help=f"summed z that ends it (default {DEFAULTS.contact_off_counts:g})",
+        help=f"summed z at which a tap ends (default {DEFAULTS.contact_off_counts:g})",
     )
     add(
         "--idle-reset-s",
         metavar="T",
         type=positive,
         default=DEFAULTS.idle_reset_s,
-        help=f"forget earlier taps after so long without contact (default {DEFAULTS.idle_reset_s:g})",
+        help=f"forget earlier taps after T s without contact (default {DEFAULTS.idle_reset_s:g})",
     )
-    add("--every-scan", action="store_true", help="infer also where nothing has changed since the pattern before")
-    add("--every-tap", action="store_true", help="use also taps that are not expected to help")
+    add("--every-scan", action="store_true", help="run the inference even if nothing has changed")
+    add("--every-tap", action="store_true", help="use all taps, even those not expected to help")
     add(
         "--no-fallback",
         dest="fallback",
         action="store_false",
-        help="keep a pattern that is not to be believed, instead of the smooth one",
+        help="keep an untrusted pattern, instead of the smooth one",
     )
 
 
@@ -262,25 +268,27 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         type=port,
         const=VIEW_PORT,
-        help=f"live page for a browser, at this port (default {VIEW_PORT}; 0: any free one)",
+        help=f"serve a live page at this port (default {VIEW_PORT}; 0: any free one)",
     )
-    add("--view-host", metavar="H", help="address it listens at, instead of this machine's own alone; needs a token")
-    add("--view-token", metavar="T", help="the token (default: one is made, and printed)")
-    add("--view-record-dir", metavar="DIR", type=Path, help="where its button records into (default: here)")
+    add("--view-host", metavar="H", help="address of the page, instead of 127.0.0.1; requires a token")
+    add("--view-token", metavar="T", help="token of the page (default: generated and printed)")
+    add(
+        "--view-record-dir", metavar="DIR", type=Path, help="folder of the page's recordings (default: the current one)"
+    )
 
 
 def baseline_parser() -> argparse.ArgumentParser:
     """Return the parser of `edge-sr baseline`."""
     parser = Parser(
         prog="edge-sr baseline",
-        description="Zeroes once and keeps the baseline.",
+        description="Zeroes once and stores the baseline.",
         epilog=BASELINE_HELP,
     )
     add_source(parser)
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="where the baseline is kept")
-    scans_help = f"scans to use (default and least {FEWEST_SCANS}; of a recording least {FEWEST_RECORDED})"
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="file for the baseline")
+    scans_help = f"scans to use (default and minimum {FEWEST_SCANS}; for a recording {FEWEST_RECORDED})"
     parser.add_argument("--scans", metavar="N", type=whole(FEWEST_RECORDED), default=FEWEST_SCANS, help=scans_help)
-    parser.add_argument("--skip", metavar="N", type=whole(0), default=0, help="scans to leave out first (default 0)")
+    parser.add_argument("--skip", metavar="N", type=whole(0), default=0, help="scans to skip at the start (default 0)")
     return parser
 
 
@@ -288,11 +296,11 @@ def devices_parser() -> argparse.ArgumentParser:
     """Return the parser of `edge-sr devices`."""
     parser = Parser(
         prog="edge-sr devices",
-        description="Lists serial ports, CAN adapters and\nCAN interfaces, what to write behind\n"
-        "--source, and what is in the way.",
+        description="Lists serial ports, CAN adapters and\nCAN interfaces, their text for --source,\n"
+        "and what prevents their use.",
         epilog="exit codes: 3 no adapter",
     )
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--json", action="store_true", help="write JSON, for programs")
     return parser
 
 

@@ -38,7 +38,7 @@ def guarded_streams() -> Iterator[None]:
         SinkError: stdout cannot be written.
     """
     streams = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = cast("TextIO", _Told(sys.stdout)), cast("TextIO", _Unheard(sys.stderr))
+    sys.stdout, sys.stderr = cast("TextIO", _Checked(sys.stdout)), cast("TextIO", _Optional(sys.stderr))
     try:
         try:
             yield
@@ -60,7 +60,7 @@ def _stand_in(stream: TextIO, number: int) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
-class _Told:
+class _Checked:
     """Stream that reports in one line why it cannot be written."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -88,7 +88,7 @@ class _Told:
             raise SinkError(f"cannot write to stdout: {error.strerror}") from error
 
 
-class _Unheard(_Told):
+class _Optional(_Checked):
     """Stream that accepts all text, even if it cannot be written: full, or its window closed."""
 
     @contextlib.contextmanager

@@ -30,14 +30,15 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
     largest = max((ID_MAPS[name].geometry.taxel_count for name in others), default=0)
     others = {name: sensors for name, sensors in others.items() if ID_MAPS[name].geometry.taxel_count == largest}
     if whole and not half_silent and largest <= model.geometry.taxel_count:
-        return Finding("id map", "ok", f"{model.name}, all ids of sensor {', '.join(whole)} heard", norm)
+        return Finding("id map", "ok", f"{model.name}, all ids of sensor {', '.join(whole)} received", norm)
     if others:
-        told = " or ".join(f"{name} (sensor {', '.join(sensors)})" for name, sensors in others.items())
+        owners = " or ".join(f"{name} (sensor {', '.join(sensors)})" for name, sensors in others.items())
         tries = " or ".join(f"--id-map {name}" for name in others)
-        return Finding("id map", "wrong", f"the ids heard are not {model.name}'s but those of {told}", norm, f"{tries}")
+        measured = f"the ids received are not {model.name}'s but those of {owners}"
+        return Finding("id map", "wrong", measured, norm, tries)
     known = [can_id for can_id in ids if can_id in model.taxels]
     shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:_SHOWN]) + ", ..." * (len(ids) > _SHOWN)
-    measured = f"{len(ids)} ids heard, {len(known)} of them {model.name}'s: {shown}"
+    measured = f"{len(ids)} ids received, {len(known)} of them {model.name}'s: {shown}"
     if half_silent or not known:
         remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
         return Finding("id map", "wrong", measured, norm, remedy)

@@ -69,7 +69,7 @@ def run(
                 except LinkLostError as error:
                     lost = error
         if lost is not None:
-            examined.findings.append(Finding("link", "wrong", f"lost: {lost}", "", "see to plug and cable"))
+            examined.findings.append(Finding("link", "wrong", f"lost: {lost}", "", "check plug and cable"))
         kept = unwritten = None
         if options.out is not None and lost is None and not stop.is_set():
             try:

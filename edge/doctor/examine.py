@@ -123,7 +123,7 @@ def check_baseline(
     """
     norm = f"{BASELINE_SCANS} scans that span at most {' / '.join(f'{limit:.0f}' for limit in SPREAD_LIMIT_COUNTS)}"
     if not living.any():
-        return None, Finding("baseline", "not known", "no taxel is heard", norm)
+        return None, Finding("baseline", "not known", "no taxel has arrived", norm)
     silent = ~living.reshape(scans[0].fresh.shape)
     usable = [scan for scan in scans if (scan.fresh | silent).all() and scan.renewed.any()][-BASELINE_SCANS:]
     if len(usable) < BASELINE_SCANS:
@@ -156,7 +156,7 @@ def check_load(
     """
     norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
     if reference is None:
-        remedy = "a pad that something has lain on from the start looks free; give an earlier --baseline or --sensor"
+        remedy = "a pad that was loaded from the start looks free; pass an earlier --baseline or --sensor"
         return Finding("load", "not known", "no earlier baseline to compare with", norm, remedy)
     known = np.nan_to_num(rest_counts).reshape(reference.counts.shape)
     z = deformation(np.rint(known).astype(np.int32) % COUNTS_ON_CIRCLE, reference, mounting)[2].ravel()
@@ -176,8 +176,8 @@ def check_load(
 
 def _nothing(samples: Mapping[str, Samples], of_link: Sequence[Finding]) -> Finding:
     scans = sum(one.scans for one in samples.values())
-    told = any(finding.verdict == "wrong" for finding in of_link)
-    remedy = "see above" if told else "is the sensor powered, and is nothing else reading it?"
+    link_faulty = any(finding.verdict == "wrong" for finding in of_link)
+    remedy = "see above" if link_faulty else "is the sensor powered, and is nothing else reading it?"
     return Finding("scans", "wrong", f"{scans} scans", f"at least {FEWEST_SCANS} of a sensor", remedy)
 
 

@@ -64,12 +64,12 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
         return Finding("link", "wrong", measured, "", off)
     bad = counters.get("bad_lines", 0) + counters.get("non_ascii_lines", 0)
     if not frames and received >= ANSWERS_BYTES:
-        remedy = "no slcan, or another line speed than the adapter's: try --source slcan:PORT@BAUD (VScom 3000000)"
+        remedy = "not slcan, or another line speed than the adapter's: try --source slcan:PORT@BAUD (VScom 3000000)"
         return Finding("link", "wrong", measured, "", remedy)
     if not frames:
         remedy = (
             "the adapter does not obey: its channel is held open or its bitrate is not 1 Mbit/s; end slcand, "
-            "xela_server and whatever else holds it, pull its plug and put it in again"
+            "xela_server and every other program that holds it, pull its plug and put it in again"
         )
         return Finding("link", "wrong", measured + (refused or ", answers only"), "", remedy if refusals else off)
     share = bad / (bad + frames)
@@ -142,7 +142,7 @@ def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Fin
     if line_full:
         return Finding("latency timer", "not known", measured, norm, "the line is full: see baud rate")
     if held_back_ms > HELD_BACK_LIMIT_MS:
-        busy = "this machine is too busy to read in time: end what else runs, or ask for --realtime"
+        busy = "this machine is too busy to read in time: end what else runs, or use --realtime"
         remedy = f"the adapter holds bytes back: of an FTDI chip, echo 1 | sudo tee {shown}; or {busy}"
         return Finding("latency timer", "wrong", measured, norm, remedy if facts.latency_ms is None else busy)
     return Finding("latency timer", "ok", measured, norm)

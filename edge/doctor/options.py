@@ -9,8 +9,8 @@ from edge.terminal.argument_types import Parser, add_source, positive
 DOCTOR_HELP: Final = """\
 Keep the pad free and still until you
 are asked to press its corners. Hold it
-as patterns are to be drawn; that is
-what top and left mean.
+in the orientation in which patterns are
+to be drawn: it defines top and left.
 
 examples:
   edge-sr doctor
@@ -19,9 +19,9 @@ examples:
           --out sensor.toml
   edge-sr --sensor sensor.toml
 
-exit codes: 0 nothing wrong, 1 something
-is, 2 usage, 3 device, 130 Ctrl-C;
-what was found until then is told.
+exit codes: 0 no fault, 1 a fault,
+2 usage, 3 device, 130 Ctrl-C, after
+the findings so far are printed
 """
 
 DOCTOR_DRIFT_S: Final = 60.0
@@ -32,16 +32,17 @@ def doctor_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="edge-sr doctor",
         usage="edge-sr doctor [options]",
-        description="Examines sensor and adapter, says what\nis wrong and what to do, and finds out\nhow the pad sits.",
+        description="Examines sensor and adapter, reports\n"
+        "faults with their remedies, and measures\nhow the pad is mounted.",
         epilog=DOCTOR_HELP,
     )
     add = parser.add_argument
     add_source(parser)
-    drift_help = f"watch for so long, the pad free and still (default {DOCTOR_DRIFT_S:g})"
+    drift_help = f"seconds to measure the free, still pad (default {DOCTOR_DRIFT_S:g})"
     add("--drift-s", metavar="T", type=positive, default=DOCTOR_DRIFT_S, help=drift_help)
-    add("--baseline", metavar="FILE", type=Path, help="stored baseline, to see whether something lies on the pad")
-    add("--no-press", action="store_true", help="do not ask for presses on the corners")
-    add("--weight-g", metavar="G", type=positive, help="ask for a weight on the pad; gives counts per newton")
-    add("--out", metavar="FILE", type=Path, help="write what was found into a sensor file")
-    add("--json", action="store_true", help="one JSON document on stdout")
+    add("--baseline", metavar="FILE", type=Path, help="stored baseline, to detect a load on the pad")
+    add("--no-press", action="store_true", help="skip the presses on the corners")
+    add("--weight-g", metavar="G", type=positive, help="weight to lay on the pad, to measure counts per newton")
+    add("--out", metavar="FILE", type=Path, help="write the results into a sensor file")
+    add("--json", action="store_true", help="write one JSON document to stdout")
     return parser

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 
-AS_MAPPED: Final = "as the id map says"
+AS_MAPPED: Final = "as in the id map"
 """Name of the orientation in which nothing is to be corrected."""
 CORNERS: Final = ("top left", "top right", "bottom right", "bottom left")
 TO_THE_MIDDLE: Final = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])

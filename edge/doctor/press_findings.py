@@ -30,7 +30,7 @@ def judge_press(
     findings: list[Finding] = []
     mounting = None
     if len(presses) < FEWEST_CORNERS:
-        measured = f"{len(presses)} of 4 corners felt"
+        measured = f"{len(presses)} of 4 corners measured"
         findings = [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")]
     else:
         turn = find_order(presses, geometry)
@@ -73,7 +73,7 @@ def _unclear_axes(pushes: int, z: int | None) -> Finding:
         return Finding("axis signs", "wrong", "z rises under some presses and falls under others", _NORM, remedy)
     if pushes < FEWEST_CORNERS:
         remedy = f"push harder towards the middle while pressing; {_AGAIN}"
-        return Finding("axis signs", "not known", f"{pushes} of 4 pushes felt", _NORM, remedy)
+        return Finding("axis signs", "not known", f"{pushes} of 4 pushes measured", _NORM, remedy)
     remedy = f"push along the diagonal, towards the middle; {_AGAIN}"
     return Finding("axis signs", "wrong", "the corners contradict each other", _NORM, remedy)
 
@@ -82,10 +82,10 @@ def _force_finding(counts_per_newton: float | None, kept: bool) -> Finding:
     low, high = USUAL_COUNTS_PER_NEWTON
     norm = f"{low:.0f} to {high:.0f}"
     if counts_per_newton is None:
-        return Finding("force", "not known", "no steady weight felt", norm, "lay it on the middle, hands off")
+        return Finding("force", "not known", "no steady weight measured", norm, "lay it on the middle, hands off")
     measured = f"{counts_per_newton:.0f} counts per newton"
     if not low <= counts_per_newton <= high:
-        remedy = "is the weight as heavy as was said, and does it lie on the pad alone?"
+        remedy = "is the weight as heavy as --weight-g states, and does it lie on the pad alone?"
         return Finding("force", "look", measured, norm, remedy)
     return Finding(
         "force", "ok", measured, norm, "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
@@ -98,7 +98,7 @@ def _settled(kept: bool) -> Verdict:
 
 def _use(kept: bool) -> str:
     return (
-        "the sensor file says so: run edge-sr with it"
+        "the sensor file states this: run edge-sr with it"
         if kept
         else "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"
     )

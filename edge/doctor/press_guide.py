@@ -110,7 +110,7 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
         taxel = corner_taxel(mean[2])
         if taxel is not None:
             break
-        yield from _wait("That was no corner. Let go.", _free, FREE_SCANS)
+        yield from _wait("That was not a corner. Let go.", _free, FREE_SCANS)
         ask = f"Press the {name} corner itself and hold it."
     else:
         return None
@@ -126,7 +126,7 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
     if felt is not None and pushed(felt[-1]):
         x, y = np.mean([reading.shear_counts for reading in felt], axis=0) - before
         push = (float(x), float(y))
-    yield from _wait("Good. Let go." if push else "No push was felt. Let go.", _free, FREE_SCANS)
+    yield from _wait("Good. Let go." if push else "No push was measured. Let go.", _free, FREE_SCANS)
     return Press(place, taxel, float(mean[2].sum()), push)
 
 

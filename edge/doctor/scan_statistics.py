@@ -64,8 +64,8 @@ class Samples:
         period_s = self.period_s()
         behind = self.time_s / period_s - np.arange(self.scans)
         lost, last_gap = 0, 0
-        told = np.diff(self.time_s)[:-AROUND]  # nothing can be concluded from a gap at the very end
-        for gap in np.flatnonzero(told > 1.5 * period_s) + 1:
+        gaps_s = np.diff(self.time_s)[:-AROUND]  # nothing can be concluded from a gap at the very end
+        for gap in np.flatnonzero(gaps_s > 1.5 * period_s) + 1:
             before = behind[max(last_gap, gap - AROUND) : gap].min()
             step = round(float(behind[gap : gap + AROUND].min() - before))
             lost += max(step, 0)
@@ -83,8 +83,8 @@ class Samples:
 
     def stuck(self) -> NDArray[np.bool_]:
         """Return (taxels,), True for living taxels with a new reading in one scan in a hundred at most."""
-        heard = np.maximum(self.fresh.sum(axis=0), 1)
-        return self.living & ((self.renewed & self.fresh).sum(axis=0) <= 0.01 * heard)
+        arrived = np.maximum(self.fresh.sum(axis=0), 1)
+        return self.living & ((self.renewed & self.fresh).sum(axis=0) <= 0.01 * arrived)
 
     def noise_counts(self) -> NDArray[np.float64]:
         """Return (3, taxels), the standard deviation from scan to scan, without creep; NaN where too little came."""

@@ -83,7 +83,7 @@ class Visit:
                 if mounting is not None:
                     found[name] = mounting
             elif why is not None or name not in examined.baselines:
-                reason = why or "the pad cannot be zeroed: mend what is wrong first"
+                reason = why or "the pad cannot be zeroed: correct what is wrong first"
                 examined.findings.append(Finding("guided press", "not known", "left out", "", reason, name))
         return found
 
@@ -93,18 +93,18 @@ class Visit:
         geometry = self._watch.known.geometry
         guide = GuidedPress(self._options.weight_g, geometry)
         whose = f"Sensor {name}: " if several else ""
-        self._say(f"{whose}Hold the pad before you as patterns are to be drawn.")
+        self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._say(whose + guide.first)
-        heard_s = self._clock_s()
+        received_s = self._clock_s()
         while not (guide.done or self._stop.is_set() or self._link.ended):
-            if self._clock_s() - heard_s > GIVEN_UP_S:
-                why = f"no scan for {GIVEN_UP_S:.0f} s: see to power and plug"
+            if self._clock_s() - received_s > GIVEN_UP_S:
+                why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
             for scan in self._link.read(POLL_S):
                 if scan.sensor != name:
                     continue
-                heard_s = self._clock_s()
+                received_s = self._clock_s()
                 zeroed = deformation(scan.counts, baseline, mounting)
                 ask = guide.push(zeroed, scan.time_ns / NS_PER_S)
                 if ask is not None:
@@ -118,11 +118,11 @@ class Visit:
 
     def _why_no_press(self) -> str | None:
         if self._options.no_press:
-            return "leave out --no-press to find order and axes"
+            return "leave out --no-press to measure order and axes"
         if self._link.kind == "replay":
             return "a recording cannot be pressed"
         if not self._err.isatty():
-            return "nobody is at a terminal: run the doctor in one to find order and axes"
+            return "stdin is not a terminal: run the doctor in one to measure order and axes"
         return None
 
     def _say(self, text: str) -> None:

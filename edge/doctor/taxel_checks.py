@@ -19,7 +19,7 @@ STRAY_COUNTS: Final = 12_000.0
 """Largest distance of a taxel's rest from the others' on one axis: z of one model spans 9700 from end to end."""
 LONE_DRIFT_COUNTS: Final = 94.0
 """Largest drift of a single taxel, in counts; as much in every taxel is a contact."""
-_OVERLOADED: Final = "overloaded, too near a magnet or steel, or broken: free it, and exchange the sensor if it stays"
+_OVERLOADED: Final = "overloaded, too near a magnet or steel, or broken: free it, and replace the sensor if it persists"
 
 
 def check_silent(samples: Samples, wrong_map: bool) -> Finding:
@@ -45,8 +45,8 @@ def check_stuck(samples: Samples) -> Finding:
     if not stuck.any():
         return Finding("stuck taxels", "ok", "none")
     if stuck[samples.living].all():
-        remedy = "one old scan is sent for ever: switch the sensor off and on, or restart the server that sends it"
-        return Finding("stuck taxels", "wrong", "all that are heard", "none", remedy)
+        remedy = "one old scan is sent over and over: switch the sensor off and on, or restart the server that sends it"
+        return Finding("stuck taxels", "wrong", "all that arrive", "none", remedy)
     return Finding("stuck taxels", "wrong", _named(stuck), "none", "broken: the runtime makes up for up to eight")
 
 
@@ -69,9 +69,9 @@ def check_noise(samples: Samples) -> Finding:
     norm = f"{NOISE_COUNTS:.0f} counts, up to {' / '.join(f'{look:.0f}' for look, _ in NOISE_LIMITS_COUNTS)}"
     loud = int((noise > limits).any(axis=0).sum())
     remedy = (
-        "keep motors, magnets and power cables away from the pad, and keep it still; ask for --every-tap if it stays"
+        "keep motors, magnets and power cables away from the pad, and keep it still; use --every-tap if it persists"
         if loud > 1
-        else f"taxel {taxel} alone is loud: a loose magnet or a broken chip"
+        else f"taxel {taxel} alone is noisy: a loose magnet or a broken chip"
     )
     return Finding("noise", worst, measured, norm, "" if worst == "ok" else remedy)
 
@@ -80,7 +80,7 @@ def check_rest(samples: Samples) -> Finding:
     """Check the readings of the free pad: they differ between models and axes, but are alike within a pad."""
     rest = samples.rest_counts()
     if np.isnan(rest).all():
-        return Finding("rest levels", "not known", "no taxel heard")
+        return Finding("rest levels", "not known", "no taxel has arrived")
     spans = (f"{n} {np.nanmin(r):.0f} to {np.nanmax(r):.0f}" for n, r in zip(AXES, rest, strict=True))
     apart = around_counts(rest - rest[:, np.flatnonzero(samples.living)[:1]])
     stray = np.abs(around_counts(apart - np.nanmedian(apart, axis=1, keepdims=True)))
@@ -108,7 +108,7 @@ def check_drift(samples: Samples) -> Finding:
     norm = f"under {CREEP_LIMIT_COUNTS:.0f} on a taxel"
     remedy = "let it warm up for ten minutes, unloaded and still, then zero again"
     if float(np.nanmax(sizes[2])) > LOAD_LIMIT_COUNTS:
-        remedy = "more than warming up does: something pressed it or let go of it meanwhile; free it and look again"
+        remedy = "more than warming up causes: something pressed or released it meanwhile; free it and measure again"
     if sizes[axis, taxel] > LONE_DRIFT_COUNTS or abs(z_sum) >= OFF_COUNTS:
         return Finding("drift", "wrong", measured, norm, remedy)
     if sizes[axis, taxel] > CREEP_LIMIT_COUNTS:

@@ -38,9 +38,9 @@ def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Fi
     if low <= rate_hz <= high:
         return Finding("rate", "ok", measured, norm)
     remedy = (
-        "set the sensor's rate in its controller, or tell the expected one with --rate-hz"
+        "set the sensor's rate in its controller, or state the expected one with --rate-hz"
         if rate_hz < low
-        else "harmless, if the processor keeps up: tell the expected rate with --rate-hz"
+        else "harmless, if the processor keeps up: state the expected rate with --rate-hz"
     )
     return Finding("rate", "look", measured, norm, remedy)
 
@@ -57,7 +57,7 @@ def check_torn(samples: Samples) -> Finding:
         only = missing[most] > 0.8 * missing.sum()
         remedy = f"taxel {most} comes and goes: its connection may be broken" if only else _LOSS_REMEDY
         return Finding("torn scans", verdict, measured, norm, remedy)
-    remedy = "who sends these scans repeats itself: lower its rate to that of the sensor"
+    remedy = "the sender of these scans repeats itself: lower its rate to that of the sensor"
     verdict = _graded(old, _OLD_LIMITS)
     return Finding("torn scans", verdict, measured, norm, "" if verdict == "ok" else remedy)
 
@@ -70,7 +70,7 @@ def check_lost(samples: Samples, silent_s: float) -> Finding:
         silent_s: time without a scan at the end, in [s].
     """
     if silent_s > LATEST_SCAN_S:
-        remedy = "the sensor fell silent: see to its power and its plug"
+        remedy = "the sensor fell silent: check its power and its plug"
         return Finding("lost scans", "wrong", f"all of the last {silent_s:.0f} s", "", remedy)
     lost = samples.lost()
     share = lost / (lost + samples.scans)

@@ -74,14 +74,14 @@ class Watch:
         Raises:
             LinkLostError: the link is gone.
         """
-        start_s = now_s = heard_s = self._clock_s()
+        start_s = now_s = received_s = self._clock_s()
         scans = 0
         while now_s - start_s < length_s and not (self._stop.is_set() or self.link.ended):
-            if now_s - heard_s > GIVEN_UP_S:
+            if now_s - received_s > GIVEN_UP_S:
                 break
             for scan in self.link.read(POLL_S):
                 self.scans.setdefault(scan.sensor, []).append(scan)
-                heard_s = now_s
+                received_s = now_s
                 scans += 1
             now_s = self._clock_s()
             self.duration_s = now_s - start_s

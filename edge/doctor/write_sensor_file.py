@@ -31,7 +31,7 @@ def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool
         in_place.check_writable(path)
     except OSError as error:
         why = error.strerror or error
-        raise SensorFileError(f"{path}: cannot be written: {why}: give --out a file in a folder of yours") from error
+        raise SensorFileError(f"{path}: cannot be written: {why}: pass --out a file in a folder of yours") from error
     before = _before(path)
     at_best = {
         name: replace(
@@ -115,8 +115,8 @@ def _refuse_loss(path: Path, before: SensorFile, written: SensorFile) -> None:
         lost.append("serial number of the adapter")
     if lost:
         raise SensorFileError(
-            f"{path}: left as it is, for it holds what would be lost: {', '.join(lost)}: give --sensor {path} as well, "
-            "to keep what is not found again, or another --out"
+            f"{path}: left as it is, because it holds what would be lost: {', '.join(lost)}: pass --sensor {path} "
+            "as well, to keep what is not measured again, or another --out"
         )
 
 
@@ -130,7 +130,7 @@ def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
         *["order and axes"] * lost("mounting", "mounting" not in entry.assumed, "mounting" not in written.assumed),
         *["gains"] * (entry.mounting.evens_gains and not written.mounting.evens_gains),
         *["counts per newton"] * lost("force", entry.counts_per_newton is not None, bool(written.counts_per_newton)),
-        *["what is known of the pad"] * (entry.pad is not None and written.pad is None),
+        *["constants of the pad"] * (entry.pad is not None and written.pad is None),
         *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),
     ]
 

@@ -34,10 +34,10 @@ def find_model(name: str | Path) -> Path:
     for model in bundled_models():
         if str(name) in (model.name, model.stem):
             return model
-    in_integers = f"{path.name.removesuffix('.onnx')}{INT8_SUFFIX}"
-    if in_integers in {model.stem for model in bundled_models()}:
+    int8 = f"{path.name.removesuffix('.onnx')}{INT8_SUFFIX}"
+    if int8 in {model.stem for model in bundled_models()}:
         raise ModelError(
-            f"model '{name}' is in float32, which this installation lacks: take {in_integers}, "
+            f"model '{name}' is in float32, which this installation lacks: take {int8}, "
             "or install a checkout (pip install --editable .), which has all models"
         )
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
@@ -52,8 +52,8 @@ def alternatives(model: Path) -> list[Path]:
     bundled = bundled_models()
     if model.resolve() in bundled:
         return [path for path in bundled if path != model.resolve()]
-    in_integers = model.with_name(f"{model.stem}{INT8_SUFFIX}{model.suffix}")
-    return [in_integers] if in_integers.is_file() else []
+    int8 = model.with_name(f"{model.stem}{INT8_SUFFIX}{model.suffix}")
+    return [int8] if int8.is_file() else []
 
 
 def demo_recording() -> Path:

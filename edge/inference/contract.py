@@ -159,8 +159,8 @@ class Contract:
         version = _value(metadata, "version")
         # Before the other keys, which another version may lack.
         if version not in (CONTRACT_VERSION, *EARLIER_VERSIONS):
-            earlier = ", ".join(map(str, EARLIER_VERSIONS))
-            expected = f"expected {CONTRACT_VERSION}, or {earlier}: export the model again with this release"
+            earlier = " or ".join(map(str, EARLIER_VERSIONS))
+            expected = f"expected {CONTRACT_VERSION}, {earlier}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
         values = {key: _value(metadata, key) for key in _keys(version)}
         _check(values)
@@ -286,7 +286,9 @@ def _check(values: Mapping[str, Any]) -> None:
     if factor is not None and not (is_number(factor) and factor > 0):
         refuse("interval_factor", "a positive number, or null for a model without deviations")
     if not is_confidence(values["confidence"], values["taps"]):
-        refuse("confidence", "for each number of taps doubt, error and gain, lists of equal length, doubt rising")
+        refuse(
+            "confidence", "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
+        )
     scaling = values["counts_per_unit"]
     if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
         refuse("counts_per_unit", f"three positive numbers from {LEAST_UNIT:g}, for x, y, z")

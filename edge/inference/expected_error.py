@@ -61,12 +61,12 @@ def expect_of(table: Table, taps: int, about: float, size: float) -> Expected | 
 
     Between two doubts it is interpolated; beyond the last the error grows with the doubt.
     """
-    told = table.get(str(taps))
-    if told is None:
+    row = table.get(str(taps))
+    if row is None:
         return None
-    known = told["doubt"]
-    error = float(np.interp(about, known, told["error"])) * max(1.0, about / known[-1])
-    gain = float(np.interp(about, known, told["gain"])) if told["gain"] else None
+    levels = row["doubt"]
+    error = float(np.interp(about, levels, row["error"])) * max(1.0, about / levels[-1])
+    gain = float(np.interp(about, levels, row["gain"])) if row["gain"] else None
     return Expected(error * size, gain)
 
 
@@ -82,8 +82,8 @@ def _is_row(row: Any) -> bool:
         return False
     if not all(isinstance(values, list) and all(is_number(v) for v in values) for values in row.values()):
         return False
-    known, count = row["doubt"], len(row["doubt"])
-    rising = count > 0 and known[0] > 0 and all(a < b for a, b in pairwise(known))
+    levels, count = row["doubt"], len(row["doubt"])
+    rising = count > 0 and levels[0] > 0 and all(a < b for a, b in pairwise(levels))
     return rising and len(row["error"]) == count and len(row["gain"]) in (0, count)
 
 

@@ -48,7 +48,7 @@ _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
 
 _SIDE_FILE: Final = "keeps its weights in a side file, expected one file"
 _NESTED: Final = "has graphs within its graph, expected one plain graph"
-_BROKEN: Final = "not a model that onnxruntime can load: damaged, or no ONNX file"
+_BROKEN: Final = "not a model that onnxruntime can load: damaged, or not an ONNX file"
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
 _Message = Mapping[int, "_Message | str"]

@@ -258,12 +258,12 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
 
 def _reason(error: Exception) -> str:
     """Return onnxruntime's message without the place in its source, which may take all the room."""
-    said = _PLACE.sub("", " ".join(str(error).split()))
-    return said if len(said) <= LONGEST_REASON else f"{said[:LONGEST_REASON]}..."
+    text = _PLACE.sub("", " ".join(str(error).split()))
+    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}..."
 
 
 def _check_tensors(role: str, tensors: Sequence[Any], shapes: Mapping[str, tuple[int | str, ...]]) -> None:
     got = ", ".join(f"{tensor.name} {tensor.type} {list(tensor.shape)}" for tensor in tensors)
     expected = ", ".join(f"{name} tensor(float) {list(shape)}" for name, shape in shapes.items())
     if got != expected:
-        raise ModelError(f"graph {role} is {got}, but its contract says {expected}")
+        raise ModelError(f"graph {role} is {got}, but its contract states {expected}")

@@ -11,7 +11,7 @@ _KEYS: Final = ("forward", "contact", "tap")
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """What a model's contract holds under `trust`.
+    """Checks of a pattern, as a model's contract holds them under `trust`.
 
     Attributes:
         forward: explains readings by a pattern.

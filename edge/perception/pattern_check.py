@@ -157,5 +157,11 @@ def first_stranger(belonging: Sequence[float]) -> int | None:
     return next((number for number, share in enumerate(belonging, 1) if share >= 0.5), None)
 
 
+def dropped_taps(belonging: Sequence[float]) -> int:
+    """Return the number of earlier taps that a pattern is made without."""
+    stranger = first_stranger(belonging)
+    return 0 if stranger is None else len(belonging) - stranger + 1
+
+
 def _share(log_odds: float) -> float:
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))

@@ -100,7 +100,7 @@ class Result:
 
     @property
     def untrusted_text(self) -> str | None:
-        """Reason for which the pattern is not to be believed, for a person; None where it is, or nobody can tell."""
+        """Reason for which the pattern is not to be believed, for a person; None where it is, or is not checked."""
         return None if self.untrusted_reason is None else REASON_TEXTS[self.untrusted_reason]
 
     def baseline_text(self) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
-from edge.perception.pattern_check import REASONS
+from edge.perception.pattern_check import REASONS, dropped_taps
 from edge.perception.result import Result, mask_bits
 from edge.perception.wrench import Wrench
 from firmware_bridge.scans.scan import Scan, VendorReading
@@ -35,6 +35,7 @@ _REAL: Final = Kind("number", "<f4", "d", "float64", math.nan)
 _NUMBER: Final = Kind("integer", "<i8", "q", "int64")
 _NUMBER_OR_NOT: Final = Kind("integer", "<i8", "q", "int64", -1)
 _SMALL: Final = Kind("integer", "<i2", "i", "int32")
+_SMALL_OR_NOT: Final = Kind("integer", "<i2", "i", "int32", -1)
 _BITS: Final = Kind("integer", "<u8", "Q", "uint64")
 _YES_OR_NO: Final = Kind("boolean", "|i1", "i", "int8", -1)
 _IS_THERE: Final = Kind("boolean", "|b1", "i", "bool", False)
@@ -156,11 +157,14 @@ FIELDS: Final = (
     Field("reused_from", _NUMBER_OR_NOT, "reused_from",
           "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
     Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
-          "a contact that is too light to tell, and for models without checks", byte=592),
+          "a contact that is too light to check, and for models without checks", byte=592),
     Field("untrusted_reason", _one_of(*REASONS, unknown=""), "untrusted_reason",
           "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
     Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
           "linear estimate that replaces one that is not to be believed", byte=600),
+    Field("taps_dropped", _SMALL_OR_NOT, "tap_mismatch", "earlier taps that the pattern is made "
+          "without, because they do not belong to this contact; unknown without earlier taps", make=dropped_taps,
+          out=_RECORD_NPZ, byte=604),
     Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
           "noise, gains and drift", decimals=4, byte=584),
     Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "
@@ -176,13 +180,14 @@ FIELDS: Final = (
           "it was stored", decimals=1, byte=160),
     Field("drift_counts", _OBJECT, "drift", "followed since: `common` on x, y, z, and the largest of a taxel's `own` "
           "beyond it; `step`: the largest step in rest level that was not followed", json=_drift, out=Out.RECORD),
-    Field("dead", _BITS, "dead", "taxels that are not believed, and why: `{\"3\": \"stuck\", \"7\": \"silent\"}`, "
+    Field("dead", _BITS, "dead", "dead taxels, whose readings are not used, and why: "
+          "`{\"3\": \"stuck\", \"7\": \"silent\"}`, "
           "`saturated`, `far`, `unzeroed`; elsewhere bit i: taxel i. A pattern is then made without them",
           make=_dead_bits, json=_dead_reasons, out=_RECORD_NPZ, byte=80),
     Field("filled", _one_of("rest", "neighbours", unknown=""), "filled",
           "what stands for the dead taxels: an estimate from their `neighbours` "
-          "(`rest` only by earlier releases); unknown while none "
-          "is dead, or no pattern can be made",
+          "(`rest` only by earlier releases); unknown while no "
+          "taxel is dead, or no pattern can be made",
           out=_RECORD_NPZ, byte=76),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),

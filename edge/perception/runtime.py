@@ -147,7 +147,7 @@ class Runtime:
             force: also in contact.
         """
         if not self._sensors:
-            self._report("refused", "zeroing refused: no sensor was heard yet")
+            self._report("refused", "zeroing refused: no scan has arrived yet")
         elif name is not None and name not in self._sensors:
             known = ", ".join(sorted(self._sensors))
             self._report("refused", f"zeroing refused: no sensor {name}, there are {known}")
@@ -204,7 +204,7 @@ class Runtime:
         if scan.counts.shape != self._scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
         sensor = self._sensors.get(scan.sensor) or self._meet(scan)
-        zeroed = sensor.hear(scan)
+        zeroed = sensor.take(scan)
         readings = None if zeroed is None or sensor.filler is None else sensor.fill(zeroed)
         filled = None if readings is None else readings.filled
         watch = sensor.watch
@@ -306,7 +306,7 @@ class Runtime:
         notes: list[Note] = []
         if self._mounted and name not in self._mounted:
             known = ", ".join(sorted(self._mounted))
-            text = f"the sensor file knows no sensor {name}, only {known}: taken as wired"
+            text = f"the sensor file has no sensor {name}, only {known}: taken as wired"
             notes.append(Note("not_in_sensor_file", text))
         if baseline is None and self._baselines:
             text = f"no stored baseline for sensor {name}, only for {', '.join(sorted(self._baselines))}: zeroing"
@@ -335,11 +335,13 @@ def _age_notes(scan: Scan) -> tuple[Note, ...]:
     if scan.device_ns is None:
         if scan.unread_ns <= OLD_NS:
             return ()
-        text = f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it came: nobody read meanwhile"
+        text = (
+            f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it arrived: nothing was read meanwhile"
+        )
         return (Note("late", text),)
     if scan.time_ns - scan.device_ns <= OLD_NS:
         return ()
-    return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it came"),)
+    return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it arrived"),)
 
 
 class _Due(NamedTuple):

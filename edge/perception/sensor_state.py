@@ -39,7 +39,7 @@ class Sensor:
         pad_row: the same as the model takes it.
         check: decides whether its patterns are to be believed; None where the model has no checks.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
-        wrench_origin: whether the model is told the counts per newton.
+        wrench_origin: whether the model gets the sensor's counts per newton.
         filler: estimates the dead taxels; None where none is dead, or nothing may be estimated.
         events: what has happened to the zeroing since the last scan; the reader clears them.
     """
@@ -74,7 +74,7 @@ class Sensor:
         self._mounting = mounting
         self._name = name
         self.filler: Filler | None = None
-        self._heard_ns: int | None = None
+        self._received_ns: int | None = None
         self._estimator = estimator
         self._unix_time_s = unix_time_s
         self._zeroing = BaselineEstimator(clock=unix_time_s)
@@ -94,9 +94,9 @@ class Sensor:
             self.gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
         trust = contract.read_trust()
         self.check = None if trust is None else PatternCheck(trust, contract, self.pad_row)
-        told = pad is not None and pad.counts_per_newton is not None
+        calibrated = pad is not None and pad.counts_per_newton is not None
         takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
-        self.wrench_origin = "calibrated" if told and takes else "nominal"
+        self.wrench_origin = "calibrated" if calibrated and takes else "nominal"
 
     def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
         """Subtract a baseline from now on.
@@ -128,13 +128,13 @@ class Sensor:
             self._tracker.forget()
         if self._rezeroing is not None:
             self._end_rezeroing()
-            self.report("given_up", "the sensor was away; ask again")
+            self.report("given_up", "the sensor was away; request it again")
 
-    def hear(self, scan: Scan) -> NDArray[np.float32] | None:
+    def take(self, scan: Scan) -> NDArray[np.float32] | None:
         """Take a scan and return each taxel's newest reading over the baseline (3, rows, cols); None without one."""
-        if self._heard_ns is not None and scan.time_ns - self._heard_ns > TAPS_FORGOTTEN_NS:
+        if self._received_ns is not None and scan.time_ns - self._received_ns > TAPS_FORGOTTEN_NS:
             self.lose_touch()
-        self._heard_ns = scan.time_ns
+        self._received_ns = scan.time_ns
         before = self.watch.dead
         zeroed = self.watch.push(scan, self.baseline)
         if self.watch.dead is not before:

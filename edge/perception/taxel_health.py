@@ -78,7 +78,7 @@ class TaxelWatch:
         self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)
         self.dead: NDArray[np.bool_] = np.zeros(grid_shape, dtype=bool)
         self._code = np.zeros(grid_shape, dtype=np.int8)
-        self._heard = np.zeros(grid_shape, dtype=bool)
+        self._arrived = np.zeros(grid_shape, dtype=bool)
         self._saturated = np.zeros(grid_shape, dtype=bool)
         self._unzeroed = np.zeros(grid_shape, dtype=bool)
         self._age = np.zeros(grid_shape, dtype=np.int64)
@@ -97,7 +97,7 @@ class TaxelWatch:
     @property
     def waiting(self) -> bool:
         """True while a taxel has not arrived yet and is not given up."""
-        return not self.sound and not bool((self._heard | self.dead).all())
+        return not self.sound and not bool((self._arrived | self.dead).all())
 
     @property
     def silent_long(self) -> NDArray[np.bool_]:
@@ -117,7 +117,7 @@ class TaxelWatch:
 
     def forget(self) -> None:
         """Hold no earlier reading any longer; dead taxels stay dead until enough good scans arrive."""
-        self._heard[:] = False
+        self._arrived[:] = False
         self.sound = False
 
     def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
@@ -162,7 +162,7 @@ class TaxelWatch:
             if not self._may_be_far(zeroed, float(self._size.max())):
                 return zeroed
         read = scan.fresh & ~self._saturated
-        self._heard |= read
+        self._arrived |= read
         np.copyto(self.held, scan.counts, where=read)
         if baseline is not None:
             zeroed = deformation(self.held, baseline, self._mounting)
@@ -249,7 +249,7 @@ class TaxelWatch:
         frozen = self._repeats >= FROZEN_SENSOR_SCANS
         fault[(self._still >= STUCK_SCANS) | (self._old >= FROZEN_SCANS) | frozen] = STUCK
         held_ns = scan.time_ns - np.maximum(self._read_ns, self._whole_ns)
-        gone = (self._age > HOLD_SCANS) | (self._heard & (self._age > 0) & (held_ns > HOLD_NS))
+        gone = (self._age > HOLD_SCANS) | (self._arrived & (self._age > 0) & (held_ns > HOLD_NS))
         fault[gone] = SILENT
         fault[gone & self._saturated] = SATURATED
 
@@ -266,7 +266,7 @@ class TaxelWatch:
             self._code = code
             self.reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
         counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
-        self.sound = not counting and not self.dead.any() and bool(self._heard.all())
+        self.sound = not counting and not self.dead.any() and bool(self._arrived.all())
 
     def _follow_far(self, zeroed: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Count scans in which a taxel reads what no contact makes; return the largest of its axes, (rows, cols)."""

@@ -46,34 +46,34 @@ def take_baselines(
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}
     whole_s: dict[str, float] = {}
-    heard_s = clock_s()
+    received_s = clock_s()
     with Progress("zeroing", skip + scans, "scan") as bar:
         while not (baselines and baselines.keys() == skipped.keys()):
             if stop is not None and stop.is_set():
                 raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
             taken = source.take(POLL_S)
             if taken is None:
-                raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor were heard")
+                raise BaselineRefusedError(f"the source ended before {scans} complete scans of every sensor")
             now_s = clock_s()
-            if any(isinstance(heard, Scan) for heard in taken):
-                heard_s = now_s
-            elif now_s - heard_s > GIVEN_UP_S:
+            if any(isinstance(one, Scan) for one in taken):
+                received_s = now_s
+            elif now_s - received_s > GIVEN_UP_S:
                 silence = f"no scan from {source.name} for {GIVEN_UP_S:.0f} s"
-                raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor says what is wrong")
-            for heard in taken:
-                if not isinstance(heard, Scan):
-                    if heard.kind in ("lost", "silent"):
+                raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor shows what is wrong")
+            for one in taken:
+                if not isinstance(one, Scan):
+                    if one.kind in ("lost", "silent"):
                         estimators.clear()  # the sensor may read differently after the gap
                     continue
-                name = heard.sensor
+                name = one.sensor
                 skipped[name] = skipped.get(name, -1) + 1
-                if name not in whole_s or (heard.complete and not heard.repeated):
+                if name not in whole_s or (one.complete and not one.repeated):
                     whole_s[name] = now_s
                 if skipped[name] < skip or name in baselines:
                     continue
                 estimator = estimators.setdefault(name, BaselineEstimator(scans))
                 try:
-                    baseline = estimator.push(heard)
+                    baseline = estimator.push(one)
                 except BaselineRefusedError as refusal:
                     raise BaselineRefusedError(f"sensor {name}: {refusal}") from refusal
                 if baseline is not None:
@@ -81,6 +81,6 @@ def take_baselines(
             for name in skipped.keys() - baselines.keys():
                 if now_s - whole_s[name] > GIVEN_UP_S:  # a taxel or the sensor is silent, while scans come
                     lack = f"no whole new scan from sensor {name} for {GIVEN_UP_S:.0f} s"
-                    raise DeviceError(f"{lack}: edge-sr doctor says what is wrong")
+                    raise DeviceError(f"{lack}: edge-sr doctor shows what is wrong")
             bar.reach(min(skip + scans, 1 + min(skipped.values(), default=-1)))
     return baselines

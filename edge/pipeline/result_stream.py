@@ -110,12 +110,12 @@ class Stream:
                 obey(self._commands, self._runtime)
                 self.statistics.commands_refused = self._commands.refused
             scans: list[Scan] = []
-            for heard in taken:
-                if isinstance(heard, Scan):
-                    scans.append(heard)
+            for one in taken:
+                if isinstance(one, Scan):
+                    scans.append(one)
                     continue
                 yield from self._results(scans)
-                self._heed(heard)
+                self._heed(one)
                 scans = []
             yield from self._results(scans)
             for event in self._silence.look():
@@ -136,10 +136,10 @@ class Stream:
             self.statistics.overruns = self._source.overruns
             if taken is None:
                 return
-            for heard in taken if self._source.patient else ():  # one scan at most
-                if isinstance(heard, Scan):
-                    first_ns = heard.time_ns if first_ns is None else first_ns
-                    if heard.time_ns - first_ns >= length_s * 1e9:
+            for one in taken if self._source.patient else ():  # one scan at most
+                if isinstance(one, Scan):
+                    first_ns = one.time_ns if first_ns is None else first_ns
+                    if one.time_ns - first_ns >= length_s * 1e9:
                         return
             yield taken
 
@@ -160,14 +160,14 @@ class Stream:
             deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
         if not scan.unread_ns:  # scans that waited unread came at no pace
             deadline.follow(scan.time_ns)
-        heard_again = self._silence.follow(scan, deadline.period_ns)
+        back = self._silence.follow(scan, deadline.period_ns)
         if result.pattern is not None and not self._source.patient:  # its scans have another clock
             statistics.late += deadline.check(scan.time_ns, done_ns)
             result = replace(result, latency_us=(done_ns - scan.time_ns) / 1e3)
         statistics.add(result)
         statistics.missed = self._silence.missed
-        if heard_again is not None:
-            self._tell(heard_again)
+        if back is not None:
+            self._tell(back)
         return result
 
     def _heed(self, notice: Notice) -> None:

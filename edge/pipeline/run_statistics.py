@@ -169,7 +169,7 @@ class Statistics:
             counts = ", ".join(f"{kind} {count}" for kind, count in self.events.items())
             lines.append(f"events: {counts}")
         if self.commands_refused:
-            lines.append(f"refused: {self.commands_refused} lines or messages were no command")
+            lines.append(f"refused: {self.commands_refused} lines or messages were not commands")
         return "\n".join(lines)
 
     def _without_pattern(self) -> list[str]:
@@ -177,8 +177,8 @@ class Statistics:
         lines: list[str] = []
         for name, result in sorted(self._farthest.items()):
             why = {
-                "zeroing": f"not zeroed, {result.note or 'too few scans'}; or give --baseline, of the free pad",
-                "incomplete": result.note or "a taxel was not heard",
+                "zeroing": f"not zeroed, {result.note or 'too few scans'}; or pass --baseline, of the free pad",
+                "incomplete": result.note or "a taxel was not received",
                 "idle": None if self.patterns else "nothing touched it",
                 "dropped": "newer scans overtook all that were in contact",
             }.get(result.state)

@@ -133,9 +133,9 @@ class Silence:
         newest_ns = max(scan.time_ns for scan in self._last.values())
         events: list[Event] = []
         for sensor, scan in self._last.items():
-            if newest_ns - self._heard_ns(sensor, scan.time_ns) > SENSOR_SILENT_NS and sensor not in self._silent:
+            if newest_ns - self._received_ns(sensor, scan.time_ns) > SENSOR_SILENT_NS and sensor not in self._silent:
                 self._silent.add(sensor)
-                events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none for so long"))
+                events.append(self._silence(sensor, newest_ns, scan.time_ns, "the recording has none in that time"))
         if self._expected and newest_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
             self._silent.update(missing)
@@ -144,11 +144,11 @@ class Silence:
         return events
 
     def _silence(self, sensor: str, now_ns: int, since_ns: int, why_recorded: str) -> Event:
-        why = why_recorded if self._recorded else "see to its cable and its controller, since others go on"
+        why = why_recorded if self._recorded else "check its cable and its controller, since other sensors continue"
         return Event(
             now_ns, "silent", sensor, f"no scan from sensor {sensor} for {(now_ns - since_ns) / 1e9:.1f} s: {why}"
         )
 
-    def _heard_ns(self, sensor: str, time_ns: int) -> int:
+    def _received_ns(self, sensor: str, time_ns: int) -> int:
         since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
         return max([time_ns, *since_ns])

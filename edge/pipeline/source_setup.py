@@ -62,7 +62,7 @@ def links_to(
     """
     for text in texts:
         if not isinstance(text, str):
-            raise UsageError(f"source is {text!r}, expected text, as behind --source; of several each by itself")
+            raise UsageError(f"source is {text!r}, expected text, as after --source; of several each by itself")
     if not texts and known.adapter is not None:
         texts = [f"slcan:serial={known.adapter}"]
     demo = any(text.rpartition("=")[2] in ("demo", DEMO_LOOP) for text in texts)

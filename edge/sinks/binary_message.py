@@ -40,14 +40,14 @@ def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32
     """Return header and maps of a message; the maps are read-only views of it.
 
     Raises:
-        MessageError: the bytes are no packed message.
+        MessageError: the bytes are not a packed message.
     """
     try:
         (length,) = _LENGTH.unpack_from(message)
         header = orjson.loads(message[_LENGTH.size : _LENGTH.size + length])
         listed = [(str(name), tuple(map(int, shape))) for name, shape in header["maps"]]
     except (struct.error, ValueError, TypeError, KeyError, OverflowError) as error:
-        raise MessageError(f"{len(message)} bytes are no packed message: expected a header with its maps") from error
+        raise MessageError(f"{len(message)} bytes are not a packed message: expected a header with its maps") from error
     position, maps = _LENGTH.size + length, {}
     for name, shape in listed:
         count = math.prod(shape)
@@ -57,5 +57,5 @@ def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32
         maps[name] = np.frombuffer(message, _FLOAT32, count, position).reshape(shape)
         position = end
     if position != len(message):
-        raise MessageError(f"{len(message) - position} bytes behind the last map, expected none")
+        raise MessageError(f"{len(message) - position} bytes after the last map, expected none")
     return header, maps

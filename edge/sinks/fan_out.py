@@ -111,7 +111,7 @@ class Fan(Sink):
         if not self._sinks:
             self.unwritten = self._given_up_unwritten
             raise self.failures[0] if self.failures else error
-        self._tell_all(f"{error}; the other sinks go on", counters)
+        self._tell_all(f"{error}; the other sinks continue", counters)
 
     def _tell_all(self, text: str, counters: Mapping[str, int]) -> None:
         event = Event(self._clock_ns(), "sink", None, text)

@@ -16,12 +16,12 @@ _LEFT_OUT: Final = tuple(field.name for field in _FIELDS if field.left_out)
 
 def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
     """Return a result without its maps; absent is None, masks have bit i for taxel i. Counts may be an array."""
-    said: dict[str, Any] = dict(zip(_NAMES, _COLUMNS.of(result), strict=True))
+    fields: dict[str, Any] = dict(zip(_NAMES, _COLUMNS.of(result), strict=True))
     for name in _LEFT_OUT:
-        if said[name] is None:
-            del said[name]
-    said["counters"] = dict(counters)
-    return said
+        if fields[name] is None:
+            del fields[name]
+    fields["counters"] = dict(counters)
+    return fields
 
 
 def event_record(event: Event, counters: Mapping[str, int], source: str | None) -> dict[str, Any]:

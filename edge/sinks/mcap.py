@@ -93,9 +93,9 @@ class McapSink(Sink):
                     GEOMETRY_METADATA, {key: json.dumps(one) for key, one in asdict(geometry).items()}
                 )
                 for name, mounting in (mountings or {}).items():
-                    said = asdict(mounting)
-                    del said["taxel_count"]  # the geometry holds it
-                    text = json.dumps(said)
+                    fields = asdict(mounting)
+                    del fields["taxel_count"]  # the geometry holds it
+                    text = json.dumps(fields)
                     self._file.add_metadata(MOUNTING_METADATA, {"sensor": name, "mounting": text})
             except OSError:
                 self._file.abandon()
@@ -122,7 +122,7 @@ class McapSink(Sink):
             return
         scan = result.scan
         sensor, unix_ns = scan.sensor, scan.time_ns + self._offset_ns
-        said = record(result, counters)
+        fields = record(result, counters)
         try:
             if not self._source_told:
                 self._file.add_metadata(SOURCE_METADATA, {"kind": self._origin or result.source})
@@ -131,8 +131,10 @@ class McapSink(Sink):
                 data = encode_baseline(result.baseline, result.baseline_age_s, unix_ns)
                 self._add(sensor, "baseline", self._baseline, unix_ns, data)
                 self._baselines[sensor] = result.baseline
-            self._add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, unix_ns, said["fresh"], said["renewed"]))
-            self._add(sensor, "result", RESULT, unix_ns, result_message(result, said, unix_ns))
+            self._add(
+                sensor, "scan", self._scan, unix_ns, encode_scan(scan, unix_ns, fields["fresh"], fields["renewed"])
+            )
+            self._add(sensor, "result", RESULT, unix_ns, result_message(result, fields, unix_ns))
             for name, values in maps_of(result).items():
                 self._add(sensor, name, IMAGE, unix_ns, image(values, frame_of(result), unix_ns))
             force = wrench(result, unix_ns)

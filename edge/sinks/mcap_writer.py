@@ -291,11 +291,11 @@ class McapFile:
                 if self.size_bytes > group_start:
                     length = self.size_bytes - group_start
                     SummaryOffset(group_opcode=opcode, group_start=group_start, group_length=length).write(offsets)
-            offsets_start, said = self.size_bytes, offsets.end()
+            offsets_start, tail = self.size_bytes, offsets.end()
             head = struct.pack("<BQQQ", Opcode.FOOTER, _FOOTER_BYTES, start, offsets_start)
-            crc = zlib.crc32(head, zlib.crc32(said, crc))
+            crc = zlib.crc32(head, zlib.crc32(tail, crc))
             footer = Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=crc)
-            self._put(said + _bytes_of(footer) + MCAP0_MAGIC)
+            self._put(tail + _bytes_of(footer) + MCAP0_MAGIC)
         except OSError:
             self.size_bytes = whole_bytes
             os.ftruncate(self._file.fileno(), whole_bytes)

@@ -150,7 +150,7 @@ def gather(path: Path) -> int:
     parts, draft = parts_dir(path), draft_of(path)
     if not parts.exists():
         what = "is finished, and can be read as it is" if path.exists() else "is not there, finished or not"
-        raise SinkError(f"{path} {what}: a recording that a crash left behind has {parts}")
+        raise SinkError(f"{path} {what}: a recording that a crash interrupted has {parts}")
     if path.exists():
         raise SinkError(f"{path} exists, and is not replaced by what {parts} holds: move it away, then {_remedy(path)}")
     try:
@@ -209,9 +209,9 @@ def _remedy(path: Path) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Make the .npz of what a crash left behind; returns an exit code."""
+    """Make the .npz from the parts that a crash left; return an exit code."""
     parser = argparse.ArgumentParser(prog="python -m edge.sinks.npz", description=main.__doc__)
-    parser.add_argument("file", type=Path, metavar="FILE.npz", help="what was recorded into")
+    parser.add_argument("file", type=Path, metavar="FILE.npz", help="name of the recording")
     path: Path = parser.parse_args(arguments).file
     try:
         scans = gather(path)

@@ -183,7 +183,7 @@ class SharedMemorySink(Sink):
         try:
             head = os.pread(descriptor, HEADER_BYTES, 0)
             if len(head) < HEADER_BYTES or not head.startswith(MAGIC):
-                raise SinkError(f"{self._path} is another program's shared memory: choose another name behind shm:")
+                raise SinkError(f"{self._path} is another program's shared memory: choose another name after shm:")
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:

@@ -33,7 +33,7 @@ class StatusSink(Sink):
         self._rates: dict[str, Rate] = {}
         self._counters: Mapping[str, int] = {}
         self._last_scan_s = clock_s()
-        self._heard_s: dict[str, float] = {}
+        self._received_s: dict[str, float] = {}
         self._last_shown_s: float | None = None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -43,7 +43,7 @@ class StatusSink(Sink):
             self._rates[result.scan.sensor] = Rate()
         self._rates[result.scan.sensor].add(result.scan.time_ns)
         self._counters = counters
-        self._last_scan_s = self._heard_s[result.scan.sensor] = self._clock_s()
+        self._last_scan_s = self._received_s[result.scan.sensor] = self._clock_s()
         self._refresh()
 
     def wait(self) -> None:
@@ -93,7 +93,7 @@ class StatusSink(Sink):
 
     def _sensor_text(self, name: str) -> str:
         result = self._latest[name]
-        silence_s = self._clock_s() - self._heard_s[name]
+        silence_s = self._clock_s() - self._received_s[name]
         if silence_s >= SHOWN_SILENT_S and len(self._latest) > 1:
             return f"{name} no scan for {silence_s:.0f} s"
         words = [name, result.state]

@@ -85,7 +85,7 @@ class ZenohSink(Sink):
     @property
     def trouble(self) -> str | None:
         """Trouble where there was no subscriber when the last result was put, else None."""
-        return None if self._read else f"nobody subscribes to zenoh:{self._target}: see to its reader, or the router"
+        return None if self._read else f"nobody subscribes to zenoh:{self._target}: check its reader, or the router"
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Put the scan, and its pattern where that is new.
@@ -94,11 +94,11 @@ class ZenohSink(Sink):
             SinkError: the session is broken.
         """
         publishers = self._publishers.get(result.scan.sensor) or self._declare(result.scan.sensor)
-        said = record(result, counters)
+        text = record(result, counters)
         self._read = any(map(_matched, (*publishers, self._events)))
-        self._put(publishers[0], orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
+        self._put(publishers[0], orjson.dumps(text, option=orjson.OPT_SERIALIZE_NUMPY))
         if result.pattern is not None and result.reused_from is None:
-            self._put(publishers[1], pack(said, maps_of(result)))
+            self._put(publishers[1], pack(text, maps_of(result)))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Put an event.
@@ -160,7 +160,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
         return key, {**CLOSED, "connect/endpoints": value.split(",")}
     if name == "config" and value:
         return key, Path(value)
-    raise UsageError(f"zenoh:{target} has {option!r} behind its key: {_REMEDY}")
+    raise UsageError(f"zenoh:{target} has {option!r} after its key: {_REMEDY}")
 
 
 def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
@@ -173,8 +173,8 @@ def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
         try:
             config = zenoh.Config.from_file(configuration)
         except zenoh.ZError as error:
-            raise SinkError(f"{configuration} is no configuration of zenoh: {_reason(error)}") from error
-        configuration = {name: CLOSED[name] for name, said in untouched.items() if config.get_json(name) == said}
+            raise SinkError(f"{configuration} is not a zenoh configuration: {_reason(error)}") from error
+        configuration = {name: CLOSED[name] for name, text in untouched.items() if config.get_json(name) == text}
     for name, value in configuration.items():
         config.insert_json5(name, json.dumps(value))
     return config
@@ -187,5 +187,5 @@ def _matched(publisher: "zenoh.Publisher") -> bool:
 
 def _reason(error: Exception) -> str:
     """Return zenoh's reason without the place in its source, which follows " at "."""
-    said = str(error).strip().partition(f" at {os.sep}")[0]
-    return said.strip().splitlines()[-1].lstrip(" =")
+    text = str(error).strip().partition(f" at {os.sep}")[0]
+    return text.strip().splitlines()[-1].lstrip(" =")

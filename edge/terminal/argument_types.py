@@ -20,7 +20,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with the message and a hint at the help."""
-        self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help tells more)\n")
+        self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help lists all options)\n")
 
 
 def add_source(parser: argparse.ArgumentParser) -> None:
@@ -30,24 +30,24 @@ def add_source(parser: argparse.ArgumentParser) -> None:
         metavar="SRC",
         action="append",
         default=[],
-        help="where scans come from (default: looks for an adapter); repeated, with names, NAME=SRC, for two fingers",
+        help="source of the scans (default: the adapter plugged in); for two fingers repeated, as NAME=SRC",
     )
     parser.add_argument(
         "--id-map",
         metavar="MAP",
         choices=ID_MAPS,
-        help=f"which CAN id is which taxel: {', '.join(ID_MAPS)}; A and B are boards before 2021 "
+        help=f"map from CAN ids to taxels: {', '.join(ID_MAPS)}; A and B are boards before 2021 "
         f"(default {USPA44_MAP.name})",
     )
-    sensor_help = "what edge-sr doctor wrote: id map, order, axes, gains, force, baseline; other options go before it"
+    sensor_help = "sensor file of edge-sr doctor: id map, order, axes, gains, force, baseline; options override it"
     parser.add_argument("--sensor", metavar="FILE", type=Path, help=sensor_help)
-    force_help = "use a sensor file of an emulated sensor on a device"
+    force_help = "allow a sensor file of an emulated sensor on a device"
     parser.add_argument("--force", action="store_true", help=force_help)
     parser.add_argument(
         "--rate-hz",
         metavar="R",
         type=positive,
-        help="play a recording at this rate; for a device, the rate to hold it against",
+        help="rate at which a recording is played; for a device, its expected rate",
     )
 
 
@@ -82,6 +82,6 @@ def port(text: str) -> int:
     """Parse a port of this machine; 0 stands for any free one."""
     if not (text.isascii() and text.isdigit()) or int(text) > MOST_PORT:
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no port: expected 0 to {MOST_PORT}, or none; write FILE or command before it"
+            f"{text!r} is not a port: expected 0 to {MOST_PORT}, or none; write FILE or command before it"
         )
     return int(text)

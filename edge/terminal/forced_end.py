@@ -77,8 +77,8 @@ def _kept(things: list[_Thing], thing: _Thing) -> Iterator[None]:
 
 
 def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
-    while not set(numbers) & set(heard := waking.recv(_READ_BYTES)):
-        if not heard:
+    while not set(numbers) & set(received := waking.recv(_READ_BYTES)):
+        if not received:
             return
     files, left_s = _sizes(), END_S
     waking.settimeout(_LOOK_S)

@@ -129,7 +129,7 @@ def tracked(things: Iterable[_Thing], what: str, unit: str, total: int | None = 
     """
     count = len(things) if total is None and isinstance(things, Sized) else total
     if count is None:
-        raise TypeError("what is tracked has no length: say its total")
+        raise TypeError("the sequence has no length: pass `total`")
     with Progress(what, count, unit) as progress:
         for thing in things:
             yield thing

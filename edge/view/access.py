@@ -58,7 +58,7 @@ class Access:
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
             return Refusal(HTTPStatus.FORBIDDEN, f"this server is not called {called}; {REMEDY}")
         if any(origin != f"http://{hosts[0]}" for origin in origins):
-            return Refusal(HTTPStatus.FORBIDDEN, f"pages of {', '.join(origins)} may not ask this server")
+            return Refusal(HTTPStatus.FORBIDDEN, f"pages of {', '.join(origins)} may not send requests to this server")
         place, _, query = path.partition("?")
         if place not in (PAGE, SOCKET):
             return Refusal(HTTPStatus.NOT_FOUND, f"there is only {PAGE}")

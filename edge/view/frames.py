@@ -8,7 +8,7 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import encodable, event_record, record
-from edge.view.run_snapshot import Heard, Newest, Point, Told
+from edge.view.run_snapshot import Newest, NumberedEvent, Point, RunSnapshot
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.silence import SENSOR_SILENT_NS
 
@@ -42,11 +42,11 @@ class Frames:
         now_ns: the moment, in [ns].
     """
 
-    def __init__(self, heard: Heard, now_ns: int, source: SourceKind | None) -> None:
+    def __init__(self, snapshot: RunSnapshot, now_ns: int, source: SourceKind | None) -> None:
         self.now_ns = now_ns
         self._source = source
-        self._heard = heard
-        self._newest = dict(heard.newest)
+        self._snapshot = snapshot
+        self._newest = dict(snapshot.newest)
         self._packed: dict[tuple[str, int], bytes] = {}
 
     @property
@@ -63,31 +63,31 @@ class Frames:
 
     def events(self, since: int) -> list[tuple[int, bytes]]:
         """Return the latest events after number `since`, with their numbers."""
-        return [(told.number, self._event(told)) for told in self._heard.events(since)]
+        return [(sent.number, self._event(sent)) for sent in self._snapshot.events(since)]
 
     def silent(self) -> dict[str, float]:
         """Return the silent sensors, and for how long each has been silent, in [s]."""
-        away_ns = {sensor: self.now_ns - newest.heard_ns for sensor, newest in self._newest.items()}
+        away_ns = {sensor: self.now_ns - newest.received_ns for sensor, newest in self._newest.items()}
         return {sensor: round(ns / 1e9, 1) for sensor, ns in away_ns.items() if ns > SENSOR_SILENT_NS}
 
-    def _event(self, told: Told) -> bytes:
-        said = event_record(told.event, told.counters, self._source)
-        return _event(said, self.now_ns - told.heard_ns, {"number": told.number})
+    def _event(self, sent: NumberedEvent) -> bytes:
+        fields = event_record(sent.event, sent.counters, self._source)
+        return _event(fields, self.now_ns - sent.received_ns, {"number": sent.number})
 
     def _pack(self, newest: Newest, since: int) -> bytes:
         result = newest.result
-        first_ns = self._heard.first_ns or 0
+        first_ns = self._snapshot.first_ns or 0
         header: dict[str, Any] = {
             **record(result, newest.counters),
             "kind": "result",
             "note_kinds": [note.kind for note in result.notes],
             "untrusted_text": result.untrusted_text,
             "rate_hz": None if newest.rate_hz is None else round(newest.rate_hz, 2),
-            "age_s": _seconds(self.now_ns - newest.heard_ns),
+            "age_s": _seconds(self.now_ns - newest.received_ns),
             # The loop may have added points since; they belong to the next frame, which begins after this one.
             "trace": [
                 _drawn(point, first_ns)
-                for point in self._heard.points(result.scan.sensor, since)
+                for point in self._snapshot.points(result.scan.sensor, since)
                 if point.number <= newest.number
             ],
         }
@@ -134,8 +134,8 @@ def refused(time_ns: int, why: str, source: SourceKind | None) -> bytes:
     return _event(event_record(Event(time_ns, "refused", None, why), {}, source), 0, {})
 
 
-def _event(said: Mapping[str, Any], age_ns: int, number: Mapping[str, int]) -> bytes:
-    return pack({**said, **number, "kind": "event", "age_s": _seconds(age_ns)}, {})
+def _event(fields: Mapping[str, Any], age_ns: int, number: Mapping[str, int]) -> bytes:
+    return pack({**fields, **number, "kind": "event", "age_s": _seconds(age_ns)}, {})
 
 
 def _path(path: Path | None) -> str | None:

@@ -16,7 +16,7 @@ from edge.pipeline.sink import Sink
 from edge.view.access import grant
 from edge.view.frames import Run
 from edge.view.recorder import FORM, Recorder
-from edge.view.run_snapshot import Heard
+from edge.view.run_snapshot import RunSnapshot
 from edge.view.server import Server
 from edge.view.sink import ViewSink
 from firmware_bridge.links.base import SourceKind
@@ -56,13 +56,13 @@ class LiveView:
             SinkError: the port cannot be taken.
         """
         access = grant(host, socket.gethostname(), token)
-        self._heard = Heard()
+        self._snapshot = RunSnapshot()
         self._messages: Callable[[Event], object] = lambda event: None
         self._recorder = Recorder(record_dir, self._tell)
         commands.record = self._recorder.record
         import_module(f"edge.sinks.{FORM}")  # now, not between two scans: the import may take a fifth of a second
-        self._server = Server(self._heard, commands, access, port, lambda: self._recorder.path, self._failed)
-        self._view = ViewSink(self._heard, lambda: self._server.watched, self._server.wake)
+        self._server = Server(self._snapshot, commands, access, port, lambda: self._recorder.path, self._failed)
+        self._view = ViewSink(self._snapshot, lambda: self._server.watched, self._server.wake)
         self._contract = contract
         self._open = contextlib.ExitStack()
         self.sinks: list[Sink] = [self._recorder, self._view]

@@ -63,7 +63,7 @@ class Recorder(Sink):
         """Begin a recording, or end it; does nothing where that is so already."""
         self._look_back()
         if on and self._closing is not None:
-            self._say("refused", "not recording: the file before is still being written; ask again")
+            self._say("refused", "not recording: the previous file is still being written; try again")
             return
         self._wanted = on
         if on and self._sink is None and self._opening is None and self.open_sink is not None:

@@ -46,34 +46,34 @@ class Newest(NamedTuple):
         number: of the sensor's results, from 1.
         result: as it came.
         counters: up to it.
-        heard_ns: time of its arrival, in [ns].
+        received_ns: time of its arrival, in [ns].
         rate_hz: smoothed rate of the sensor's scans; None before the second.
     """
 
     number: int
     result: Result
     counters: Mapping[str, int]
-    heard_ns: int
+    received_ns: int
     rate_hz: float | None
 
 
-class Told(NamedTuple):
+class NumberedEvent(NamedTuple):
     """Event with its number and time of arrival.
 
     Attributes:
         number: of the run's events, from 1.
         event: as it came.
         counters: up to it.
-        heard_ns: time of its arrival, in [ns].
+        received_ns: time of its arrival, in [ns].
     """
 
     number: int
     event: Event
     counters: Mapping[str, int]
-    heard_ns: int
+    received_ns: int
 
 
-class Heard:
+class RunSnapshot:
     """Newest result and trace of every sensor, and the latest events, in memory that does not grow with the run.
 
     Attributes:
@@ -86,8 +86,8 @@ class Heard:
         self.first_ns: int | None = None
         self._clock_ns = clock_ns
         self._traces: dict[str, _Trace] = {}
-        self._events: deque[Told] = deque(maxlen=EVENTS)
-        self._told = 0
+        self._events: deque[NumberedEvent] = deque(maxlen=EVENTS)
+        self._events_count = 0
 
     def add(self, result: Result, counters: Mapping[str, int]) -> int:
         """Add a result; returns the time of its arrival, in [ns]."""
@@ -102,22 +102,22 @@ class Heard:
         trace.add(result)
         for event in result.events:
             self.tell(event, counters)
-        heard_ns = self._clock_ns()
-        newest = Newest(trace.number, result, counters, heard_ns, trace.rate.rate_hz)
+        received_ns = self._clock_ns()
+        newest = Newest(trace.number, result, counters, received_ns, trace.rate.rate_hz)
         if scan.sensor in self.newest:
             self.newest[scan.sensor] = newest
         else:
             self.newest = {**self.newest, scan.sensor: newest}
-        return heard_ns
+        return received_ns
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Add an event."""
-        self._told += 1
-        self._events.append(Told(self._told, event, counters, self._clock_ns()))
+        self._events_count += 1
+        self._events.append(NumberedEvent(self._events_count, event, counters, self._clock_ns()))
 
-    def events(self, since: int) -> list[Told]:
+    def events(self, since: int) -> list[NumberedEvent]:
         """Return the latest events after number `since`."""
-        return [told for told in self._events.copy() if told.number > since]
+        return [one for one in self._events.copy() if one.number > since]
 
     def points(self, sensor: str, since: int) -> list[Point]:
         """Return the points of a sensor after number `since`: all, or if these are too many, one in 50 ms."""

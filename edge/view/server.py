@@ -29,9 +29,9 @@ from edge.pipeline.commands import Commands
 from edge.view.access import SOCKET, Access
 from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import Frames, Run, hello, refused, state
-from edge.view.run_snapshot import Heard
+from edge.view.run_snapshot import RunSnapshot
 from edge.view.static_page import load_page
-from edge.view.viewer_commands import LONGEST_BYTES, hear
+from edge.view.viewer_commands import LONGEST_BYTES, execute
 from edge.view.viewer_connection import Attended
 from firmware_bridge.links.base import SourceKind
 
@@ -57,7 +57,7 @@ class Server:
 
     def __init__(
         self,
-        heard: Heard,
+        snapshot: RunSnapshot,
         commands: Commands,
         access: Access,
         port: int,
@@ -67,7 +67,7 @@ class Server:
         """Take the port; pages are answered from `begin` to `close`.
 
         Args:
-            heard: store of what is shown.
+            snapshot: store of what is shown.
             commands: queue for the viewers' commands.
             access: conditions that a request must meet.
             port: 0 for any free one.
@@ -78,7 +78,7 @@ class Server:
             SinkError: the page cannot be served there.
         """
         self.watched = False
-        self._heard = heard
+        self._snapshot = snapshot
         self._commands = commands
         self._access = access
         self._recording = recording
@@ -129,7 +129,7 @@ class Server:
             self._loop, self.watched = None, False
             ready.set()
             if not self._ending:
-                self._failed(f"the live page has ended: {sys.exception()!r}; the run goes on")
+                self._failed(f"the live page has ended: {sys.exception()!r}; the run continues")
 
     async def _show(self, run: Run, ready: threading.Event) -> None:
         self._loop = asyncio.get_running_loop()
@@ -150,8 +150,8 @@ class Server:
             max_size=LONGEST_BYTES,
         ) as server:
             ready.set()
-            said: tuple[object, ...] = ()
-            said_s = tidied_s = 0.0
+            sent: tuple[object, ...] = ()
+            sent_s = tidied_s = 0.0
             closing = False  # connections that were still closing when the others were tidied up
             while not self._ending:
                 with contextlib.suppress(TimeoutError):
@@ -159,12 +159,12 @@ class Server:
                     async with asyncio.timeout(STATE_S if waits else None):
                         await self._news.wait()
                 self._news.clear()
-                frames = Frames(self._heard, time.monotonic_ns(), self._source)
+                frames = Frames(self._snapshot, time.monotonic_ns(), self._source)
                 silent, recording = frames.silent(), self._recording()
-                to_say = (recording, len(self._viewers), tuple(silent))
+                new_state = (recording, len(self._viewers), tuple(silent))
                 now_s = time.monotonic()
-                if to_say != said or now_s - said_s >= STATE_S:
-                    said, said_s = to_say, now_s
+                if new_state != sent or now_s - sent_s >= STATE_S:
+                    sent, sent_s = new_state, now_s
                     broadcast(self._viewers, state(recording, len(self._viewers), silent))
                 gone = self._connections.gone
                 if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
@@ -188,7 +188,7 @@ class Server:
         if request.path.partition("?")[0] == SOCKET:
             if isinstance(connection, Connection) and self._connections.grant(connection):
                 return None
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} look already: close one\n")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"too many viewers ({MOST_VIEWERS}): close one\n")
         return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
 
     async def _attend(self, run: Run, connection: ServerConnection) -> None:
@@ -208,7 +208,7 @@ class Server:
                 async for message in connection:
                     if connection.state is not State.OPEN:
                         break  # many commands may wait from before it closed, and each takes its time
-                    why = hear(message, attended.viewer, self._commands)
+                    why = execute(message, attended.viewer, self._commands)
                     if why is not None:
                         broadcast([connection], refused(time.monotonic_ns(), why, self._source))
                     await asyncio.sleep(COMMAND_PAUSE_S)
@@ -233,9 +233,10 @@ def _listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as error:
-        what, remedy = f"port {port} of {host} cannot be had: {error.strerror}", "name another with --view"
+        what, remedy = f"cannot listen on {host}:{port}: {error.strerror}", "name another port with --view"
         if error.errno == errno.EADDRINUSE:
-            what, remedy = f"port {port} of {host} is in use", "name another with --view, or 0 for any free one"
+            what = f"cannot listen on {host}:{port}: address in use"
+            remedy = "name another port with --view, or 0 for any free one"
         elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-            what, remedy = f"{host} is no address of this machine", "name one with --view-host, or leave it out"
+            what, remedy = f"{host} is not an address of this machine", "name one with --view-host, or leave it out"
         raise SinkError(f"no live page: {what}; {remedy}") from error

@@ -8,7 +8,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.view.frames import MAX_FPS
-from edge.view.run_snapshot import Heard
+from edge.view.run_snapshot import RunSnapshot
 
 PERIOD_NS: Final = round(1e9 / MAX_FPS)
 
@@ -22,7 +22,7 @@ class ViewSink(Sink):
 
     def __init__(
         self,
-        heard: Heard,
+        snapshot: RunSnapshot,
         watched: Callable[[], bool],
         wake: Callable[[], object],
         clock_ns: Callable[[], int] = time.monotonic_ns,
@@ -30,12 +30,12 @@ class ViewSink(Sink):
         """Begin without a result.
 
         Args:
-            heard: store of results and events.
+            snapshot: store of results and events.
             watched: returns True while there is a viewer.
             wake: wakes the server, which has something new to send; never waits.
             clock_ns: monotonic, in [ns].
         """
-        self._heard = heard
+        self._snapshot = snapshot
         self._watched = watched
         self._wake = wake
         self._clock_ns = clock_ns
@@ -44,11 +44,11 @@ class ViewSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Store one result."""
-        self._news(self._heard.add(result, counters))
+        self._news(self._snapshot.add(result, counters))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Store one event."""
-        self._heard.tell(event, counters)
+        self._snapshot.tell(event, counters)
         self._news(self._clock_ns())
 
     def wait(self) -> None:

@@ -13,26 +13,26 @@ FORMS: Final = (
 )
 
 
-def hear(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+def execute(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
     """Queue the command in a viewer's message; returns the reason if it is refused."""
-    why = _hear(message, viewer, commands)
+    why = _refusal(message, viewer, commands)
     if why is not None:
         commands.refuse()
     return why
 
 
-def _hear(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
     try:
         parsed = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
         parsed = None
     if not isinstance(parsed, dict):
-        return f"{_shown(message)} is no JSON object: expected {FORMS}"
+        return f"{_shown(message)} is not a JSON object: expected {FORMS}"
     name = parsed.get("cmd")
     if name in ("record", "pause"):
         on = _switch(parsed)
         if on is None:
-            return f'{_shown(message)} does not say whether to {name}: expected {{"cmd": "{name}", "on": true}}'
+            return f'{_shown(message)} does not state whether to {name}: expected {{"cmd": "{name}", "on": true}}'
         if name == "pause":
             viewer.paused = on
             return None
@@ -40,9 +40,9 @@ def _hear(message: str | bytes, viewer: Viewer, commands: Commands) -> str | Non
     else:
         command = runtime_command(parsed)
     if command is None:
-        return f"{_shown(message)} is no command: expected {FORMS}"
+        return f"{_shown(message)} is not a command: expected {FORMS}"
     if commands.full:
-        return f"{WAITING} commands wait already: ask again when the run has done them"
+        return f"{WAITING} commands are waiting: repeat it when the run has executed them"
     commands.put(command)
     return None
 

@@ -13,13 +13,13 @@ class Viewer:
     def __init__(self) -> None:
         self.paused = False
         self._seen: dict[str, int] = {}
-        self._told = 0
+        self._sent_number = 0
 
     def due(self, frames: Frames) -> list[bytes]:
         """Return the frames that are new since the last call: events, and unless paused one frame a sensor."""
         due: list[bytes] = []
-        for number, frame in frames.events(self._told):
-            self._told = number
+        for number, frame in frames.events(self._sent_number):
+            self._sent_number = number
             due.append(frame)
         if self.paused:
             return due

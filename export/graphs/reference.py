@@ -43,8 +43,8 @@ def origin(report: Mapping[str, Any]) -> dict[str, str]:
 
     Fine-tuning for int8 changes the weights, and so makes another network.
     """
-    told = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
-    return {ORIGIN_KEY: json.dumps(told, sort_keys=True)}
+    stated = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
+    return {ORIGIN_KEY: json.dumps(stated, sort_keys=True)}
 
 
 def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
@@ -53,10 +53,10 @@ def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
     Raises:
         ExportError: the metadata are missing.
     """
-    told = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
-    if told is None:
+    stated = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
+    if stated is None:
         raise ExportError(f"metadata key '{ORIGIN_KEY}' is missing: export the model again")
-    return json.loads(told)
+    return json.loads(stated)
 
 
 def network_of(model: onnx.ModelProto) -> PatternNet:

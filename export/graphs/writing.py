@@ -60,16 +60,16 @@ class Writer:
         """
         # The evaluated graph is the written one wherever the runtime can run it.
         session = self._session(name, model if contract.batch == ANY_BATCH else single, contract)
-        said = [f"x{contract.scale}"]
+        parts = [f"x{contract.scale}"]
         if contract.scale == self.frozen.scale:
             for given in tracked(range(1, contract.taps + 1), "judging", "run"):
                 contract.test_error[str(given)] = mean_error(judge_model(session, self.frozen, given))
             error = contract.test_error[str(contract.taps)]
-            said.append(f"{error['psnr_db']:.2f} dB, SSIM {error['ssim']:.3f}")
+            parts.append(f"{error['psnr_db']:.2f} dB, SSIM {error['ssim']:.3f}")
             if "coverage_90" in error:
-                said.append(f"interval covers {error['coverage_90']:.1%}")
+                parts.append(f"interval covers {error['coverage_90']:.1%}")
         else:
-            said.append(f"not judged, the test set is of x{self.frozen.scale}")
+            parts.append(f"not evaluated, the test set is of x{self.frozen.scale}")
         fitting = [one for one in self.validation if one.scale == contract.scale]
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))
@@ -78,7 +78,7 @@ class Writer:
         content = self._bytes(model, contract)
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
         write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
-        return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*said, *facts])}"
+        return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*parts, *facts])}"
 
     def _session(self, name: str, single: onnx.ModelProto, contract: Contract) -> ModelSession:
         with tempfile.TemporaryDirectory() as drafts:

@@ -177,12 +177,12 @@ def quantised_well(
     other = fine_tuned(net, model, plain.integers, sequences, recipe, tuning.seed)
     integers = quantised(to_model(other, geometry), seen, every=every)
     now_db = in_float_db - graph_psnr_db(integers, net.taps, validation)
-    said = f"fine-tuned {tuning.steps} steps: before {before_db:.3f} dB lost in validation, now {now_db:.3f}"
+    comparison = f"fine-tuned {tuning.steps} steps: before {before_db:.3f} dB lost in validation, now {now_db:.3f}"
     if now_db >= before_db:
-        return replace(plain, said=f"{said}, so not taken")
+        return replace(plain, said=f"{comparison}, so not used")
     other = recalibrated(other, integers, validation)
     model = to_model(other, geometry)
-    return Quantised(other, model, quantised(model, seen, every=every), trained_on=True, said=said)
+    return Quantised(other, model, quantised(model, seen, every=every), trained_on=True, said=comparison)
 
 
 def graph_psnr_db(model: onnx.ModelProto, taps: int, validation: FrozenSet) -> float:

@@ -87,7 +87,7 @@ def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> on
     """
     nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
     if not nodes:
-        raise ExportError("no convolution of the graph may be done in integers: export it without --int8")
+        raise ExportError("no convolution of the graph may be quantised: export it without --int8")
     inputs = {INPUT_NAME: seen.window.numpy()}
     if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
         inputs[PAD_NAME] = seen.pad.numpy()

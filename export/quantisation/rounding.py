@@ -151,7 +151,7 @@ def rounded(net: PatternNet, convolutions: Mapping[str, IntegerConvolution]) -> 
     named = {name.removesuffix(".weight"): grids for name, grids in convolutions.items()}
     foreign = [name for name in named if not isinstance(modules.get(name), nn.Conv2d)]
     if foreign:
-        raise ExportError(f"the graph's convolution {foreign[0]} is none of the network's: fold before export")
+        raise ExportError(f"the graph's convolution {foreign[0]} does not belong to the network: fold before export")
     with contextlib.ExitStack() as undone:
         for name, grids in named.items():
             module = modules[name]

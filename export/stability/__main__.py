@@ -32,9 +32,9 @@ _LEAST, _WORST = 1e-9, 1e2
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.stability", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (all)")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"parts to check, of {', '.join(PARTS)} (all)")
     parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
-    parser.add_argument("--quick", action="store_true", help="fewer and coarser cases, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="run fewer and coarser cases, as a test of the command")
     options = parser.parse_args(arguments)
     for part in options.parts:
         if part not in PARTS:
@@ -62,8 +62,8 @@ def run(parts: tuple[str, ...], folder: Path, quick: bool = False) -> list[Case]
     verdicts = [str(case.cells()["verdict"]) for case in cases]
     report.say(
         f"{len(cases)} rows: {verdicts.count('holds')} hold, {verdicts.count('refused')} are refused by a clear error, "
-        f"{verdicts.count('limit')} tell a documented limit, {len(broken)} are broken. A value that is not a number is "
-        "broken, whatever its bound. Run times are of one thread."
+        f"{verdicts.count('limit')} state a documented limit, {len(broken)} are broken. A value that is not a number "
+        "is broken, whatever its bound. Run times are of one thread."
     )
     if broken:
         report.show([{"part": case.part} | case.cells() for case in broken], "### Broken")
@@ -134,14 +134,14 @@ def _pareto(report: Report, folder: Path, quick: bool) -> None:
 def in_integers(nets: list[Row]) -> str:
     """Return what integers take and lose against float32, network by network, and which model is the default."""
     rows = {str(row["method"]): row for row in nets}
-    told = [
+    comparisons = [
         f"{name} {float(str(rows[name + INT8_SUFFIX]['p50 us'])) / float(str(row['p50 us'])):.2f} of the time, "
         f"{float(str(rows[name + INT8_SUFFIX]['PSNR dB'])) - float(str(row['PSNR dB'])):+.2f} dB"
         for name, row in rows.items()
         if name + INT8_SUFFIX in rows
     ]
     arithmetic = rows[DEFAULT_MODEL]["arithmetic"] if DEFAULT_MODEL in rows else "arithmetic that was not measured"
-    return f"In int8 against float32: {'; '.join(told)}. The default is `{DEFAULT_MODEL}`, in {arithmetic}."
+    return f"In int8 against float32: {'; '.join(comparisons)}. The default is `{DEFAULT_MODEL}`, in {arithmetic}."
 
 
 def _scatter(report: Report, rows: list[Row], by: str, axes_of: tuple[str, str], part: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from export.stability.case import Case, refused, timed
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer
-from train.physics.fem_cache import REFEREE_POISSON, Mesh
+from train.physics.fem_cache import REFERENCE_POISSON, Mesh
 from train.physics.fem_reference import FemPad, FemPresses, NoEquilibriumError
 
 PART: Final = "FEM referee"
@@ -64,7 +64,7 @@ def cases(quick: bool = False) -> Iterator[Case]:
     """
     fineness = _QUICK if quick else _WHOLE
     yield from _incompressible(fineness.punch)
-    for poisson in (_poisson(BULKS[0]), REFEREE_POISSON):
+    for poisson in (_poisson(BULKS[0]), REFERENCE_POISSON):
         for step in fineness.steps:
             yield _compress(fineness.compression, poisson, step, LEFT)
     for step in (0.2, 0.1):
@@ -89,7 +89,7 @@ def _incompressible(mesh: Mesh) -> Iterator[Case]:
     forces_n: list[float] = []
     for bulk in BULKS:
         mixed, run_ms = timed(lambda bulk=bulk: _punch(mesh, bulk, mixed=True))
-        severity, note = f"K/G {bulk:g}", _told(mixed)
+        severity, note = f"K/G {bulk:g}", _note(mixed)
         what = "residual, share of the reactions"
         yield Case(PART, "flat punch", severity, what, float(mixed.residual.max()), _RESIDUAL, run_ms, note=note)
         apart = float(np.abs(mixed.board_n / mixed.force_n - 1).max())
@@ -98,7 +98,7 @@ def _incompressible(mesh: Mesh) -> Iterator[Case]:
         alone, run_ms = timed(lambda bulk=bulk: _punch(mesh, bulk, mixed=False))
         ratio = float(alone.force_n[-1]) / forces_n[-1]
         what = "force by displacement alone, to the mixed one"
-        locks = f"{_told(alone)}; locks: not what the referee uses"
+        locks = f"{_note(alone)}; locks: not what the reference uses"
         yield Case(PART, "locking", severity, what, ratio, None, run_ms, note=locks, limit=True, least=1.05)
     change = abs(forces_n[-1] / forces_n[-2] - 1)
     severity = f"K/G {BULKS[-2]:g} to {BULKS[-1]:g}"
@@ -123,7 +123,7 @@ def _compress(mesh: Mesh, poisson: float, step: float, wanted: float) -> Case:
     if isinstance(found, NoEquilibriumError):
         guard = f"{type(found).__name__}: {found}"
         return Case(PART, case, severity, what, left, _LEFT_AFTER[step], run_ms, guard=guard)
-    return Case(PART, case, severity, what, left, wanted + 1e-9, run_ms, note=_told(found))
+    return Case(PART, case, severity, what, left, wanted + 1e-9, run_ms, note=_note(found))
 
 
 def _face(mesh: Mesh, layer: Layer, steps_mm: NDArray[np.floating]) -> tuple[FemPresses | NoEquilibriumError, float]:
@@ -137,14 +137,14 @@ def _face(mesh: Mesh, layer: Layer, steps_mm: NDArray[np.floating]) -> tuple[Fem
 
 def _bulge(mesh: Mesh) -> Iterator[Case]:
     """Yield the cases of sides that bulge over the board's rim, below which the elements do not support them."""
-    layer = Layer(poisson=REFEREE_POISSON)
+    layer = Layer(poisson=REFERENCE_POISSON)
     shares = np.array([0.05, 0.1, 0.15, 0.2, 0.25, 0.3])
     pad = FemPad(*mesh, layer)
     found, run_ms = timed(lambda: pad.press(np.zeros((pad.size, pad.size)), layer.thickness_mm * shares))
-    case, severity = "compression", f"K/G {_bulk(REFEREE_POISSON):.0f}, down by {{:.0%}}"
+    case, severity = "compression", f"K/G {_bulk(REFERENCE_POISSON):.0f}, down by {{:.0%}}"
     last = severity.format(shares[-1])
     what = "residual, share of the reactions"
-    yield Case(PART, case, last, what, float(found.residual.max()), _RESIDUAL, run_ms, note=_told(found))
+    yield Case(PART, case, last, what, float(found.residual.max()), _RESIDUAL, run_ms, note=_note(found))
     apart = float(np.abs(found.board_n / found.force_n - 1).max())
     yield Case(PART, case, last, "push to the board's reaction", apart, _BALANCE, run_ms)
     what, early = "sides below the board, mm", 3
@@ -161,7 +161,7 @@ def _converge(cells: tuple[int, ...], case: str, half_width_mm: float) -> Iterat
         ratio = (forces_n[i - 1] - forces_n[i]) / (forces_n[i - 2] - forces_n[i - 1])
         severity = f"{cells[i - 2]}, {cells[i - 1]}, {cells[i]} elements a side"
         what, run_ms = "change of the force, to the change before", runs[i][1]
-        note = f"order {-np.log2(abs(ratio)):.2f}; {_told(runs[i][0])}"
+        note = f"order {-np.log2(abs(ratio)):.2f}; {_note(runs[i][0])}"
         yield Case(PART, case, severity, what, abs(ratio), 2**-_ORDER, run_ms, note=note)
         # Richardson extrapolation: the limit of a geometric series of such changes.
         limit_n = forces_n[i] + (forces_n[i] - forces_n[i - 1]) * ratio / (1 - ratio)
@@ -175,23 +175,23 @@ def _square(count: int, half_width_mm: float) -> FemPresses:
     """Press a square punch on even elements, a quarter as many over the thickness as along a side."""
     # Pixels at x1 and the rim, all at the same distance.
     even = replace(USPA44, rows=count - 1, cols=count - 1, pitch_mm=USPA44.width_mm / count)
-    pad = FemPad(1, count // 4, Layer(poisson=REFEREE_POISSON), geometry=even)
+    pad = FemPad(1, count // 4, Layer(poisson=REFERENCE_POISSON), geometry=even)
     inside = np.abs(pad.nodes_mm) <= half_width_mm * (1 + 1e-9)
     return pad.press(np.where(inside[:, None] & inside, 0.0, _OFF), np.array([0.1]))
 
 
 def _too_far(mesh: Mesh) -> Case:
-    layer = Layer(poisson=REFEREE_POISSON)
+    layer = Layer(poisson=REFERENCE_POISSON)
     pad = FemPad(*mesh, layer)
     down_mm = np.array([(1 - LEFT) * layer.thickness_mm])
     return refused(
         PART,
         f"compression to {LEFT:.0%}",
-        f"K/G {_bulk(REFEREE_POISSON):.0f}, one leap",
+        f"K/G {_bulk(REFERENCE_POISSON):.0f}, one leap",
         lambda: pad.press(np.zeros((pad.size, pad.size)), down_mm),
         NoEquilibriumError,
     )
 
 
-def _told(found: FemPresses) -> str:
+def _note(found: FemPresses) -> str:
     return f"{len(found.indentation_mm)} load steps, {found.newton_steps.sum()} Newton"

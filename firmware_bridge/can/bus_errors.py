@@ -27,8 +27,8 @@ _COUNTED: Final[tuple[str, ...]] = (
     "overflows",
 )
 _TROUBLE: Final = {
-    "bus_off": "bus-off, the adapter has left the bus: check wires, termination and who else sends at another bitrate",
-    "error_passive": "error-passive, most of what is on the bus is garbled: check wires, termination and bitrate",
+    "bus_off": "bus-off, the adapter has left the bus: check wires, termination and the bitrate of every node",
+    "error_passive": "error-passive, most frames on the bus are garbled: check wires, termination and bitrate",
 }
 
 
@@ -97,7 +97,7 @@ class BusErrors:
         """Return the trouble to report to the user at `time_ns` [ns] of monotonic time, None if there is none."""
         troubles = [] if self._state is None else [_TROUBLE[self._state]]
         if self._lost_ns is not None and time_ns - self._lost_ns < LOST_RECENTLY_NS:
-            troubles.append("the adapter has lost frames: they are not fetched fast enough")
+            troubles.append("the adapter has lost frames: they are not read fast enough")
         return "; ".join(troubles) or None
 
     def counters(self) -> dict[str, int]:

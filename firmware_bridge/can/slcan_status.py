@@ -43,8 +43,8 @@ FRAMES_TO_FORGET: Final = 1600
 """Frames after which a loss that an error line reported is over: a second of one sensor."""
 
 BUS_OFF: Final = "the adapter reports bus-off: check bitrate, wiring and termination"
-BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame: check bitrate, wiring and termination"
-FRAMES_LOST: Final = "the adapter lost frames: they come faster than it hands them on"
+BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame arrives: check bitrate, wiring and termination"
+FRAMES_LOST: Final = "the adapter lost frames: they arrive faster than it forwards them"
 
 _STATUS = re.compile(rb"s[awpb][0-9]{6}|e[1-9][abBcfoOs]{1,9}")
 _FLAGS = re.compile(rb"F[0-9A-Fa-f]{2}")

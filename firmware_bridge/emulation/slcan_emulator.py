@@ -173,15 +173,15 @@ class Emulator:
         """Serve commands until a time on the monotonic clock; return False after a request to stop."""
         while not self._stop.is_set():
             left_s = deadline_s - time.monotonic()
-            heard = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
-            if heard:
-                self._obey(heard)
+            received = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
+            if received:
+                self._obey(received)
             elif left_s <= 0:
                 return True
         return False
 
-    def _obey(self, heard: bytes) -> None:
-        self._line.write(self.adapter.feed(heard))
+    def _obey(self, received: bytes) -> None:
+        self._line.write(self.adapter.feed(received))
 
     def _drain(self, deadline_s: float = math.inf) -> None:
         """Let the client fetch the bytes under way, which hanging up would discard."""

@@ -1,4 +1,4 @@
-"""Command line of the emulated controller and its slcan adapter, to try a client by hand.
+"""Command line of the emulated controller and its slcan adapter, for manual tests.
 
     python -m firmware_bridge.emulation.slcan_main FILE [FILE]
 
@@ -42,18 +42,18 @@ def argument_parser(program: str, description: str | None) -> argparse.ArgumentP
     )
     parser.add_argument("--rate-hz", type=float, help="scans a second of each sensor (default: as recorded)")
     parser.add_argument("--loop", action="store_true", help="begin again after the last scan")
-    parser.add_argument("--no-acks", action="store_true", help="answer no command, as some firmwares do")
-    parser.add_argument("--left-open", action="store_true", help="the channel is open from the start")
-    parser.add_argument("--old-canable", action="store_true", help="no answers, no time stamps, no flags")
-    parser.add_argument("--ignore-line-speed", action="store_true", help="as USB-CDC adapters do")
-    parser.add_argument("--jitter-ms", type=float, default=1.0, help="of scans, up to so much (default: 1)")
-    parser.add_argument("--latency-ms", type=float, default=1.0, help="of the adapter (default: 1)")
-    parser.add_argument("--frame-us", type=float, default=1e6 * FRAME_S, help="of the bus, a frame (default: 130)")
-    parser.add_argument("--first-frame", type=int, default=0, metavar="N", help="of the bus when the channel is opened")
-    parser.add_argument("--seed", type=int, default=0, help="of jitter and unused bytes (default: 0)")
-    parser.add_argument("--stamps", metavar="FILE", help="of each scan controller and time of its last frame, ns")
-    parser.add_argument("--link", type=Path, metavar="PATH", help="keep a link to the terminal, whatever its name")
-    parser.add_argument("--until-stdin-closes", action="store_true", help="end with the process that started it")
+    parser.add_argument("--no-acks", action="store_true", help="do not answer commands, like some firmwares")
+    parser.add_argument("--left-open", action="store_true", help="begin with an open channel")
+    parser.add_argument("--old-canable", action="store_true", help="send no answers, time stamps or flags")
+    parser.add_argument("--ignore-line-speed", action="store_true", help="accept any line speed, like USB-CDC adapters")
+    parser.add_argument("--jitter-ms", type=float, default=1.0, help="largest jitter of a scan (default: 1)")
+    parser.add_argument("--latency-ms", type=float, default=1.0, help="latency of the adapter (default: 1)")
+    parser.add_argument("--frame-us", type=float, default=1e6 * FRAME_S, help="time on the bus, a frame (default: 130)")
+    parser.add_argument("--first-frame", type=int, default=0, metavar="N", help="frame of the cycle sent first")
+    parser.add_argument("--seed", type=int, default=0, help="seed of jitter and unused bytes (default: 0)")
+    parser.add_argument("--stamps", metavar="FILE", help="write controller and time [ns] of each scan's last frame")
+    parser.add_argument("--link", type=Path, metavar="PATH", help="symbolic link to the emulated serial port")
+    parser.add_argument("--until-stdin-closes", action="store_true", help="end when stdin is closed")
     return parser
 
 
@@ -98,7 +98,7 @@ def _serve(options: argparse.Namespace, make_emulator: MakeEmulator) -> None:
 def _controllers(text: str) -> list[int]:
     ids = [one.strip() for one in text.split(",") if one.strip()]
     if not all(one.isascii() and one.isdigit() and len(one) <= 2 for one in ids):
-        raise argparse.ArgumentTypeError(f"{text!r} are no controller ids, such as 4,6")
+        raise argparse.ArgumentTypeError(f"{text!r} are not controller ids, such as 4,6")
     return list(map(int, ids))
 
 

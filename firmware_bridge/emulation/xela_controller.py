@@ -75,14 +75,24 @@ def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate
         if model is None:
             got, known = track.counts.shape[1:], ", ".join(map(str, _SHAPES))
             raise RecordingError(f"{recording.path}: scans of shape {got}, expected one of {known}")
-        known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
-        own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
-        if own_rate_hz is None:
-            raise RecordingError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
-        if not 0 < own_rate_hz < math.inf:
-            raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
-        controllers.append(Controller(track, can_id, own_rate_hz, model))
+        controllers.append(Controller(track, can_id, playing_rate_hz(recording, track, rate_hz), model))
     return controllers
+
+
+def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -> float:
+    """Return the scans a second at which a track is played: the requested ones, else as recorded.
+
+    Raises:
+        ValueError: the rate is not positive.
+        RecordingError: no rate is requested, and the recording has none.
+    """
+    known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
+    own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
+    if own_rate_hz is None:
+        raise RecordingError(f"{recording.path} does not state its rate: pass --rate-hz")
+    if not 0 < own_rate_hz < math.inf:
+        raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
+    return own_rate_hz
 
 
 def bus_timeline(

@@ -1,4 +1,4 @@
-"""Command line of the emulated xela_server, to try a client by hand.
+"""Command line of the emulated xela_server, for manual tests.
 
     python -m firmware_bridge.emulation.xela_server_main FILE [FILE]
     python -m firmware_bridge.emulation.xela_server_main --sim
@@ -31,20 +31,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add = parser.add_argument
     add("file", nargs="*", help="recording, .csv or .npz")
-    add("--sim", action="store_true", help="no recording, but waves, as the vendor's simulation mode")
+    add("--sim", action="store_true", help="send waves, like the vendor's simulation mode")
     add("--speaks", choices=VERSIONS, default=VERSIONS[-1], help=f"version (default: {VERSIONS[-1]})")
-    add("--port", type=_port, default=0, help="default: one that is free; the vendor's is 5000")
+    add("--port", type=_port, default=0, help="port (default: any free one; the vendor's is 5000)")
     add("--message-hz", type=float, default=DEFAULT_MESSAGE_HZ, help="messages a second (default: 100)")
     add("--rate-hz", type=float, help="cycles a second of each sensor (default: as recorded)")
-    add("--spread", type=float, default=0.0, help="share of a cycle over which its taxels come (default: 0)")
-    add("--queue-ms", type=float, default=0.0, help="how old what it says is (default: 0)")
+    add("--spread", type=float, default=0.0, help="share of a cycle over which its taxels arrive (default: 0)")
+    add("--queue-ms", type=float, default=0.0, help="age of the readings in a message (default: 0)")
     add("--loop", action="store_true", help="begin again after the last cycle")
-    add("--other", action="append", type=_other, default=[], metavar="MODEL:TAXELS", help="a sensor that is no 4x4 one")
-    add("--garbage-every", type=_count, default=0, metavar="N", help="after so many messages one that is none")
-    add("--kill-after-s", type=_seconds, metavar="T", help="break every connection after so long, again and again")
-    add("--down-s", type=_seconds, default=1.0, metavar="T", help="and be gone for so long (default: 1)")
-    add("--freeze-after-s", type=_seconds, metavar="T", help="hang after so long, with connections open")
-    add("--until-stdin-closes", action="store_true", help="end with the process that started it")
+    add(
+        "--other", action="append", type=_other, default=[], metavar="MODEL:TAXELS", help="add a sensor that is not 4x4"
+    )
+    add("--garbage-every", type=_count, default=0, metavar="N", help="send one invalid message after every N")
+    add("--kill-after-s", type=_seconds, metavar="T", help="break all connections every T s")
+    add("--down-s", type=_seconds, default=1.0, metavar="T", help="time until a broken server returns (default: 1)")
+    add("--freeze-after-s", type=_seconds, metavar="T", help="stop sending after T s, with connections open")
+    add("--until-stdin-closes", action="store_true", help="end when stdin is closed")
     options = parser.parse_args(arguments)
     try:
         recordings = [load_recording(path) for path in options.file] or ([sim_recording()] if options.sim else [])
@@ -79,19 +81,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _other(text: str) -> tuple[str, int]:
     model, _, taxels = text.rpartition(":")
     if not (model and taxels.isascii() and taxels.isdigit() and int(taxels) < 100):
-        raise argparse.ArgumentTypeError(f"{text!r} is no MODEL:TAXELS, such as uSPa46:24")
+        raise argparse.ArgumentTypeError(f"{text!r} is not MODEL:TAXELS, such as uSPa46:24")
     return model, int(taxels)
 
 
 def _port(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 5 and int(text) <= 65_535):
-        raise argparse.ArgumentTypeError(f"{text!r} is no port, expected 0..65535, 0 for one that is free")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port, expected 0..65535, 0 for any free one")
     return int(text)
 
 
 def _count(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 9):
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of messages, expected 0 or more")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of messages, expected 0 or more")
     return int(text)
 
 
@@ -101,7 +103,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         seconds = math.nan
     if not 0 <= seconds <= LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text!r} is no time, expected 0..{LONGEST_S:g} s")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time, expected 0..{LONGEST_S:g} s")
     return seconds
 
 

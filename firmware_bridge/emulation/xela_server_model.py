@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.emulation.xela_controller import playing_rate_hz
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
@@ -103,8 +104,8 @@ class VendorServer:
         """Return True once every cycle of every sensor could be sent."""
         if self._loop:
             return False
-        heard_s = elapsed_s - self._queue_s
-        return all(heard_s * one.rate_hz - self._spread >= len(one.counts) for one in self._players)
+        played_s = elapsed_s - self._queue_s
+        return all(played_s * one.rate_hz - self._spread >= len(one.counts) for one in self._players)
 
     def cycle(self, sensor: int, elapsed_s: float) -> int:
         """Return the newest whole cycle of a sensor, counted from 0; -1 before the first."""
@@ -119,7 +120,7 @@ class VendorServer:
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
         """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
-        told: dict[str, Any] = {
+        message: dict[str, Any] = {
             "message": sequence,
             "time": unix_s,
             "sensors": len(self._players) + len(self._others),
@@ -127,18 +128,18 @@ class VendorServer:
             "version": self._version + PRETENDED_VERSION,
         }
         for index in range(len(self._players)):
-            told[str(index + 1)] = self._sensor(index, elapsed_s, unix_s)
+            message[str(index + 1)] = self._sensor(index, elapsed_s, unix_s)
         for index, (model, taxels) in enumerate(self._others, len(self._players) + 1):
             data = ",".join(["8000"] * 3 * taxels)
-            told[str(index)] = {"sensor": str(index), "data": data, "model": model, "taxels": taxels, "ups": [58.0]}
-        told["sendtime" if self._version == "1.8.0" else "complete"] = unix_s
-        return json.dumps(told)
+            message[str(index)] = {"sensor": str(index), "data": data, "model": model, "taxels": taxels, "ups": [58.0]}
+        message["sendtime" if self._version == "1.8.0" else "complete"] = unix_s
+        return json.dumps(message)
 
     def _sensor(self, index: int, elapsed_s: float, unix_s: float) -> dict[str, Any]:
         player = self._players[index]
-        heard_s = max(0.0, elapsed_s - self._queue_s)
+        played_s = max(0.0, elapsed_s - self._queue_s)
         taxels = np.arange(USPA44.taxel_count)
-        begun = heard_s * player.rate_hz + _ROUNDED - self._spread * taxels / USPA44.taxel_count
+        begun = played_s * player.rate_hz + _ROUNDED - self._spread * taxels / USPA44.taxel_count
         cycles = np.maximum(0, np.floor(begun)).astype(int)
         rows = cycles % len(player.counts) if self._loop else np.minimum(cycles, len(player.counts) - 1)
         counts = player.counts[rows, :, taxels]
@@ -149,8 +150,8 @@ class VendorServer:
         by_hex = ",".join(f"{value:04X}" for value in values)
         rest = player.counts[0].T
         scale = NEWTONS_PER_COUNT.ravel()
-        told: dict[str, Any] = {
-            "time": unix_s - min(elapsed_s, self._queue_s) - (heard_s % (1 / player.rate_hz)),
+        message: dict[str, Any] = {
+            "time": unix_s - min(elapsed_s, self._queue_s) - (played_s % (1 / player.rate_hz)),
             "sensor": str(index + 1),
             "data": values if self._version == "1.7.7" else by_hex,
             "model": "uSPa44",
@@ -160,8 +161,8 @@ class VendorServer:
             "ups": np.round(ups_hz, 2).tolist(),
         }
         if self._version == "1.8.0":
-            told["integer"] = values
-        return told
+            message["integer"] = values
+        return message
 
 
 def sim_recording() -> Recording:
@@ -177,16 +178,10 @@ def sim_recording() -> Recording:
 def _player(recording: Recording, track: Track, rate_hz: float | None) -> _Player:
     if track.counts.shape[1:] != USPA44.scan_shape:
         raise RecordingError(f"{recording.path}: scans of shape {track.counts.shape[1:]}, expected {USPA44.scan_shape}")
-    known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
-    own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
-    if own_rate_hz is None:
-        raise RecordingError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
-    if not 0 < own_rate_hz < math.inf:
-        raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
     counts = track.counts.reshape(len(track.counts), 3, -1).copy()
     present = counts[:, 0] != ABSENT
     # The server repeats the last reading of an absent taxel; before its first reading it sends 0.
     counts[0][:, ~present[0]] = 0
     for scan in range(1, len(counts)):
         counts[scan][:, ~present[scan]] = counts[scan - 1][:, ~present[scan]]
-    return _Player(counts, present, own_rate_hz)
+    return _Player(counts, present, playing_rate_hz(recording, track, rate_hz))

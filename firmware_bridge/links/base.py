@@ -1,4 +1,4 @@
-"""Interface of every link; a new link is one file with this interface, and its form in `parse`."""
+"""Interface of every link; a new link is one file with this interface, and its form in the registry (`registry.py`)."""
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType

@@ -84,7 +84,7 @@ def serial_devices(
         latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
         if latency_ms >= SLOW_LATENCY_MS:
             problems.append(
-                f"latency timer at {latency_ms} ms: edge-sr asks for 1 ms when it opens it; others read in bunches"
+                f"latency timer at {latency_ms} ms: edge-sr sets 1 ms when it opens it; other programs read in bunches"
             )
         found.append(
             Found(

@@ -77,7 +77,7 @@ def find_gs_usb(serial_number: str | None, backend: IBackend | None = None) -> t
         return fitting[0]
     if serial_number is not None:
         unread = [described.usb_id for described, _ in found if described.serial_number is None]
-        hint = f"; where none is shown, it could not be read: {udev_rule(unread[0])}" if unread else ""
+        hint = f"; a serial number that is not shown could not be read: {udev_rule(unread[0])}" if unread else ""
         raise NoDeviceError(
             f"{len(fitting) or 'no'} gs_usb adapter with serial number {serial_number}, expected one. {seen}{hint}"
         )

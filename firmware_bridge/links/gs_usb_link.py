@@ -33,7 +33,10 @@ QUIET_MS: Final = 20
 MOST_OLD_TRANSFERS: Final = 1000
 """Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
 
-_BUSY = "in use: end what holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
+_BUSY = (
+    "in use: end the program that holds it, such as another edge-sr or candump; "
+    "sudo ip link set can0 down frees the kernel's"
+)
 
 
 class GsUsbLink(Link):

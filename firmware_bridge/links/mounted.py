@@ -35,7 +35,7 @@ class MountedLink(Link):
         self.origin = link.origin
         self.wrapped = link
         self._prefix = f"{name}/" if name else ""
-        self._told = f"{name}: " if name else ""
+        self._prefix_text = f"{name}: " if name else ""
         self._places = dict(places)
         self.mountings = {f"{self._prefix}{sensor}": one for sensor, one in link.mountings.items()}
 
@@ -70,7 +70,7 @@ class MountedLink(Link):
     def notices(self) -> list[Notice]:
         """Return the notices of the wrapped link, with the user's name for it."""
         return [
-            notice._replace(sensors=f"{self._prefix}{notice.sensors}", text=f"{self._told}{notice.text}")
+            notice._replace(sensors=f"{self._prefix}{notice.sensors}", text=f"{self._prefix_text}{notice.text}")
             for notice in self.wrapped.notices()
         ]
 

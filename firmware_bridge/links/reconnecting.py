@@ -50,7 +50,7 @@ class LastingLink(Link):
         self._lost_ns: int | None = None
         self._retry_ns = 0
         self._delay_s = FIRST_RETRY_S
-        self._heard_ns = 0
+        self._received_ns = 0
         self._silent_s = LINK_SILENT_S
         self._silent = False
         self._outages = 0
@@ -61,7 +61,7 @@ class LastingLink(Link):
         self._link.__enter__()
         self.kind = self._link.kind
         self._entered = self._open = True
-        self._heard_ns = self._clock_ns()
+        self._received_ns = self._clock_ns()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -95,7 +95,7 @@ class LastingLink(Link):
             now_ns = self._clock_ns()
             if self._lost_ns is not None or self._silent:
                 self._end_outage(now_ns)
-            self._heard_ns = now_ns
+            self._received_ns = now_ns
         else:
             self._suspect()
         return scans
@@ -122,7 +122,7 @@ class LastingLink(Link):
         return self._link.serial_line()
 
     def _end_outage(self, now_ns: int) -> None:
-        away_s = (now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)) / 1e9
+        away_s = (now_ns - (self._received_ns if self._lost_ns is None else self._lost_ns)) / 1e9
         self._tell("back", f"{self.name} is back after {away_s:.1f} s")
         self._lost_ns, self._silent = None, False
         self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
@@ -130,16 +130,16 @@ class LastingLink(Link):
     def _suspect(self) -> None:
         """Schedule another opening of a silent link, less often each time."""
         now_ns = self._clock_ns()
-        if self.ended or self._give_up_s == 0 or now_ns - self._heard_ns < self._silent_s * 1e9:
+        if self.ended or self._give_up_s == 0 or now_ns - self._received_ns < self._silent_s * 1e9:
             return
         if not self._silent and self._lost_ns is None:
             self._silent = True
             self._outages += 1
-            self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it anew")
-        away_ns = now_ns - (self._heard_ns if self._lost_ns is None else self._lost_ns)
+            self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it again")
+        away_ns = now_ns - (self._received_ns if self._lost_ns is None else self._lost_ns)
         if away_ns >= self._give_up_s * 1e9:
             raise LinkLostError(
-                f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: see to the sensor's power and its cable"
+                f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: check the sensor's power and its cable"
             )
         self._silent_s += min(self._silent_s, LATE_RETRY_S)
         self._open = False
@@ -153,7 +153,7 @@ class LastingLink(Link):
             self._reopenings += 1
             self._entered = self._open = True
             if self._link.kind != self.kind:  # every result would go on to state the first kind
-                raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start anew")
+                raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start again")
 
     def _close(self, why: str, now_ns: int | None = None) -> None:
         now_ns = self._clock_ns() if now_ns is None else now_ns
@@ -163,7 +163,7 @@ class LastingLink(Link):
             raise LinkLostError(why)
         if self._lost_ns is None:
             self._outages += not self._silent
-            self._lost_ns = now_ns if not self._silent else self._heard_ns
+            self._lost_ns = now_ns if not self._silent else self._received_ns
             self._tell("lost", f"{why}; trying again until it is back")
         elif now_ns - self._lost_ns >= self._give_up_s * 1e9:
             raise LinkLostError(f"{self.name} was away for {self._give_up_s:g} s: {why}")
@@ -184,7 +184,7 @@ class LastingLink(Link):
             self._sleep(min(wait_s, timeout_s))
         now_ns = self._clock_ns()
         if now_ns >= self._retry_ns:
-            self._heard_ns, self._silent_s = now_ns, LINK_SILENT_S  # its silence begins with the opening
+            self._received_ns, self._silent_s = now_ns, LINK_SILENT_S  # its silence begins with the opening
             self._away = False
             self._reopen(now_ns)
 

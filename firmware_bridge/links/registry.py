@@ -161,7 +161,7 @@ def _slcan(text: str, rest: str, model: ModelMap) -> Link:
     if port in ("", "serial="):
         raise _refusal(text)
     if at and not _BAUD.fullmatch(baud):
-        raise SourceError(f"baud is {baud[:20]!r}, expected 1 to 99999999 behind the @: --source slcan:{port}@115200")
+        raise SourceError(f"baud is {baud[:20]!r}, expected 1 to 99999999 after the @: --source slcan:{port}@115200")
     if port.startswith("serial="):
         port = find_by_serial(port.removeprefix("serial="), serial_ports()).path
     link = _slcan_link(port, int(baud) if at else None, model)

@@ -171,7 +171,7 @@ def _due_times_ns(recording: Recording, track: Track, rate_hz: float | None) -> 
         return track.time_ns - first_ns
     rate_hz = recording.rate_hz if rate_hz is None else rate_hz
     if rate_hz is None:
-        raise SourceError(f"{recording.path} does not tell how fast it was recorded: give --rate-hz")
+        raise SourceError(f"{recording.path} does not state its rate: pass --rate-hz")
     if (len(track.counts) - 1) / rate_hz > LAST_TIME_NS / NS_PER_S:
         raise SourceError(
             f"{recording.path} lasts {len(track.counts) / rate_hz:.3g} s at {rate_hz:g} Hz: give a higher rate"

@@ -46,7 +46,7 @@ LATE_STAMPS_FRAMES: Final = 1000
 
 # pyserial lets termios.error through, which is no OSError; Windows has no termios.
 _PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
-_BUSY = "in use: end what holds it, such as slcand, xela_server or another edge-sr"
+_BUSY = "in use: end the program that holds it, such as slcand, xela_server or another edge-sr"
 
 
 class SlcanSerialLink(Link):

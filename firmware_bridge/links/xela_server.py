@@ -84,7 +84,7 @@ class XelaServerLink(Link):
         self._open = ExitStack()
         self._connection: ClientConnection | None = None
         self._met = False
-        self._heard_ns = 0
+        self._received_ns = 0
         self._pong: tuple[Event, int] | None = None
         self._first: list[Scan] = []
 
@@ -97,7 +97,7 @@ class XelaServerLink(Link):
         self._scans.begin()
         self._pong = None
         self._connection = self._connect()
-        self._heard_ns = self._clock_ns()
+        self._received_ns = self._clock_ns()
         try:
             self._first = self._take(FIRST_MESSAGE_S)
         except BaseException:
@@ -139,9 +139,9 @@ class XelaServerLink(Link):
                 for _ in range(MOST_WAITING):
                     message = connection.recv(timeout_s, decode=False)
                     timeout_s = 0
-                    self._heard_ns, self._pong = self._clock_ns(), None
+                    self._received_ns, self._pong = self._clock_ns(), None
                     self._received_bytes += len(message)
-                    scans += self._scans.feed(message, self._heard_ns)
+                    scans += self._scans.feed(message, self._received_ns)
             except TimeoutError:
                 self._watch(connection)  # raises at times, if the connection has just closed
         except ConnectionClosed as error:
@@ -157,10 +157,10 @@ class XelaServerLink(Link):
         """Ping a server that sends no message: a connection can be dead without being closed."""
         now_ns = self._clock_ns()
         if self._pong is None:
-            if now_ns - self._heard_ns >= SERVER_QUIET_S * NS_PER_S:
+            if now_ns - self._received_ns >= SERVER_QUIET_S * NS_PER_S:
                 self._pong = connection.ping(), now_ns
         elif self._pong[0].is_set():
-            self._heard_ns, self._pong = now_ns, None
+            self._received_ns, self._pong = now_ns, None
         elif now_ns - self._pong[1] >= ANSWER_S * NS_PER_S:
             raise LinkLostError(
                 f"{self.url}: link lost: silent, and no answer within {ANSWER_S:g} s: the network or the server hangs"
@@ -226,13 +226,13 @@ def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> 
 
 def _no_handshake(error: Exception, opening_s: float) -> str:
     if isinstance(error, TimeoutError):
-        return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is no xela_server"
+        return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is not an xela_server"
     if isinstance(error, InvalidStatus):
         return f"answers with HTTP status {error.response.status_code}: not the xela_server, but another program"
     if isinstance(error, InvalidMessage):
         return "does not answer as a WebSocket does: another program, or one that expects TLS, is at this port"
     if isinstance(error, InvalidHandshake):
-        return f"is no xela_server: {error}"
+        return f"is not an xela_server: {error}"
     return f"the connection broke while it was opened: {error}"
 
 
@@ -243,5 +243,5 @@ def _ending(error: ConnectionClosed) -> str:
         return f"the server closed it (code {int(received.code)}{reason})"
     sent = error.sent
     if sent is not None:
-        return f"the server sent what no xela_server sends: {sent.reason or f'code {int(sent.code)}'}"
+        return f"the server sent a message that no xela_server sends: {sent.reason or f'code {int(sent.code)}'}"
     return "the server is gone"

@@ -104,7 +104,7 @@ class MessageType:
         try:
             values, _ = self._read(body, 0)
         except (struct.error, ValueError) as error:
-            raise CdrError(f"{len(data)} bytes are no whole {self.name}: {error}") from error
+            raise CdrError(f"{len(data)} bytes are not a whole {self.name}: {error}") from error
         return values
 
     def _write(self, out: bytearray, values: Mapping[str, Any]) -> None:
@@ -169,7 +169,7 @@ class MessageType:
 def _field(line: str, known: Mapping[str, MessageType]) -> Field:
     match = _FIELD.fullmatch(line)
     if match is None:
-        raise ValueError(f"{line!r} is no field of a message")
+        raise ValueError(f"{line!r} is not a field of a message")
     kind, array, length, name = match.groups()
     count = None if array is None else int(length or 0)
     if kind in known and not count:
@@ -179,7 +179,7 @@ def _field(line: str, known: Mapping[str, MessageType]) -> Field:
     if kind in _NUMBERS:
         number = struct.Struct("<" + _NUMBERS[kind])
         return Field(name, kind, number, np.dtype("<" + _NUMBERS[kind]), count, None)
-    raise ValueError(f"{line!r}: {kind} is no known kind")
+    raise ValueError(f"{line!r}: {kind} is not a supported kind")
 
 
 TIME: Final = MessageType("builtin_interfaces/msg/Time", "int32 sec\nuint32 nanosec")

@@ -155,20 +155,20 @@ class _Reading:
             return
         sensor = metadata.metadata.get("sensor", "")
         try:
-            said = json.loads(metadata.metadata["mounting"])
-            order, signs, gains = (tuple(said[key]) for key in ("order", "signs", "gains"))
-            if not all(type(value) is int for value in (*order, *signs)) or type(said["swap_xy"]) is not bool:
+            fields = json.loads(metadata.metadata["mounting"])
+            order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
+            if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
                 raise ValueError("not whole numbers")
-            mounting = Mounting(order, said["swap_xy"], signs, tuple(map(float, gains)), self._geometry.taxel_count)
+            mounting = Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), self._geometry.taxel_count)
         except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
             raise RecordingError(f"{self._path}: no mounting of sensor {sensor[:20]!r}: {_short(error)}") from error
         if not is_sensor_name(sensor) or len(self._mountings) >= MOST_SENSORS:
             raise RecordingError(f"{self._path}: a mounting of sensor {sensor[:20]!r}, expected those of its sensors")
         self._mountings[sensor] = mounting
 
-    def _take_geometry(self, said: Mapping[str, str]) -> None:
+    def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
-            geometry = SensorGeometry(**{key: json.loads(text) for key, text in said.items()})
+            geometry = SensorGeometry(**{key: json.loads(text) for key, text in fields.items()})
             sizes = (geometry.rows, geometry.cols)
             if not all(type(size) is int and size > 0 for size in sizes) or not is_sensor_name(geometry.name):
                 raise ValueError("no grid of taxels")
@@ -244,7 +244,7 @@ class _Reading:
 
     def damaged(self, why: str, left_bytes: int) -> None:
         """Keep the records before the damage and note it."""
-        self._notes.insert(0, f"{self._path} is damaged ({why}): {left_bytes:,} bytes behind that are not read")
+        self._notes.insert(0, f"{self._path} is damaged ({why}): {left_bytes:,} bytes after that are not read")
 
     def recording(self) -> Recording:
         if not self._lanes:
@@ -324,7 +324,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     else:
         raise ValueError(f"compressed by {chunk.compression[:20]!r}, expected zstd, lz4 or nothing")
     if len(data) != size_bytes:
-        raise ValueError(f"it does not hold the {size_bytes:,} bytes that it tells of")
+        raise ValueError(f"it does not hold the {size_bytes:,} bytes that it states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("its check sum is wrong")
     return data

@@ -79,9 +79,9 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
         shape, _, dtype = _HEADERS[version](entry)
         if dtype.hasobject or dtype.kind not in "biufU":
             raise NpzError(f"{info.filename} holds {dtype}, expected plain arrays of numbers or text")
-        told_bytes, held_bytes = prod(shape) * dtype.itemsize, info.file_size - entry.tell()
-        if told_bytes != held_bytes:
-            raise NpzError(f"{info.filename} tells of {told_bytes} bytes and holds {held_bytes}: it is damaged")
+        stated_bytes, held_bytes = prod(shape) * dtype.itemsize, info.file_size - entry.tell()
+        if stated_bytes != held_bytes:
+            raise NpzError(f"{info.filename} states {stated_bytes} bytes and holds {held_bytes}: it is damaged")
     with archive.open(info) as entry:
         array = npy.read_array(entry, allow_pickle=False)
         if entry.read(1):  # reading to the end also verifies the checksum
@@ -90,5 +90,5 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
         points = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(dtype.byteorder))
         low, high = _SURROGATES
         if points.max() > HIGHEST_CODE_POINT or ((points >= low) & (points <= high)).any():
-            raise NpzError(f"{info.filename} holds text that is no Unicode")
+            raise NpzError(f"{info.filename} holds text that is not Unicode")
     return array

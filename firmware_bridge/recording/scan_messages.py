@@ -99,29 +99,29 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
     Raises:
         CdrError: it is no scan message, or a value is impossible.
     """
-    said = scan_type(geometry.taxel_count).decode(data)
-    sensor, number, fresh, renewed = said["sensor"], said["number"], said["fresh"], said["renewed"]
+    fields = scan_type(geometry.taxel_count).decode(data)
+    sensor, number, fresh, renewed = fields["sensor"], fields["number"], fields["fresh"], fields["renewed"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
     _check(0 <= number <= LAST_TIME_NS, "number", number, f"0..{LAST_TIME_NS}")
     for name, least in (("time_ns", 0), ("device_time_ns", -1)):
-        _check(least <= said[name] <= LAST_TIME_NS, name, said[name], f"{least}..{LAST_TIME_NS}")
+        _check(least <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{least}..{LAST_TIME_NS}")
     right = fresh < 1 << geometry.taxel_count and renewed & ~fresh == 0
     _check(right, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
-    counts = said["counts"].reshape(geometry.scan_shape)
+    counts = fields["counts"].reshape(geometry.scan_shape)
     low, high = int(counts.min()), int(counts.max())
     _check(low >= ABSENT and high <= HIGHEST_COUNT, "counts", (low, high), f"{ABSENT}..{HIGHEST_COUNT}")
     absent = counts == ABSENT
-    told = mask(fresh, geometry)
-    _check(bool((absent == ~told).all()), "counts", "readings", "one on each axis of a fresh taxel, none of others")
-    _check_vendor(said)
+    arrived = mask(fresh, geometry)
+    _check(bool((absent == ~arrived).all()), "counts", "readings", "one on each axis of a fresh taxel, none of others")
+    _check_vendor(fields)
     vendor = {
-        "newtons": _vendor(said, "vendor_newtons", geometry.scan_shape),
-        "temperature_k": _vendor(said, "vendor_temperature_k", told.shape),
-        "ups_hz": _vendor(said, "vendor_ups_hz", told.shape),
+        "newtons": _vendor(fields, "vendor_newtons", geometry.scan_shape),
+        "temperature_k": _vendor(fields, "vendor_temperature_k", arrived.shape),
+        "ups_hz": _vendor(fields, "vendor_ups_hz", arrived.shape),
     }
     known = any(array is not None for array in vendor.values())
     return RecordedScan(
-        *(sensor, number, said["time_ns"], said["device_time_ns"], fresh, renewed),
+        *(sensor, number, fields["time_ns"], fields["device_time_ns"], fresh, renewed),
         counts,
         VendorReading(**vendor) if known else None,
     )
@@ -150,22 +150,22 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
     Raises:
         CdrError: it is no baseline message, or a value is impossible.
     """
-    said = baseline_type(geometry.taxel_count).decode(data)
-    sensor, created_unix_s, scans = said["sensor"], said["created_unix_s"], said["scans"]
+    fields = baseline_type(geometry.taxel_count).decode(data)
+    sensor, created_unix_s, scans = fields["sensor"], fields["created_unix_s"], fields["scans"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
-    _check(is_sensor_name(said["id"]), "id", said["id"], "a short text")
+    _check(is_sensor_name(fields["id"]), "id", fields["id"], "a short text")
     if np.isnan(created_unix_s):
-        age_s, at = said["age_s"], said["header"]["stamp"]
+        age_s, at = fields["age_s"], fields["header"]["stamp"]
         _check(np.isnan(age_s) or 0 <= age_s <= LAST_UNIX_S, "age_s", age_s, f"0..{LAST_UNIX_S:g} seconds, or none")
         created_unix_s = at["sec"] + at["nanosec"] / NS_PER_S - age_s
     else:
         _check(0 < created_unix_s <= LAST_UNIX_S, "created_unix_s", created_unix_s, "seconds since 1970, or none")
     _check(scans >= 1, "scans", scans, "a whole number from 1")
-    counts = np.array(said["counts"].reshape(geometry.scan_shape))
+    counts = np.array(fields["counts"].reshape(geometry.scan_shape))
     inside = np.isnan(counts) | ((counts >= 0) & (counts <= HIGHEST_COUNT + 1))
     _check(bool(inside.all()), "counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
     counts.setflags(write=False)
-    return Baseline(sensor, counts, created_unix_s, scans, "file", said["id"])
+    return Baseline(sensor, counts, created_unix_s, scans, "file", fields["id"])
 
 
 def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:
@@ -174,9 +174,9 @@ def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:
     return taxels[: geometry.taxel_count].astype(bool).reshape(geometry.rows, geometry.cols)
 
 
-def _check_vendor(said: dict[str, Any]) -> None:
+def _check_vendor(fields: dict[str, Any]) -> None:
     """Check the vendor's values against the ranges for the server itself; NaN is a taxel without a thermometer."""
-    newtons, kelvin, ups_hz = (said[name] for name in ("vendor_newtons", "vendor_temperature_k", "vendor_ups_hz"))
+    newtons, kelvin, ups_hz = (fields[name] for name in ("vendor_newtons", "vendor_temperature_k", "vendor_ups_hz"))
     right = bool((np.abs(newtons) <= HIGHEST_NEWTONS).all())
     _check(right, "vendor_newtons", "others", f"-{HIGHEST_NEWTONS:g}..{HIGHEST_NEWTONS:g}")
     low, high = KELVIN
@@ -186,8 +186,8 @@ def _check_vendor(said: dict[str, Any]) -> None:
     _check(right, "vendor_ups_hz", "others", f"0..{HIGHEST_UPS_HZ:g}")
 
 
-def _vendor(said: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-    array = said[name]
+def _vendor(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+    array = fields[name]
     if not array.size:
         return None
     _check(array.size == int(np.prod(shape)), name, f"{array.size} numbers", f"none, or {int(np.prod(shape))}")

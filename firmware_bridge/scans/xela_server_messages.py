@@ -105,24 +105,24 @@ class ServerDecoder:
             text: the message, as text or in UTF-8.
         """
         self._counted["messages"] += 1
-        told = self._told(text)
-        if told is None:
+        content = self._content(text)
+        if content is None:
             return ServerMessage("bad")
-        version = told.get("version")
+        version = content.get("version")
         version = version[:40] if isinstance(version, str) else ""
-        if told.get("message") == WELCOME:
+        if content.get("message") == WELCOME:
             self._counted["welcomes"] += 1
             return ServerMessage("welcome", version=version)
-        sequence = told.get("message")
+        sequence = content.get("message")
         if type(sequence) is not int or not 0 <= sequence < 1 << 63:
             return self._bad("bad_sequence")
-        named = [name for name, value in told.items() if _is_name(name) and isinstance(value, dict)]
+        named = [name for name, value in content.items() if _is_name(name) and isinstance(value, dict)]
         if not named:
             self._counted["without_readings"] += 1
         self._counted["bad_sensor"] += max(0, len(named) - MOST_SENSORS)
-        readings = [self._reading(name, told[name]) for name in named[:MOST_SENSORS]]
+        readings = [self._reading(name, content[name]) for name in named[:MOST_SENSORS]]
         found = tuple(reading for reading in readings if reading is not None)
-        return ServerMessage("readings", sequence, self._time_s(told.get("time")), version, found)
+        return ServerMessage("readings", sequence, self._time_s(content.get("time")), version, found)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of messages and of their errors.
@@ -134,36 +134,36 @@ class ServerDecoder:
         """
         return dict(self._counted)
 
-    def _told(self, text: str | bytes) -> dict[str, Any] | None:
+    def _content(self, text: str | bytes) -> dict[str, Any] | None:
         if len(text) > LONGEST_MESSAGE_BYTES:
             self._counted["too_long"] += 1
             return None
         try:
-            told = json.loads(text, object_pairs_hook=_without_duplicates)
+            content = json.loads(text, object_pairs_hook=_without_duplicates)
         except _DuplicateError:
             self._counted["duplicate_keys"] += 1
             return None
         except (ValueError, RecursionError):  # no JSON, no UTF-8, a number too long for int(), or brackets in brackets
             self._counted["bad_json"] += 1
             return None
-        if not isinstance(told, dict):
+        if not isinstance(content, dict):
             self._counted["bad_json"] += 1
             return None
-        return told
+        return content
 
     def _bad(self, kind: str) -> ServerMessage:
         self._counted[kind] += 1
         return ServerMessage("bad")
 
-    def _reading(self, name: str, told: dict[str, Any]) -> ServerReading | None:
-        taxels = told.get("taxels")
+    def _reading(self, name: str, content: dict[str, Any]) -> ServerReading | None:
+        taxels = content.get("taxels")
         if type(taxels) is int and 0 < taxels != self._geometry.taxel_count:
-            model = told.get("model")
+            model = content.get("model")
             self.foreign[name] = f"{_printable(model)} with {min(taxels, 9999)} taxels"
             self._counted["foreign_sensor"] += 1
             return None
         known = type(taxels) is int and taxels == self._geometry.taxel_count
-        counts = self._counts(told.get("data"), told.get("integer")) if known else None
+        counts = self._counts(content.get("data"), content.get("integer")) if known else None
         if counts is None:
             self._counted["bad_sensor"] += 1
             return None
@@ -171,10 +171,10 @@ class ServerDecoder:
         return ServerReading(
             name,
             np.ascontiguousarray(np.array(counts, dtype=np.int32).reshape(-1, 3).T),
-            self._ups_hz(told.get("ups")),
-            self._newtons(told.get("calibrated")),
-            self._temperature_k(told.get("temp")),
-            self._time_s(told.get("time")),
+            self._ups_hz(content.get("ups")),
+            self._newtons(content.get("calibrated")),
+            self._temperature_k(content.get("temp")),
+            self._time_s(content.get("time")),
         )
 
     def _counts(self, data: object, integer: object) -> list[int] | None:
@@ -187,25 +187,25 @@ class ServerDecoder:
         self._counted["disagreeing"] += of_data != of_integer
         return of_integer if of_data is None else of_data
 
-    def _ups_hz(self, told: object) -> tuple[float, ...] | None:
-        ups_hz = _numbers(told, self._geometry.taxel_count)
+    def _ups_hz(self, content: object) -> tuple[float, ...] | None:
+        ups_hz = _numbers(content, self._geometry.taxel_count)
         if ups_hz is None or not 0 <= min(ups_hz) <= max(ups_hz) <= HIGHEST_UPS_HZ:
-            self._counted["bad_ups"] += told is not None
+            self._counted["bad_ups"] += content is not None
             return None
         return tuple(ups_hz)
 
-    def _newtons(self, told: object) -> NDArray[np.float32] | None:
-        newtons = _numbers(told, 3 * self._geometry.taxel_count)
+    def _newtons(self, content: object) -> NDArray[np.float32] | None:
+        newtons = _numbers(content, 3 * self._geometry.taxel_count)
         if newtons is None or max(max(newtons), -min(newtons)) > HIGHEST_NEWTONS:
-            self._counted["bad_calibrated"] += told is not None
+            self._counted["bad_calibrated"] += content is not None
             return None
         by_axis = np.array(newtons, dtype=np.float32).reshape(-1, 3).T
         return np.ascontiguousarray(by_axis).reshape(self._geometry.scan_shape)
 
-    def _temperature_k(self, told: object) -> NDArray[np.float32] | None:
-        kelvin = _numbers(told, self._geometry.taxel_count)
+    def _temperature_k(self, content: object) -> NDArray[np.float32] | None:
+        kelvin = _numbers(content, self._geometry.taxel_count)
         if kelvin is None:
-            self._counted["bad_temperature"] += told is not None
+            self._counted["bad_temperature"] += content is not None
             return None
         measured = [one for one in kelvin if one]
         if not measured:  # zeros: the sensor has no thermometer
@@ -216,11 +216,11 @@ class ServerDecoder:
         known = np.array([one or math.nan for one in kelvin], dtype=np.float32)
         return known.reshape(self._geometry.rows, self._geometry.cols)
 
-    def _time_s(self, told: object) -> float | None:
-        if isinstance(told, bool) or not isinstance(told, (int, float)) or not 0 < told < LATEST_S:
-            self._counted["bad_time"] += told is not None
+    def _time_s(self, content: object) -> float | None:
+        if isinstance(content, bool) or not isinstance(content, (int, float)) or not 0 < content < LATEST_S:
+            self._counted["bad_time"] += content is not None
             return None
-        return float(told)
+        return float(content)
 
 
 class _DuplicateError(ValueError):
@@ -228,10 +228,10 @@ class _DuplicateError(ValueError):
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    told = dict(pairs)
-    if len(told) != len(pairs):
+    content = dict(pairs)
+    if len(content) != len(pairs):
         raise _DuplicateError
-    return told
+    return content
 
 
 def _is_name(key: str) -> bool:
@@ -250,19 +250,19 @@ def _from_hex(text: str, size: int) -> list[int] | None:
     return [int(word, 16) for word in words] if len(words) == size else None
 
 
-def _whole_numbers(told: object, size: int) -> list[int] | None:
-    if not isinstance(told, list) or len(told) != size:
+def _whole_numbers(content: object, size: int) -> list[int] | None:
+    if not isinstance(content, list) or len(content) != size:
         return None
-    if set(map(type, told)) != {int} or not 0 <= min(told) <= max(told) <= HIGHEST_COUNT:
+    if set(map(type, content)) != {int} or not 0 <= min(content) <= max(content) <= HIGHEST_COUNT:
         return None
-    return told
+    return content
 
 
-def _numbers(told: object, size: int) -> Sequence[float] | None:
+def _numbers(content: object, size: int) -> Sequence[float] | None:
     """Return a list of `size` finite numbers, None if it is not one; True is no number here, unlike in Python."""
-    if not isinstance(told, list) or len(told) != size or not set(map(type, told)) <= {int, float}:
+    if not isinstance(content, list) or len(content) != size or not set(map(type, content)) <= {int, float}:
         return None
     try:
-        return told if all(map(math.isfinite, told)) else None
+        return content if all(map(math.isfinite, content)) else None
     except OverflowError:  # a whole number that no float can hold
         return None

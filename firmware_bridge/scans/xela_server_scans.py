@@ -81,13 +81,13 @@ class ServerScans:
     def trouble(self) -> str | None:
         """Trouble of the server and its sensors to report to the user, None if there is none."""
         wanted = f"expected {self._geometry.taxel_count}"
-        told = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
+        notes = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
         silent = [name for name, sensor in self._sensors.items() if sensor.silent]
-        told += [f"nothing comes of sensor {name}: see to its cable and its power" for name in silent]
+        notes += [f"nothing arrives from sensor {name}: check its cable and its power" for name in silent]
         if self._lags:
             late = f"what is read is older by {STALE_NS // 1_000_000} ms than usual"
-            told.append(f"{late}: the server lags, the network does, or this program is too slow")
-        return "; ".join(told) or None
+            notes.append(f"{late}: the server lags, the network does, or this program is too slow")
+        return "; ".join(notes) or None
 
     @property
     def any_sensor(self) -> bool:
@@ -118,17 +118,17 @@ class ServerScans:
             return []
         sent_ns = None if message.sent_s is None else self._clock.host_ns(round(message.sent_s * 1e6), arrival_ns)
         scans: list[Scan] = []
-        heard = {reading.sensor: reading for reading in message.readings}
-        new = [name for name in heard if name not in self._sensors][: MOST_SENSORS - len(self._sensors)]
+        readings = {reading.sensor: reading for reading in message.readings}
+        new = [name for name in readings if name not in self._sensors][: MOST_SENSORS - len(self._sensors)]
         for name in [*self._sensors, *new]:
             sensor = self._sensors.get(name)
             if sensor is None:
                 sensor = self._sensors[name] = _ServerSensor(name, self._geometry)
             scan = age_ns = None
-            if name in heard:
-                age_ns = _age_ns(heard[name], message)
+            if name in readings:
+                age_ns = _age_ns(readings[name], message)
                 device_ns = None if sent_ns is None or age_ns is None else sent_ns - age_ns
-                scan = sensor.feed(heard[name], arrival_ns, device_ns, old=(age_ns or 0) > SERVER_READING_OLD_NS)
+                scan = sensor.feed(readings[name], arrival_ns, device_ns, old=(age_ns or 0) > SERVER_READING_OLD_NS)
             if scan is not None:
                 self._follow_age(scan, age_ns or 0)
                 scans.append(scan)
@@ -194,10 +194,10 @@ class _ServerSensor:
         self._geometry = geometry
         self._series = ScanSeries(name, geometry)
         self._usual_hz = np.full(geometry.taxel_count, USUAL_UPS_HZ)
-        self._heard_ns: int | None = None
+        self._received_ns: int | None = None
         self._acquired_s: float | None = None
         self._acquired_ns = 0
-        self._said_dead = False
+        self._stated_dead = False
         self._belied_ns: int | None = None
         self.silent = False
         self.begin()
@@ -210,8 +210,8 @@ class _ServerSensor:
 
     def look(self, now_ns: int) -> None:
         """Update `silent`: True if no taxel was renewed for too long."""
-        self._heard_ns = now_ns if self._heard_ns is None else self._heard_ns
-        self.silent = now_ns - self._heard_ns > SERVER_READING_OLD_NS
+        self._received_ns = now_ns if self._received_ns is None else self._received_ns
+        self.silent = now_ns - self._received_ns > SERVER_READING_OLD_NS
 
     def feed(self, reading: ServerReading, arrival_ns: int, device_ns: int | None, *, old: bool = False) -> Scan | None:
         """Return the scan that a reading closes, None if it closes no scan; `old` marks one that was old when sent."""
@@ -229,7 +229,7 @@ class _ServerSensor:
         self._come |= come
         if not self._come.any():
             return None
-        self._heard_ns = arrival_ns
+        self._received_ns = arrival_ns
         waited_for = alive
         if alive.any():
             median_hz = sorted(ups_hz[alive].tolist())[int(np.count_nonzero(alive)) // 2]
@@ -243,15 +243,15 @@ class _ServerSensor:
 
         A server without the rates reports 0 as well.
         """
-        told = reading.ups_hz is not None and any(reading.ups_hz)
-        said_dead = old or (reading.ups_hz is not None and not told)
+        measured = reading.ups_hz is not None and any(reading.ups_hz)
+        stated_dead = old or (reading.ups_hz is not None and not measured)
         # Compared between two such messages in a row: the first one may bring a last reading.
-        if said_dead and self._said_dead and self._counts is not None and (reading.counts != self._counts).any():
+        if stated_dead and self._stated_dead and self._counts is not None and (reading.counts != self._counts).any():
             self._belied_ns = arrival_ns
-        self._said_dead = said_dead
-        if said_dead and (self._belied_ns is None or arrival_ns - self._belied_ns > SERVER_READING_OLD_NS):
+        self._stated_dead = stated_dead
+        if stated_dead and (self._belied_ns is None or arrival_ns - self._belied_ns > SERVER_READING_OLD_NS):
             return np.zeros_like(self._usual_hz)
-        return np.array(reading.ups_hz) if told else self._usual_hz
+        return np.array(reading.ups_hz) if measured else self._usual_hz
 
     def _stands_still(self, reading: ServerReading, arrival_ns: int) -> bool:
         """Return True if the server has repeated a reading for too long, whatever its age by the server's clock."""

@@ -9,7 +9,7 @@ from firmware_bridge.errors import SensorFileError
 
 LARGEST: Final = 1e12
 """Largest magnitude of a number in the file; a whole number can have more digits than any float."""
-REMEDY: Final = "mend it, or write it anew with edge-sr doctor --out"
+REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
 
 
 class Table:

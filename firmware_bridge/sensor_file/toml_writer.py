@@ -35,7 +35,7 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
     """
     path = Path(path)
     if not sensor_file.sensors:
-        raise SensorFileError(f"{path}: not written, for nothing was found that it could hold: see what is wrong first")
+        raise SensorFileError(f"{path}: not written, because nothing was measured: correct the findings first")
     for name, entry in sensor_file.sensors.items():
         if entry.baseline is not None and np.isnan(entry.baseline.counts).any():
             raise SensorFileError(
@@ -43,8 +43,8 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
             )
     if sensor_file.own_map is not None:
         raise SensorFileError(
-            f"{path}: not written, for no file can name the id map {sensor_file.model!r} of a program's own: expected "
-            f"one of {', '.join(ID_MAPS)}"
+            f"{path}: not written, because no file can name the id map {sensor_file.model!r} of a program's own: "
+            f"expected one of {', '.join(ID_MAPS)}"
         )
     text = _text(sensor_file)
     try:
@@ -56,7 +56,7 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
 def _text(sensor_file: SensorFile) -> str:
     adapter = [] if sensor_file.adapter is None else [f"adapter = {_quoted(sensor_file.adapter)}  # serial number"]
     lines = [
-        "# A sensor as edge-sr doctor found it; edge-sr --sensor FILE goes by it.",
+        "# Sensor file of edge-sr doctor; use it with edge-sr --sensor FILE.",
         f'format = "{FILE_FORMAT}"',
         f"version = {FILE_VERSION}",
         f"model = {_quoted(sensor_file.model)}  # which CAN id is which taxel, as --id-map",
@@ -77,8 +77,8 @@ def _text(sensor_file: SensorFile) -> str:
 
 def _mark_lines(entry: SensorEntry) -> list[str]:
     marks = (
-        ("assumed", entry.assumed, "as wired; nobody has looked"),
-        ("emulated", entry.emulated, "found of an emulated sensor: not for a device"),
+        ("assumed", entry.assumed, "as wired; not measured"),
+        ("emulated", entry.emulated, "measured on an emulated sensor: not for a device"),
     )
     return [
         f"{key} = {json.dumps([part for part in PARTS if part in parts])}  # {why}"

@@ -235,18 +235,18 @@ class DriftTracker:
         step = np.where(self._live, level - self.counts, np.float32(0))
         known = self._step
         common, own = self._parts(step)
-        told = np.abs(step).max() > STEP_COUNTS
+        stepped = np.abs(step).max() > STEP_COUNTS
         if self._cause == _ZEROED and np.abs(common).max() <= COMMON_COUNTS and _alike(common, own):
             # Not touched since zeroing: the change of a pad that has warmed up or is held in another attitude.
-            step, told = np.zeros_like(step), False
-        elif not told:
+            step, stepped = np.zeros_like(step), False
+        elif not stepped:
             step = own
         self._step = step if np.abs(step).max() > BACK_COUNTS else None
         # Taxels that may be touched do not contribute to the common drift of the others.
         untouched: NDArray[np.bool_] = np.logical_and.reduce(np.abs(own) <= VOTE_COUNTS) & self._live
         self._voters = untouched if self._step is not None and untouched.sum() >= FEWEST_VOTERS else None
         before, self.note = self.note, self._step_note()
-        if not told:
+        if not stepped:
             self._event = None if before is None else _BACK
         elif before is None or known is None or np.abs(step - known).max() > STEP_COUNTS:
             self._event = self.note

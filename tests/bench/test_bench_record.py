@@ -78,8 +78,8 @@ def test_a_flat_line_for_every_error_and_run_time():
     ("content", "complaint"),
     [
         ("{", "cannot be read"),
-        ("[]", "is no bench"),
-        ('{"format": "other"}', "is no bench"),
+        ("[]", "is not a bench"),
+        ('{"format": "other"}', "is not a bench"),
         ('{"format": "tactile bench", "version": 9}', "is of version 9, expected 1: run that bench again"),
     ],
 )
@@ -135,5 +135,5 @@ def test_percentiles_of_few_runs_are_not_claimed():
     columns = ["", *run_time_columns(100.0)]
     assert cells[columns.index("back to back p99.9 us")] == "-"
     assert cells[columns.index("100 Hz p99.9 us")] == "12"
-    assert "p99.9 and misses say little" in about(make_record(ticks=2999))
-    assert "say little" not in about(make_record())
+    assert "p99.9 and misses mean little" in about(make_record(ticks=2999))
+    assert "mean little" not in about(make_record())

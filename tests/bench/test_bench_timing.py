@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from edge.bench.pareto import front
 from edge.bench.peer_ratios import alternated
 from edge.bench.ratios import Ratio, ratio_of
+from edge.bench.record import front
 from edge.bench.timing import BLOCKS, back_to_back, paced, summary
 
 

@@ -98,6 +98,17 @@ def test_a_slow_reader_loses_frames_and_stops_nobody():
         assert told["frames"] + emulator.lost_frames == 400 * 16
 
 
+def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
+    with (
+        Emulator([make_recording(200, rate_hz=2000.0)], frame_s=0, jitter_s=0, waits=True) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        time.sleep(0.15)  # the terminal is full after 30 ms
+        scans = read_until_lost(link)
+    assert (stacked(scans) == make_counts(200)).all()
+    assert (emulator.sent_frames, emulator.lost_frames) == (200 * 16, 0)
+
+
 def test_it_hangs_up_when_all_is_played_and_fetched():
     recording = make_recording(20)
     with Emulator([recording]) as emulator, SlcanSerialLink(emulator.port) as link:
@@ -192,7 +203,7 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys):
     for arguments, words in (
         ([str(tmp_path / "gone.csv")], "cannot be read"),
         ([str(path)], "--rate-hz"),
-        ([str(path), "--controller", "x"], "'x' are no controller ids, such as 4,6"),
+        ([str(path), "--controller", "x"], "'x' are not controller ids, such as 4,6"),
         ([str(path), "--rate-hz", "9", "--link", "/nonexist/x"], "link is /nonexist/x, expected a path in a folder"),
         ([str(path), "--rate-hz", "9", "--link", str(path)], "a.csv, expected a path that is free or a link"),
         ([str(path), "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),

@@ -132,7 +132,7 @@ def test_taxels_that_fall_silent_are_absent():
         wait_for(lambda: not link.read(0.05) and not link.read(0.05))
         assert link.counters()["messages"] > 0 and link.trouble is None
         wait_for(lambda: not link.read(0.05) and link.trouble)
-        assert link.trouble == "nothing comes of sensor 1: see to its cable and its power"
+        assert link.trouble == "nothing arrives from sensor 1: check its cable and its power"
         vendor.silent = frozenset()
         wait_for(lambda: any(scan.whole for scan in link.read(0.05)))
 
@@ -162,16 +162,16 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     ("arguments", "words"),
     [
         ([], "nothing to serve: name a recording, or --sim"),
-        (["--sim", "--other", "uSPa46"], "'uSPa46' is no MODEL:TAXELS, such as uSPa46:24"),
+        (["--sim", "--other", "uSPa46"], "'uSPa46' is not MODEL:TAXELS, such as uSPa46:24"),
         (["--sim", "--spread", "2"], "spread is 2.0"),
         (["--sim", "--message-hz", "0"], "messages a second are 0.0"),
         (["--sim", "--host", "0.0.0.0"], "unrecognized arguments: --host"),
-        (["--sim", "--port", "99999"], "'99999' is no port, expected 0..65535"),
-        (["--sim", "--port", "-1"], "'-1' is no port"),
-        (["--sim", "--down-s", "-1"], "'-1' is no time, expected 0..1e+06 s"),
-        (["--sim", "--kill-after-s", "nan"], "'nan' is no time"),
-        (["--sim", "--freeze-after-s", "soon"], "'soon' is no time"),
-        (["--sim", "--garbage-every", "-2"], "'-2' is no number of messages"),
+        (["--sim", "--port", "99999"], "'99999' is not a port, expected 0..65535"),
+        (["--sim", "--port", "-1"], "'-1' is not a port"),
+        (["--sim", "--down-s", "-1"], "'-1' is not a time, expected 0..1e+06 s"),
+        (["--sim", "--kill-after-s", "nan"], "'nan' is not a time"),
+        (["--sim", "--freeze-after-s", "soon"], "'soon' is not a time"),
+        (["--sim", "--garbage-every", "-2"], "'-2' is not a number of messages"),
         (["gone.csv"], "gone.csv: cannot be read"),
     ],
 )

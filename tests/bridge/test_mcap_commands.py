@@ -185,8 +185,8 @@ class TestRecord:
         (tmp_path / "taken").mkdir()
         for name, code, words in (
             ("taken", 5, "cannot record into taken: it is a directory"),
-            ("x.csv", 2, "no .csv is recorded: expected x.mcap or x.npz"),
-            ("x.JSONL", 2, "no .JSONL is recorded"),
+            ("x.csv", 2, ".csv cannot be recorded: expected x.mcap or x.npz"),
+            ("x.JSONL", 2, ".JSONL cannot be recorded"),
         ):
             assert cli.main(["record", name, "--source", "slcan:/dev/none"]) == code
             error = capsys.readouterr().err

@@ -62,9 +62,10 @@ class TestContract:
         assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
 
     def test_what_is_written_is_read(self):
-        for contract in (make_pad_contract(), make_contract(), make_contract(version=4)):
+        for contract in (make_pad_contract(), make_contract(), make_contract(version=5), make_contract(version=4)):
             assert Contract.from_metadata(contract.to_metadata()) == contract
-        assert len(make_contract().to_metadata()) == len(make_contract(version=4).to_metadata()) + 3
+        assert len(make_contract().to_metadata()) == len(make_contract(version=5).to_metadata()) + 1
+        assert len(make_contract(version=5).to_metadata()) == len(make_contract(version=4).to_metadata()) + 3
 
     def test_of_version_4_later_keys_are_not_looked_at(self):
         metadata = make_contract(version=4).to_metadata() | {"tactile.traction_scale": "2", "tactile.pad_inputs": "{"}
@@ -165,7 +166,10 @@ class TestSession:
                 {"with_traction": False},
                 r"output is pattern [^,]*, 40, 40\], but .* traction tensor\(float\) \[1, 3, 8, 8\]",
             ),
-            ({"contract": make_contract(), "pad_width": 5}, r"pad tensor\(float\) \[1, 5\], but .* says window [^p]*$"),
+            (
+                {"contract": make_contract(), "pad_width": 5},
+                r"pad tensor\(float\) \[1, 5\], but .* states window [^p]*$",
+            ),
             ({"contract": make_contract(), "with_traction": True}, r"traction tensor\(float\) \[1, 3, 4, 4\], but"),
             (
                 {"metadata": make_pad_contract(traction_scale=3).to_metadata()},
@@ -173,7 +177,7 @@ class TestSession:
             ),
             (
                 {"metadata": make_contract(version=4).to_metadata()},
-                r"pad tensor\(float\) \[1, 5\], but its contract says window tensor\(float\) \[1, 12, 4, 4\]$",
+                r"pad tensor\(float\) \[1, 5\], but its contract states window tensor\(float\) \[1, 12, 4, 4\]$",
             ),
         ],
     )

@@ -56,7 +56,7 @@ HTTP = b"HTTP/1.1 %s\r\nContent-Length: 0\r\n%s\r\n"
         (b"SSH-2.0-OpenSSH_9.6\r\n", "another program"),
         (b"\x15\x03\x01\x00\x02\x02\x46", "expects TLS"),
         (b"", "another program"),
-        (HTTP % (b"101 Switching Protocols", b""), "is no xela_server"),
+        (HTTP % (b"101 Switching Protocols", b""), "is not an xela_server"),
     ],
 )
 def test_others_that_listen_there(answer, words):

@@ -146,7 +146,7 @@ def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
     for step in range(20):
         assert server.say(10 * step, cycle(step))
     scans = [scan for step in range(20, 420) for scan in server.say(10 * step, cycle(19), **dead)]
-    assert server.scans.trouble is not None and "nothing comes of sensor 1: see to its cable" in server.scans.trouble
+    assert server.scans.trouble is not None and "nothing arrives from sensor 1: check its cable" in server.scans.trouble
     assert not any(scan.renewed.any() for scan in scans) and len(scans) <= 67  # a second long it may be a still pad
     assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
     server.scans.begin()  # opening it again brings no scan either
@@ -163,7 +163,7 @@ def test_a_sensor_that_died_long_ago_stays_dead(set_by_s):
     server.clock_s += set_by_s
     scans = [scan for step in range(1, 700) for scan in server.say(100 * step, cycle(1), time_s=UNIX_S)]
     assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
-    assert server.scans.trouble is not None and "nothing comes of sensor 1" in server.scans.trouble
+    assert server.scans.trouble is not None and "nothing arrives from sensor 1" in server.scans.trouble
     server.scans.begin()
     assert server.say(80_000, cycle(1), time_s=UNIX_S) == []
 

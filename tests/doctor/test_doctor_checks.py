@@ -55,7 +55,7 @@ class TestSensor:
         counts[:, 0, 1, 1] += np.rint(np.random.default_rng(3).normal(0, sigma, len(counts))).astype(np.int32)
         # So loud a taxel cannot be zeroed, and the report shows that consequence.
         assert faults(as_scans(counts)) == {"noise": verdict, "baseline": "not known"}
-        assert "taxel 5 alone is loud" in remedy_of("noise", as_scans(counts))
+        assert "taxel 5 alone is noisy" in remedy_of("noise", as_scans(counts))
 
     @pytest.mark.parametrize("sigma", [1.2, 2.0, 3.0])
     def test_noise_is_measured_right_and_creeping_is_none(self, sigma):
@@ -280,7 +280,7 @@ class TestIdMap:
         }
         if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
             sensor = {"AB": "7b"}.get(spoken + asked, sensor)
-            assert found["id map"].verdict == "ok" and f"sensor {sensor} heard" in found["id map"].measured
+            assert found["id map"].verdict == "ok" and f"sensor {sensor} received" in found["id map"].measured
             return
         assert found["id map"].verdict == "wrong" and found["id map"].remedy.startswith(f"--id-map {spoken}")
         if {asked, spoken} == {"uSPa44", "XR1944"}:
@@ -296,7 +296,7 @@ class TestIdMap:
         heard, _, _ = heard_of(USPA44_MAP, ids)
         finding = check_id_map(heard, USPA44_MAP, half_silent=True)
         assert finding is not None and finding.verdict == "wrong" and "no map has all" in finding.remedy
-        assert "8 ids heard, 8 of them uSPa44's: 0x004" in finding.measured
+        assert "8 ids received, 8 of them uSPa44's: 0x004" in finding.measured
 
     def test_one_of_two_sensors_may_be_of_another_map(self):
         ids = [can_id for can_id, _ in (*USPA44_MAP.wire_order("4"), *XR1944_MAP.wire_order("6"))]

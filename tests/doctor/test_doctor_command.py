@@ -145,7 +145,7 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
     of_link = "link, baud rate, latency timer, id map"
     of_sensor = "rate, torn scans, lost scans, silent taxels, stuck taxels, noise, rest levels, drift, baseline, load"
     assert names == f"{of_link}, {of_sensor}, guided press".split(", ")
-    assert "nobody is at a terminal" in document["findings"][-1]["remedy"]
+    assert "stdin is not a terminal" in document["findings"][-1]["remedy"]
     assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
 
 

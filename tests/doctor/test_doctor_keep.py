@@ -46,10 +46,13 @@ class TestLoss:
                 streams.setattr(sys, "stderr", err)
                 code = cli.main([*asked, "--weight-g", "200"])
         assert code == 2 and good.read_text() == content and load_sensor_file(good).sensors["4"].baseline is not None
-        assert "good.toml: left as it is, for it holds what would be lost: order and axes of sensor 4" in err.getvalue()
+        assert (
+            "good.toml: left as it is, because it holds what would be lost: order and axes of sensor 4"
+            in err.getvalue()
+        )
 
     def test_nothing_found_and_nothing_known_writes_nothing(self, tmp_path):
-        with pytest.raises(SensorFileError, match=r"s\.toml: not written, for nothing was found"):
+        with pytest.raises(SensorFileError, match=r"s\.toml: not written, because nothing was measured"):
             keep.keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
         assert list(tmp_path.iterdir()) == []
 
@@ -61,7 +64,7 @@ class TestLoss:
             (SensorEntry(Mounting(swap_xy=True)), "order and axes of sensor 4"),
             (
                 SensorEntry(pad=Pad(thickness_mm=4.2), assumed=frozenset({"mounting"})),
-                "what is known of the pad of sensor 4",
+                "constants of the pad of sensor 4",
             ),
             (SensorEntry(Mounting(gains=GAINS), assumed=frozenset({"mounting"})), "gains of sensor 4"),
         ],
@@ -70,7 +73,7 @@ class TestLoss:
         path = tmp_path / "s.toml"
         save_sensor_file(path, SensorFile(sensors={"4": held}))
         found = {"6": Baseline.of("6", BASELINE.counts, 1.79e9, 100, "start-up")}
-        with pytest.raises(SensorFileError, match=f"would be lost: {lost}: give --sensor .*s.toml as well"):
+        with pytest.raises(SensorFileError, match=f"would be lost: {lost}: pass --sensor .*s.toml as well"):
             keep.keep(path, SensorFile(), None, found, NONE, NONE)
         keep.keep(path, load_sensor_file(path), None, found, NONE, NONE)
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}
@@ -115,8 +118,8 @@ class TestMarks:
         entry = load_sensor_file(tmp_path / "s.toml").sensors["4"]
         assert entry.assumed == {"mounting"} and entry.emulated == {"baseline"}
         text = (tmp_path / "s.toml").read_text()
-        assert 'assumed = ["mounting"]  # as wired; nobody has looked' in text
-        assert 'emulated = ["baseline"]  # found of an emulated sensor: not for a device' in text
+        assert 'assumed = ["mounting"]  # as wired; not measured' in text
+        assert 'emulated = ["baseline"]  # measured on an emulated sensor: not for a device' in text
 
     def test_a_later_visit_takes_back_what_it_finds(self, tmp_path):
         path = tmp_path / "s.toml"

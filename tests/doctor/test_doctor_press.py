@@ -112,7 +112,7 @@ class TestAnswers:
         for left_out in range(4):
             presses = [press(place) for place in USPA44.corners]
             del presses[left_out]
-            assert find_order(presses) == "as the id map says"
+            assert find_order(presses) == "as in the id map"
             axes = find_axes(presses)
             assert axes is not None and (axes.swap_xy, axes.signs) == (False, (1, 1))
 
@@ -139,7 +139,7 @@ class TestAnswers:
 
     def test_what_a_sensor_file_keeps_is_no_longer_wrong(self):
         turned = [press(place, USPA44.corners[(n + 1) % 4]) for n, place in enumerate(USPA44.corners)]
-        for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file says so")):
+        for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file states this")):
             findings, mounting = judge_press(Answer(turned), kept, False)
             assert mounting is not None and mounting.moves_taxels
             assert findings[0].verdict == verdict and words in findings[0].remedy
@@ -159,14 +159,14 @@ class TestPerson:
         middle = np.zeros((40, 3, 4, 4))
         middle[:, 2, 1:3, 1:3] = 1000
         asked, guide = answer_to([*middle, *np.zeros((30, 3, 4, 4)), *visit(UPRIGHT, False, (1, 1, 1))])
-        assert asked[1:3] == ["That was no corner. Let go.", "Press the top left corner itself and hold it."]
+        assert asked[1:3] == ["That was not a corner. Let go.", "Press the top left corner itself and hold it."]
         assert guide.done and len(guide.answer.presses) == 4
 
     def test_a_corner_let_go_without_a_push_is_a_press_all_the_same(self):
         script = visit(UPRIGHT, False, (1, 1, 1))
         script[65:110] = 0
         asked, guide = answer_to(script)
-        assert asked[2] == "No push was felt. Let go."
+        assert asked[2] == "No push was measured. Let go."
         assert guide.answer.presses[0].push_counts is None and len(guide.answer.presses) == 4
         assert judged(guide)[1] == Mounting()
 

@@ -91,7 +91,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_opened(tmp_
     def open_link():
         raise AssertionError("opened")
 
-    with pytest.raises(SensorFileError, match=r"cannot be written: .*: give --out a file"):
+    with pytest.raises(SensorFileError, match=r"cannot be written: .*: pass --out a file"):
         told("--out", tmp_path / name, link=open_link)
     assert list(tmp_path.iterdir()) == []
 

@@ -85,7 +85,7 @@ def test_networks_brought_from_elsewhere_are_judged_as_they_are(folder, tmp_path
     assert list(rows) == ["compact stsr 40", "compact mtsr2 40+20"]
     assert rows["compact mtsr2 40+20"]["epochs"] == "60.0"
     assert rows["compact mtsr2 40+20"]["trained on"] == "a faster one"
-    assert "Not there, so not judged: stsr 10, stsr 40," in page
+    assert "Missing, so not evaluated: stsr 10, stsr 40," in page
     assert "compact mtsr2 40+20 over compact mtsr2 40+20, one tap given" in page
     assert not list((tmp_path / "data").glob("quick-seen*"))
     stale = replace(OUT[0], name=names[0].removeprefix("quick-"))

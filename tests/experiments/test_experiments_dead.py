@@ -9,7 +9,6 @@ from edge.inference.bundled import BUNDLE_DIR, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.dead_taxel_fill import load_estimator
 from train.experiments.sensor import dead
-from train.experiments.support.workbench import thinned
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +43,7 @@ def test_eight_silent_give_no_pattern_and_one_found_is_better_than_unfound(page)
 
 def test_no_dead_taxel_is_what_the_models_own_judge_says():
     frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-    few = thinned(frozen, len(frozen) // 4)
+    few = frozen.thinned(len(frozen) // 4)
     model = ModelSession(find_model("mtsr4"))
     told = dead.play(model, few, load_estimator(TAXELS, (4, 4)), 0, "silent")
     windows = few.windows(model.contract.taps)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
 
 from train.physics import fem_cache as referee
 from train.physics.fem_cache import Mesh, press_or_recall

@@ -146,7 +146,7 @@ def test_a_model_is_replaced_by_one_that_loads_and_stays_as_bak(folder, frozen, 
 def test_a_seed_size_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path):
     path = save_untrained(tmp_path / "peer.pt", "stsr", 4)
     line = export(path, tmp_path, at_frames(frozen, slice(0, 96, 30)))
-    assert "x4, not judged, the test set is of x10, parity" in line
+    assert "x4, not evaluated, the test set is of x10, parity" in line
     session = ModelSession(tmp_path / "peer.onnx")
     assert session.contract.pattern_shape == (16, 16) and session.contract.interval_factor is None
     assert session.contract.test_error == {}
@@ -258,7 +258,7 @@ def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, m
     path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=16, blocks=1)
     command = [str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz"), "--fine-tune-steps", "2"]
     with pytest.raises(
-        SystemExit, match=r"^export: integers cost too much in one-int8\.onnx .*: use the float32 model"
+        SystemExit, match=r"^export: quantisation costs too much in one-int8\.onnx .*: use the float32 model"
     ):
         main(command)
     *before, line = capsys.readouterr().out.splitlines()
@@ -305,4 +305,4 @@ def test_the_command_is_as_written(capsys):
 def test_what_integers_cost_too_much_is_said(psnr_db, coverage, said):
     in_float = {"psnr_db": 35.0, "coverage_90": 0.9}
     facts = to_onnx._cost(in_float, {"psnr_db": psnr_db, "coverage_90": coverage})
-    assert facts[0] == f"{35 - psnr_db:.3f} dB lost to them" and facts[1:] == said
+    assert facts[0] == f"{35 - psnr_db:.3f} dB lost to quantisation" and facts[1:] == said

@@ -168,7 +168,7 @@ def test_weights_that_are_no_better_are_not_taken(hostile, hostile_graphs, taps,
     _, integers, seen = hostile_graphs
     bad = replace(tuning, steps=3, learning_rate=1.0)
     done = quantised_well(hostile, USPA44, seen, taps, bad, -100.0)
-    assert done.net is hostile and not done.trained_on and done.said.endswith(", so not taken")
+    assert done.net is hostile and not done.trained_on and done.said.endswith(", so not used")
     assert done.integers.SerializeToString() == integers.SerializeToString()
 
 
@@ -218,7 +218,7 @@ def test_what_cannot_be_folded_and_what_is_not_of_the_network_is_said(hostile_gr
     with pytest.raises(ExportError, match=r"trunk\.1\.1 does not follow a convolution"):
         folded(alone)
     with (
-        pytest.raises(ExportError, match="is none of the network's"),
+        pytest.raises(ExportError, match="does not belong to the network"),
         rounded(seed_size(), integer_convolutions(model, integers)),
     ):
         pass

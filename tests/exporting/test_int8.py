@@ -126,7 +126,7 @@ def test_the_export_writes_another_file_that_says_what_it_is(tmp_path):
     path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=16, blocks=1)
     frozen = frozen_at(10)
     line = export(path, tmp_path, frozen, calibration=make_sequences(count=40))
-    assert line.startswith("one-int8.onnx: ") and "4 of 16 convolutions in integers" in line and "dB lost" in line
+    assert line.startswith("one-int8.onnx: ") and "4 of 16 convolutions in int8" in line and "dB lost" in line
     model = onnx.load(tmp_path / "one-int8.onnx")
     contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
     assert contract.arithmetic == "int8" and set(contract.test_error) == {"1", "2"}

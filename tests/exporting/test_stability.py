@@ -186,9 +186,9 @@ def test_a_pad_that_rests_at_its_wrap_is_not_saturated(monkeypatch):
 
 def test_what_lacks_is_said_before_anything_is_worked_out(tmp_path, monkeypatch):
     def lacking(part):
-        raise ModuleNotFoundError("the FEM referee needs felupe (GPL)")
+        raise ModuleNotFoundError("the FEM reference needs felupe (GPL)")
 
     monkeypatch.setattr(command, "_cases", lacking)
-    with pytest.raises(SystemExit, match=r"^stability: the FEM referee needs felupe"):
+    with pytest.raises(SystemExit, match=r"^stability: the FEM reference needs felupe"):
         command.main(["--reports", str(tmp_path)])
     assert list(tmp_path.iterdir()) == []

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
 
 from export.stability import finite_elements
 from train.physics.elastic_layer import Layer
@@ -53,7 +53,7 @@ def test_what_goes_too_far_ends_in_an_error_that_tells_where(quick):
     stepped = cases["compression to 40%", "K/G 100, steps of 5%", "thickness left, share"]
     assert "NoEquilibriumError" in stepped.guard
     assert 0.4 < stepped.value < 0.8
-    layer = Layer(poisson=finite_elements.REFEREE_POISSON)
+    layer = Layer(poisson=finite_elements.REFERENCE_POISSON)
     pad = FemPad(2, 2, layer)
     with pytest.raises(NoEquilibriumError, match="other steps"):
         pad.press(np.zeros((pad.size, pad.size)), np.array([0.6 * layer.thickness_mm]))
@@ -72,5 +72,5 @@ def test_a_solver_that_gets_nowhere_is_broken(monkeypatch):
         raise NoEquilibriumError("step 1", 0.0)
 
     monkeypatch.setattr(FemPad, "press", nowhere)
-    for poisson, step in ((0.45, 0.05), (finite_elements.REFEREE_POISSON, 0.1)):
+    for poisson, step in ((0.45, 0.05), (finite_elements.REFERENCE_POISSON, 0.1)):
         assert not finite_elements._compress(finite_elements.Mesh(2, 2), poisson, step, 0.4).holds

@@ -122,7 +122,7 @@ class TestArchives:
 
     def test_an_array_larger_than_its_member(self, tmp_path, bounded_memory):
         header = npy(np.zeros((1, 3, 4, 4), np.int32)).replace(b"(1, 3", b"(9999999999, 3").replace(b" " * 9, b"", 1)
-        self.refused(tmp_path, stored({"counts": header} | members("counts")), "tells of 1919999999808 bytes and holds")
+        self.refused(tmp_path, stored({"counts": header} | members("counts")), "states 1919999999808 bytes and holds")
 
     def test_lengths_whose_product_wraps_around(self, tmp_path):
         shape = f"({1 << 32}, {1 << 32})"
@@ -146,7 +146,7 @@ class TestArchives:
     @pytest.mark.parametrize("text", [b"\0\0\x11\0", b"\0\xd8\0\0"])
     def test_text_that_is_no_unicode(self, tmp_path, text):
         sensors = npy(np.array(["4", "4"])).replace(b"4\0\0\0", text)
-        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "no Unicode")
+        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "not Unicode")
 
     def test_a_header_of_pieces_of_python(self, tmp_path):
         sensors = npy(np.array(["4", "4"])).replace(b"'shape': (2,)", b"'shape': (((((")

@@ -246,7 +246,7 @@ def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, w
         assert "breaks off (within a record, at byte" in note
     else:
         behind = (tmp_path / "made.mcap").stat().st_size
-        left = int(re.search(r"is damaged \(.*\): ([0-9,]+) bytes behind that are not read", note)[1].replace(",", ""))
+        left = int(re.search(r"is damaged \(.*\): ([0-9,]+) bytes after that are not read", note)[1].replace(",", ""))
         assert 0 < left < behind
     with pytest.raises(RecordingError, match=words):
         load_recording(written(tmp_path, broken))

@@ -153,7 +153,7 @@ class TestReplay:
         assert process.wait(TIMEOUT_S) == 0
         after = used[used.index(4) :]
         assert 1 in after and after.index(1) < 30
-        assert process.stderr is not None and "refused: 1 lines or messages were no command" in process.stderr.read()
+        assert process.stderr is not None and "refused: 1 lines or messages were not commands" in process.stderr.read()
 
     def test_two_files_are_played_together_as_of_one_source(self, files, tmp_path):
         data = dict(np.load(files / "taps.npz"))

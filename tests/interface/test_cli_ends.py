@@ -105,7 +105,7 @@ class TestEnds:
         done = run(*base_options(files), "--source", name, "--duration-s", "6")
         os.close(leader), os.close(follower)
         assert done.returncode == 3 and done.stdout == ""
-        doctor = f"edge-sr doctor --source {name} says what is wrong"
+        doctor = f"edge-sr doctor --source {name} shows what is wrong"
         lines = done.stderr.splitlines()
         assert re.match(rf"edge-sr: no scan in [56] s: is the sensor powered .*{doctor}$", lines[1])
         assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)

@@ -192,7 +192,7 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     monkeypatch.setattr(run, "open_sink", lambda text, **facts: sink)
     assert cli.main(["--source", "demo:loop", "--sink", "status"]) == 0
     out, err = capfd.readouterr()
-    assert out.count("4 of 4 taps scored") == 1 and err.count("goes on until Ctrl-C") == 1
+    assert out.count("4 of 4 taps scored") == 1 and err.count("continues until Ctrl-C") == 1
     assert err.count("demo: now another surface is tapped") == err.count("demo: now a magnet comes near") == 2
     used: dict[tuple[int, int], set[int]] = {}
     for result in sink.results:

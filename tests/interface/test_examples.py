@@ -71,7 +71,7 @@ def test_the_gripper_stops_on_contact_and_never_moves_by_what_is_emulated_unaske
     assert (
         code == 1
         and out == []
-        and errors == ["stop_on_area: demo is emulated, no sensor: --pretend goes by it all the same"]
+        and errors == ["stop_on_area: demo is emulated, not a sensor: pass --pretend to accept it"]
     )
     code, out, errors = run(empty, *demo, "--pretend")
     assert (code, errors) == (0, []) and out[:2] == ["gripper: closing", "gripper: stopped"]
@@ -164,12 +164,12 @@ def reading(state="idle", sensor="4", **said):
     return Result(scan, "device", "tiny", state, **({"force_counts": 10.0} | said))
 
 
-SILENT = Note("dead", "taxel 3 was not heard")
+SILENT = Note("dead", "taxel 3 was not received")
 UNTRUSTED = {"trusted": False, "untrusted_reason": "unfamiliar"}
 WRONG = {
     "the reading is 50": {"age_ms": 5000},
     "taxels [5] are dead": {"dead": {5: "stuck"}},
-    "not ready: taxel 3 was not heard": {"state": "incomplete", "notes": (SILENT,), "force_counts": None},
+    "not ready: taxel 3 was not received": {"state": "incomplete", "notes": (SILENT,), "force_counts": None},
     "not ready: zeroing": {"state": "zeroing", "force_counts": None},
     "not to be believed: readings like no contact": {"state": "contact", "area_mm2": 50.0} | UNTRUSTED,
     "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
@@ -240,7 +240,7 @@ def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
 def test_while_nothing_was_heard_it_says_so(at_once):
     grip, gripper = grip_of(at_once)
     grip._mind_silence()
-    assert gripper.done == [] and grip.why == "it never began: nothing was heard"
+    assert gripper.done == [] and grip.why == "it never began: no scan arrived"
 
 
 @pytest.mark.parametrize("limit", ["--area-mm2", "--most-counts", "--oldest-ms", "--duration-s"])

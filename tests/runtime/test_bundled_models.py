@@ -63,7 +63,9 @@ def behind_the_linear_map(name, test_set):
 def test_the_models_are_there_each_in_one_small_file():
     assert {path.stem for path in bundled_models()} == set(NAMES)
     for path in bundled_models():
-        assert path.stat().st_size < 3.2e6  # 3.13 MB with the pad as an input and traction as an output
+        assert (
+            path.stat().st_size < 3.5e6
+        )  # 3.13 MB with the pad as an input and traction as an output, .24 MB of checks
     assert not [path for path in BUNDLE_DIR.iterdir() if path.suffix not in (".onnx", ".npz")]
 
 

@@ -36,7 +36,11 @@ def test_a_sensor_that_the_model_was_not_trained_for_is_refused(change):
     [
         ({"rows": "64", "cols": "64", "scale": "16"}, {"scale": "17"}, "patterns of at most 1048576 pixels"),
         ({"contact_level": "0.999"}, {"contact_level": "1"}, "a number below 1"),
-        ({"taps": "4".ljust(65_536)}, {"taps": "4".ljust(65_537)}, "65537 characters, expected at most 65536"),
+        (
+            {"taps": "4".ljust(1 << 20)},
+            {"taps": "4".ljust((1 << 20) + 1)},
+            "1048577 characters, expected at most 1048576",
+        ),
     ],
 )
 def test_a_contract_is_taken_up_to_its_limits(lawful, one_more, match):

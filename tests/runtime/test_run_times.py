@@ -141,7 +141,7 @@ class TestCache:
         (tmp_path / "cache" / FILE_NAME).write_bytes(content)
         damaged = cache(tmp_path)
         assert damaged.find(models[0]) is None
-        assert damaged.notes == [f"{tmp_path}/cache/{FILE_NAME} is damaged: measured anew"]
+        assert damaged.notes == [f"{tmp_path}/cache/{FILE_NAME} is damaged: measured again"]
         damaged.keep({models[0]: KEPT})
         assert cache(tmp_path).find(models[0]) == (KEPT, 0.0)
 
@@ -163,7 +163,7 @@ class TestCache:
         assert damaged.find(models[1]) == (KEPT, 0.0) and damaged.notes == []
         assert damaged.find(models[0]) is None
         # An entry that is null is none, and was never this program's.
-        assert damaged.notes == ([] if change is None else [f"{path} is damaged at a: measured anew"])
+        assert damaged.notes == ([] if change is None else [f"{path} is damaged at a: measured again"])
 
     def test_a_place_that_cannot_be_written_is_said_once(self, tmp_path, models):
         (tmp_path / "cache").write_text("a file where a folder should be")

@@ -314,27 +314,27 @@ def test_a_reading_that_lay_about_is_told():
     for number, delay_ns in enumerate([0, 50_000_000, 50_000_001, 0]):
         scan = make_scan(number, press_counts=3000)
         notes.append(runtime.push(dataclasses.replace(scan, device_ns=scan.time_ns - delay_ns)).note)
-    assert notes == [None, None, "this reading was 0.05 s old when it came", None]
+    assert notes == [None, None, "this reading was 0.05 s old when it arrived", None]
 
 
 def test_a_sensor_that_the_sensor_file_does_not_know_is_told():
     mountings = {"4": Mounting(), "6": Mounting()}
     runtime = Runtime(FakeModel(), source="device", baselines={"left/4": BASELINE}, mountings=mountings)
     result = runtime.push(make_scan(0, sensor="left/4"))
-    assert result.note == "the sensor file knows no sensor left/4, only 4, 6: taken as wired"
+    assert result.note == "the sensor file has no sensor left/4, only 4, 6: taken as wired"
     assert "sensor file" not in (runtime.push(make_scan(0)).note or "")
 
 
 def test_zeroing_before_any_sensor_was_heard_is_refused_and_said():
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     runtime.zero()
-    assert runtime.push(make_scan(0)).event == "zeroing refused: no sensor was heard yet"
+    assert runtime.push(make_scan(0)).event == "zeroing refused: no scan has arrived yet"
 
 
 def test_what_may_be_old_because_nobody_read_is_said_to_be():
     runtime = make_runtime()
     late = dataclasses.replace(make_scan(0), unread_ns=4_980_000_000)
     note = runtime.push(late).note
-    assert note is not None and "may have been 4.98 s old when it came: nobody read meanwhile" in note
+    assert note is not None and "may have been 4.98 s old when it arrived: nothing was read meanwhile" in note
     known = dataclasses.replace(make_scan(1), unread_ns=4_980_000_000, device_ns=make_scan(1).time_ns - 1000)
     assert "old" not in (runtime.push(known).note or "")

@@ -60,7 +60,7 @@ def test_a_reading_that_came_late_is_held_since_it_was_taken(stamped):
     came_ns, late_ns = 50 * PERIOD_NS, 35 * PERIOD_NS
     late = make_scan(1, press_counts=PRESS, time_ns=came_ns)
     taken = {"device_ns": came_ns - late_ns} if stamped else {"unread_ns": late_ns}
-    assert "old when it came" in runtime.push(dataclasses.replace(late, **taken)).note
+    assert "old when it arrived" in runtime.push(dataclasses.replace(late, **taken)).note
     torn = make_scan(2, press_counts=PRESS, absent=(0, 1), time_ns=came_ns + PERIOD_NS)
     result = runtime.push(dataclasses.replace(torn, device_ns=torn.time_ns if stamped else None))
     assert result.pattern is None and result.dead == {0: "silent", 1: "silent"}

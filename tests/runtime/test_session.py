@@ -172,6 +172,7 @@ BROKEN_VALUES = {
     "pad_inputs": [["thickness", 4.5, 1.0]],
     "takes_gains": 1,
     "traction_scale": 2.0,
+    "trust": {"forward": {}},
 }
 
 
@@ -195,7 +196,7 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
     metadata = make_contract(version=1).to_metadata()
     del metadata[KEY_PREFIX + "interval_factor"]
-    with pytest.raises(ModelError, match=r"'version' is 1, expected 5 or 4: export the model again"):
+    with pytest.raises(ModelError, match=r"'version' is 1, expected 6, 4 or 5: export the model again"):
         ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
 
 
@@ -206,11 +207,11 @@ def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks
         ({"output_name": "out"}, r"graph output is out tensor\(float\) \[1, 40, 40\], .* pattern tensor"),
         (
             {"with_deviation": True},
-            r"output is pattern .*, deviation tensor\(float\) \[1, 40, 40\], but .* says pattern [^,]*, 40, 40\]$",
+            r"output is pattern .*, deviation tensor\(float\) \[1, 40, 40\], but .* states pattern [^,]*, 40, 40\]$",
         ),
         (
             {"with_deviation": False, "contract": make_contract(interval_factor=1.6)},
-            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract says pattern .*, deviation tensor",
+            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract states pattern .*, deviation tensor",
         ),
         ({"element_type": TensorProto.DOUBLE}, r"graph input is window tensor\(double\)"),
         ({"input_shape": ["n", 12, 4, 4]}, r"graph input is window tensor\(float\) \['n', 12, 4, 4\]"),
@@ -224,10 +225,10 @@ def test_a_graph_that_breaks_its_contract_is_refused_naming_the_tensor(tmp_path,
 
 def test_a_contract_for_other_shapes_is_refused(tmp_path):
     metadata = make_contract(taps=2).to_metadata()
-    with pytest.raises(ModelError, match=r"input is window.*12, 4, 4.*contract says.*6, 4, 4"):
+    with pytest.raises(ModelError, match=r"input is window.*12, 4, 4.*contract states.*6, 4, 4"):
         ModelSession(write_model(tmp_path / "a.onnx", metadata=metadata))
     metadata = make_contract(scale=5).to_metadata()
-    with pytest.raises(ModelError, match=r"output is pattern.*1, 40, 40.*contract says.*1, 20, 20"):
+    with pytest.raises(ModelError, match=r"output is pattern.*1, 40, 40.*contract states.*1, 20, 20"):
         ModelSession(write_model(tmp_path / "b.onnx", metadata=metadata))
 
 

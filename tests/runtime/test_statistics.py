@@ -91,7 +91,7 @@ def test_summary_tells_all_of_it():
         f"sensor 4: baseline {BASELINE.id} 90 s old, from file",
         "sinks: nobody subscribes to zenoh:a",
         "events: lost 2, back 1",
-        "refused: 2 lines or messages were no command",
+        "refused: 2 lines or messages were not commands",
     ]
 
 
@@ -103,8 +103,8 @@ def noted(number, state, note=None, sensor="4"):
 @pytest.mark.parametrize(
     ("results", "why"),
     [
-        ([noted(0, "zeroing")], "not zeroed, too few scans; or give --baseline, of the free pad"),
-        ([noted(0, "zeroing"), noted(1, "zeroing", "it moved")], "not zeroed, it moved; or give --baseline, of the"),
+        ([noted(0, "zeroing")], "not zeroed, too few scans; or pass --baseline, of the free pad"),
+        ([noted(0, "zeroing"), noted(1, "zeroing", "it moved")], "not zeroed, it moved; or pass --baseline, of the"),
         ([noted(0, "incomplete", "taxel 3 is dead"), noted(1, "zeroing")], "taxel 3 is dead"),
         ([noted(0, "zeroing", "it moved"), noted(1, "idle")], "nothing touched it"),
         ([noted(0, "idle"), noted(1, "dropped"), noted(2, "idle")], "newer scans overtook all"),

@@ -20,7 +20,7 @@ from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.cdr_messages import force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
 from edge.view.frames import Frames, Run, hello
-from edge.view.run_snapshot import Heard
+from edge.view.run_snapshot import RunSnapshot
 from edge.view.viewer_state import Viewer
 
 PITCH_MM, PIXELS = 4.7, 8
@@ -160,7 +160,7 @@ class TestSinks:
         assert nominal["wrench_origin"] == "nominal" and "force" not in nominal
 
     def test_the_live_page(self):
-        heard = Heard(lambda: 10**12)
+        heard = RunSnapshot(lambda: 10**12)
         result = make_wrench_result()
         heard.add(result, {})
         header, _ = unpack(Viewer().due(Frames(heard, 10**12, "device"))[0])

@@ -38,7 +38,7 @@ def test_sensors_names_as_topics(sensor, topic):
 def test_names_that_ros_cannot_hold_are_refused():
     assert base_topic("/gripper/skin_1") == "gripper/skin_1"
     for text in ("", "4", "a//b", "a/", "a b", "ä", "//a", "~/a"):
-        with pytest.raises(UsageError, match=r"is none of ROS: expected letters"):
+        with pytest.raises(UsageError, match=r"is not a ROS topic: expected letters"):
             base_topic(text)
     with pytest.raises(SinkError, match=rf"ROS holds {LONGEST_TOPIC - 1}: name sensor"):
         sensor_topic("skin", "ä" * 64, "pattern")
@@ -49,7 +49,7 @@ def test_names_that_ros_cannot_hold_are_refused():
     [
         ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
         ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID is '233'"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, so that nobody finds us"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, which hides edge-sr from other nodes"),
     ],
 )
 def test_an_environment_that_ros_would_not_take_is_refused(environment, said):

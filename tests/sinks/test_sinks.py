@@ -37,7 +37,7 @@ class TestFan:
         for result in results:
             fan.write(result, RUN)
         assert good.results == results and len(bad.results) == 1 and bad.closed
-        assert told == good.events == [Event(7, "sink", None, "disk full; the other sinks go on")]
+        assert told == good.events == [Event(7, "sink", None, "disk full; the other sinks continue")]
         with pytest.raises(SinkError, match="disk full"):
             fan.close()
         assert good.closed

@@ -135,7 +135,7 @@ class TestMessages:
                 capture_output=True,
                 text=True,
             )
-        why = f"nobody subscribes to zenoh:grip?connect={endpoint}: see to its reader, or the router"
+        why = f"nobody subscribes to zenoh:grip?connect={endpoint}: check its reader, or the router"
         assert done.returncode == 0 and f"edge-sr: {why}\n" in done.stderr and f"\nsinks: {why}\n" in done.stderr
 
     def test_events_say_of_what_they_are(self):
@@ -180,7 +180,7 @@ class TestWhoComesAndGoes:
             assert sink.trouble is None
             sink.write(result, {})
             assert (
-                sink.trouble == f"nobody subscribes to zenoh:grip?connect={endpoint}: see to its reader, or the router"
+                sink.trouble == f"nobody subscribes to zenoh:grip?connect={endpoint}: check its reader, or the router"
             )
             for key in ("grip/*/scan", "grip/4/pattern", "grip/event"):
                 reader = place.declare_subscriber(key)
@@ -276,9 +276,9 @@ class TestOpening:
             ("a//b", r"'a//b' for a key"),
             ("a/*", r"'a/\*' for a key"),
             ("@/a", r"'@/a' for a key"),
-            ("a?listen=x", r"'listen=x' behind its key: expected zenoh:KEY, zenoh:KEY\?connect="),
-            ("a?connect=here", r"'connect=here' behind its key"),
-            ("a?", r"'' behind its key"),
+            ("a?listen=x", r"'listen=x' after its key: expected zenoh:KEY, zenoh:KEY\?connect="),
+            ("a?connect=here", r"'connect=here' after its key"),
+            ("a?", r"'' after its key"),
         ],
     )
     def test_what_cannot_be_understood_is_refused(self, target, told):
@@ -286,10 +286,10 @@ class TestOpening:
             open_sink(f"zenoh:{target}", CONTRACT)
 
     def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
-        with pytest.raises(SinkError, match=r"none.json5 is no configuration of zenoh: No such file"):
+        with pytest.raises(SinkError, match=r"none.json5 is not a zenoh configuration: No such file"):
             open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT)
         (tmp_path / "bad.json5").write_text("{mode: ")
-        with pytest.raises(SinkError, match=r"bad.json5 is no configuration of zenoh: expected"):
+        with pytest.raises(SinkError, match=r"bad.json5 is not a zenoh configuration: expected"):
             open_sink(f"zenoh:a?config={tmp_path}/bad.json5", CONTRACT)
 
     def test_an_endpoint_that_zenoh_does_not_know_is_told(self):

@@ -83,10 +83,10 @@ class FaultyEmulator(Emulator):
             self.sent_frames += room >= 0 and piece.sent is not None
             self.lost_frames += room < 0 and piece.sent is not None
 
-    def _obey(self, heard: bytes) -> None:
+    def _obey(self, received: bytes) -> None:
         was_open = self.adapter.channel_open
-        unread_bytes = self._line.left_bytes() if b"C" in heard else self._line.unread_bytes()
-        answer = self.adapter.feed(heard)
+        unread_bytes = self._line.left_bytes() if b"C" in received else self._line.unread_bytes()
+        answer = self.adapter.feed(received)
         if self.adapter.channel_open != was_open:  # closing and opening drop old bytes, answers as well
             self._truth.close_channel(unread_bytes)
         if not self.adapter.channel_open:

@@ -178,7 +178,7 @@ def _held(
             continue
         rows = taxels.get((one.head["sensor"], taxel))
         if rows is None or rows.shown < 0:
-            trouble.append(f"taxel {taxel} is held, but was never heard")
+            trouble.append(f"taxel {taxel} is held, but was never received")
             continue
         _, at_us, at_ns = rows.rows[rows.shown]
         held_us = min(newest_us - at_us, (newest_ns - at_ns) / 1e3)

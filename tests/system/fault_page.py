@@ -22,7 +22,7 @@ MEMORY_MB_PER_MINUTE: Final = 0.2
 FEWEST_SIZES: Final = 60
 """Sizes of a minute: in less time, allocations of the start look like growth."""
 SINKS_GIVEN_UP: Final = 4
-_GIVEN_UP: Final = "the other sinks go on"
+_GIVEN_UP: Final = "the other sinks continue"
 """Words on stderr about each sink given up; a record of it may be left out where its reader is slow."""
 
 

@@ -44,7 +44,7 @@ def schedule(seconds: float) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 0 when every promise was kept, 1 when not."""
     parser = argparse.ArgumentParser(prog="python tests/system/faults.py", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("minutes", type=float, metavar="MINUTES", help="how long; a quarter of one at least")
+    parser.add_argument("minutes", type=float, metavar="MINUTES", help="length of the run, .25 at least")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of all chance (default 1)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write faults.md there")
     options = parser.parse_args(arguments)

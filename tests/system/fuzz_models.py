@@ -173,7 +173,7 @@ def sequences(data: bytes) -> None:
         try:
             load_sequences(as_file("taps.npz", data))
         except DatasetError as error:
-            if wanted := re.search(r"its sha256 is ([0-9a-f]{64}), it says ([0-9a-f]{64})", str(error)):
+            if wanted := re.search(r"its sha256 is ([0-9a-f]{64}), it states ([0-9a-f]{64})", str(error)):
                 data = data.replace(wanted[2].encode(), wanted[1].encode())
     refused(lambda: load_sequences(as_file("taps.npz", data)), DatasetError)
 

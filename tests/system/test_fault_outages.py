@@ -57,7 +57,7 @@ def test_every_promise_can_be_broken():
     told = forged.told
     sizes = [Size(float(n), 70.0 + n, 5, 9 + n) for n in range(90)]
     steady = [Size(float(n), 70.0, 5, 9) for n in range(90)]
-    said = "edge-sr: full.npz: File too large; the other sinks go on\n"
+    said = "edge-sr: full.npz: File too large; the other sinks continue\n"
     good = Ran(exit_code=5, said=4 * said, seen=[*forged.seen], sizes=steady, told=told)
     assert all(promise.kept for promise in promises(good, judge(good.seen, told), told))
     assert show(good, judge(good.seen, told), told, lambda text: None)
@@ -84,7 +84,7 @@ def unkept(ran: Ran, told: Told) -> list[str]:
 
 def test_what_was_not_measured_is_not_kept():
     forged = Forged()
-    said = 4 * "; the other sinks go on\n"
+    said = 4 * "; the other sinks continue\n"
     ran = Ran(exit_code=5, said=said, seen=forged.seen, told=forged.told)
     assert unkept(ran, forged.told) == ["a link that is back"]
     forged.events = outage("reset", 0.05, 0.06)
@@ -102,7 +102,7 @@ def test_every_break_of_the_link_is_judged(name):
     forged = Forged(cycles=300)
     forged.rows["handed_ns"][16 * 50 : 16 * 250] = 0
     forged.events = outage(name, 0.5, 0.6)
-    ran = Ran(exit_code=5, said=4 * "; the other sinks go on\n", seen=forged.seen, told=forged.told)
+    ran = Ran(exit_code=5, said=4 * "; the other sinks continue\n", seen=forged.seen, told=forged.told)
     assert unkept(ran, forged.told) == ["a link that is back"]
 
 

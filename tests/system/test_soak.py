@@ -13,7 +13,7 @@ from dataclasses import replace
 import pytest
 from edge_samples import ROOT
 
-from edge.bench.soak import Window, judged
+from edge.bench.soak import Window, evaluated
 
 MINUTES = float(os.environ.get("EDGE_SOAK_MINUTES", "1"))
 
@@ -41,15 +41,15 @@ def test_memory_stays_flat_and_latency_does_not_drift():
 
 
 def test_what_does_not_change_is_flat():
-    found = judged(STILL)
+    found = evaluated(STILL)
     assert found.minutes == 1.0
     assert abs(found.memory_mb_per_minute) < found.memory_half < 0.2
     assert found.latency_ratio == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_leak_and_a_drift_are_seen_by_what_they_are():
-    leaking = judged([replace(window, resident_mb=78.0 + 0.04 * n) for n, window in enumerate(STILL)])
+    leaking = evaluated([replace(window, resident_mb=78.0 + 0.04 * n) for n, window in enumerate(STILL)])
     assert leaking.memory_mb_per_minute == pytest.approx(12 * 0.04)
     assert leaking.memory_half == pytest.approx(0.0, abs=1e-6)
-    drifting = judged([replace(window, quiet_us=1000.0 * 1.1**n) for n, window in enumerate(STILL)])
+    drifting = evaluated([replace(window, quiet_us=1000.0 * 1.1**n) for n, window in enumerate(STILL)])
     assert drifting.latency_ratio == pytest.approx(1.1**8)

@@ -167,8 +167,8 @@ def rewrite(path, **changes):
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"schema": None}, "is no file of sequences: make one"),
-        ({"schema": "something else"}, "is no file of sequences: make one"),
+        ({"schema": None}, "is not a file of sequences: make one"),
+        ({"schema": "something else"}, "is not a file of sequences: make one"),
         ({"version": 2}, "version 2, newer than 1: update"),
         ({"version": "one"}, "damaged"),
         ({"counts": None}, "counts"),
@@ -212,10 +212,10 @@ def test_files_of_other_kinds_are_refused(tmp_path):
     flipped[len(whole) // 2] ^= 1
     for wrong in (b"", b"garbage", whole[: len(whole) // 2], bytes(flipped), pickle.dumps([1])):
         path.write_bytes(wrong)
-        with pytest.raises(DatasetError, match=r"damaged|no file of sequences"):
+        with pytest.raises(DatasetError, match=r"damaged|not a file of sequences"):
             load_sequences(path)
     np.save(path.with_suffix(".npy"), np.zeros(3))
-    with pytest.raises(DatasetError, match="no file of sequences"):
+    with pytest.raises(DatasetError, match="not a file of sequences"):
         load_sequences(path.with_suffix(".npy"))
 
 

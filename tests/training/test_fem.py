@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
 
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver

@@ -47,7 +47,7 @@ def test_a_flat_face_presses_as_the_finite_elements_have_it(poisson):
 
 
 def test_the_elements_themselves_on_a_coarse_mesh():
-    pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+    pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
     from train.physics.whole_pad import WholePad
 
     for poisson in (0.45, 0.495):

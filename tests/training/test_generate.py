@@ -182,7 +182,7 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to the workers too
     out, complaint = run.communicate()
     assert run.returncode == 130
-    assert complaint.decode() == "train.generate: interrupted; the same command goes on from here\n"
+    assert complaint.decode() == "train.generate: interrupted; the same command continues\n"
     assert not out
     assert any(parts.glob("*.npz"))
 
@@ -214,7 +214,7 @@ def test_damaged_parts_are_solved_anew_and_others_are_kept(small, tmp_path):
 
 def test_what_was_made_otherwise_is_not_overwritten(small, tmp_path):
     before = small.read_bytes()
-    with pytest.raises(DatasetError, match="is there and was made otherwise: delete it"):
+    with pytest.raises(DatasetError, match="exists and was made with other settings: delete it"):
         generate(replace(SMALL, seed=6), small, jobs=1)
     solved = []
     assert generate(SMALL, small, jobs=1, progress=solved.append).sha256() == load_sequences(small).sha256()
@@ -277,7 +277,7 @@ def test_the_command_says_what_it_made_and_what_it_cannot(tmp_path, capsys):
         (["--surfaces", "none", "--glyphs", "0"], "no surfaces to tap"),
         (["--mesh", str(tmp_path / "absent.stl"), "--surfaces", "C"], "cannot be read: No such file"),
         (["--taps", "9"], "taps is 9"),
-        (["--seed", "2"], "was made otherwise"),
+        (["--seed", "2"], "was made with other settings"),
     ):
         assert main([*line, *wrong]) == 1
         complained = capsys.readouterr().err

@@ -65,10 +65,10 @@ def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
     silent = [0, 1, 3, 4, 5]
     np.testing.assert_allclose(found.constants[silent], 0, atol=1e-9)
     np.testing.assert_allclose(found.deviations[CHANNELS:][silent], CONSTANT_SPREAD)
-    assert found.told.tolist() == [False, False, True, False, False, False]
+    assert found.determined.tolist() == [False, False, True, False, False, False]
     pad = identify.found_pad(found)
     assert list(pad.constants) == list(pad.intervals) == ["poisson"]
-    assert "not told" in identify.table("4", found)
+    assert "not determined" in identify.table("4", found)
 
 
 def test_more_contacts_leave_less_open(mixture):
@@ -107,7 +107,7 @@ def test_a_mixture_is_read_back_and_a_damaged_one_named(mixture, tmp_path):
     mixture.save(tmp_path / "a.npz")
     np.testing.assert_array_equal(load_mixture(tmp_path / "a.npz").means, mixture.means)
     replace(mixture, means=mixture.means[:, :2]).save(tmp_path / "b.npz")
-    with pytest.raises(DatasetError, match=r"b\.npz is no mixture"):
+    with pytest.raises(DatasetError, match=r"b\.npz is not a mixture"):
         load_mixture(tmp_path / "b.npz")
 
 

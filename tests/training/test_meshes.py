@@ -196,10 +196,10 @@ def test_points_are_no_mesh(tmp_path):
 def test_corners_that_are_no_number(tmp_path, bad):
     corners = box().triangles.copy()
     corners[3, 1, 2] = bad
-    refused(saved(tmp_path, "nan.stl", binary_stl(corners)), "1 of 12 triangles.*no finite number")
+    refused(saved(tmp_path, "nan.stl", binary_stl(corners)), "1 of 12 triangles.*not finite numbers")
     sick = box()
     sick.vertices[0, 0] = bad
-    refused(saved(tmp_path, "nan.ply", ply(sick)), "no finite number")
+    refused(saved(tmp_path, "nan.ply", ply(sick)), "not finite numbers")
 
 
 def test_triangles_that_name_absent_corners(tmp_path):

@@ -116,7 +116,7 @@ def test_files_of_two_kinds_do_not_mix(tmp_path):
     presses, more, taps = (tmp_path / f"{name}.npz" for name in ("presses", "more", "taps"))
     assert len(load_taps([presses, more])) == 24
     assert load_taps([taps]).seed == 0
-    with pytest.raises(DatasetError, match=r"taps\.npz of train\.generate beside presses"):
+    with pytest.raises(DatasetError, match=r"taps\.npz: made by train\.generate, the others are presses"):
         load_taps([presses, taps])
 
 

@@ -344,7 +344,7 @@ class TestMagnets:
 
 @pytest.mark.parametrize(("thickness_mm", "poisson"), [(2.0, 0.3), (3.0, 0.4)])
 def test_a_patch_pushed_along_moves_a_block_of_finite_elements_as_the_layer(thickness_mm, poisson):
-    felupe = pytest.importorskip("felupe", reason="the FEM referee is an extra: pip install '.[fem]'")
+    felupe = pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
     from scipy.sparse.linalg import cg
 
     # Free sides give way: a block of eight thicknesses does not feel them, one of five did by 8 % in its middle plane.

@@ -130,7 +130,7 @@ def test_what_is_no_checkpoint_is_refused_by_name(folder, tmp_path, damage, caps
         path.write_bytes(b"no weights at all")
     elif damage != "no weights":
         torch.save(weights, path)
-    with pytest.raises(CheckpointError, match=r"net\.pt and net\.json are no checkpoint"):
+    with pytest.raises(CheckpointError, match=r"net\.pt and net\.json are not a checkpoint"):
         load_network(path)
     assert "it ran" not in capsys.readouterr().out
 

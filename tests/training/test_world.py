@@ -93,13 +93,17 @@ def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(small, tmp_path, mon
 
 def test_what_was_made_otherwise_is_not_overwritten(small, tmp_path):
     before = small.read_bytes()
-    with pytest.raises(DatasetError, match="is there and was made otherwise: delete it, or write to another file"):
+    with pytest.raises(
+        DatasetError, match="exists and was made with other settings: delete it, or write to another file"
+    ):
         make_presses(replace(SMALL, seed=6), small, jobs=1)
     assert small.read_bytes() == before
     folder = tmp_path / "other.npz.parts"
     folder.mkdir()
     replace(solve_pad(SMALL, 0), config=SMALL.facts()).save(folder / "000000.npz")
-    with pytest.raises(DatasetError, match=r"other\.npz\.parts holds parts that were made otherwise: delete it"):
+    with pytest.raises(
+        DatasetError, match=r"other\.npz\.parts holds parts that were made with other settings: delete it"
+    ):
         make_presses(replace(SMALL, seed=6), tmp_path / "other.npz", jobs=1)
 
 
@@ -131,7 +135,7 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     os.killpg(run.pid, signal.SIGINT)  # a terminal sends it to the workers too
     out, complaint = run.communicate()
     assert run.returncode == 130
-    assert complaint.decode() == "train.data.make_presses: interrupted; the same command goes on from here\n"
+    assert complaint.decode() == "train.data.make_presses: interrupted; the same command continues\n"
     assert not out and any(parts.glob("*.npz"))
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from edge.errors import UsageError
 from edge.pipeline.commands import WAITING, Command, Commands
 from edge.view.access import grant, is_loopback
-from edge.view.viewer_commands import LONGEST_BYTES, hear
+from edge.view.viewer_commands import LONGEST_BYTES, execute
 from edge.view.viewer_state import Viewer
 
 TOKEN = "correct-horse-battery"
@@ -160,13 +160,13 @@ class TestAccess:
 
 
 class TestAsked:
-    def hear(self, *messages):
+    def execute(self, *messages):
         asked = Commands()
-        why = [hear(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer(), asked) for m in messages]
+        why = [execute(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer(), asked) for m in messages]
         return asked, why
 
     def test_commands_are_polled_once_in_their_order(self):
-        asked, why = self.hear(
+        asked, why = self.execute(
             {"cmd": "zero"},
             {"cmd": "zero", "sensor": "4", "force": True},
             {"cmd": "reset"},
@@ -203,26 +203,26 @@ class TestAsked:
         ],
     )
     def test_what_is_none_is_counted_and_told(self, message):
-        asked, [why] = self.hear(message)
+        asked, [why] = self.execute(message)
         assert asked.refused == 1 and asked.poll() == []
         assert why is not None and "expected {" in why and len(why) < 400 and "\n" not in why
 
     @settings(max_examples=40)
     @given(st.text() | st.binary() | st.recursive(st.none() | st.booleans() | st.text(), st.lists).map(json.dumps))
     def test_nothing_raises(self, message):
-        hear(message, Viewer(), Commands())
+        execute(message, Viewer(), Commands())
 
     def test_pausing_is_the_viewers_own(self):
         asked, viewer, other = Commands(), Viewer(), Viewer()
-        assert hear('{"cmd": "pause", "on": true}', viewer, asked) is None
+        assert execute('{"cmd": "pause", "on": true}', viewer, asked) is None
         assert viewer.paused and not other.paused and asked.poll() == []
-        hear('{"cmd": "pause", "on": false}', viewer, asked)
+        execute('{"cmd": "pause", "on": false}', viewer, asked)
         assert not viewer.paused
 
     def test_where_nobody_polls_a_few_wait_and_the_others_are_refused(self):
-        asked, why = self.hear(*[{"cmd": "reset"}] * (WAITING + 3))
+        asked, why = self.execute(*[{"cmd": "reset"}] * (WAITING + 3))
         assert why.count(None) == WAITING and asked.refused == 3 and len(asked.poll()) == WAITING
-        assert hear('{"cmd": "reset"}', Viewer(), asked) is None
+        assert execute('{"cmd": "reset"}', Viewer(), asked) is None
 
     def test_the_longest_message_holds_any_command(self):
         assert len(json.dumps({"cmd": "zero", "sensor": "s" * 1000, "force": False})) < LONGEST_BYTES

@@ -13,7 +13,7 @@ from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import record
 from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
-from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, Heard
+from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
 from edge.view.sink import ViewSink
 from edge.view.viewer_state import Viewer
 
@@ -33,7 +33,7 @@ def clock():
 
 @pytest.fixture
 def heard(clock):
-    return Heard(clock)
+    return RunSnapshot(clock)
 
 
 def unpacked(frames):
@@ -314,7 +314,7 @@ class TestSink:
 
     def sink(self, clock, watched=True):
         woken = []
-        return ViewSink(Heard(clock), lambda: watched, lambda: woken.append(clock()), clock), woken
+        return ViewSink(RunSnapshot(clock), lambda: watched, lambda: woken.append(clock()), clock), woken
 
     def test_nobody_is_woken_where_nobody_looks(self, clock):
         sink, woken = self.sink(clock, watched=False)

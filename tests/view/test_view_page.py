@@ -400,8 +400,10 @@ def test_a_pattern_that_is_not_believed_cannot_be_taken_for_one_that_is(open_pag
             assert red_share(page) > 0.25, "it stays what it was while it is looked at"
             page.keyboard.press("Space")
             verdict[0] = None
-            playwright.expect(part(page, "verdict")).to_have_text("too light to tell whether this is to be believed")
-            playwright.expect(number(page, "trusted")).to_have_text("too light to tell")
+            playwright.expect(part(page, "verdict")).to_have_text(
+                "too light to check whether the pattern is to be believed"
+            )
+            playwright.expect(number(page, "trusted")).to_have_text("too light to check")
             word(page, "contact")
             assert red_share(page) < 0.01
     with live_page(tmp_path) as shown, shown.playing():

@@ -48,12 +48,12 @@ class TestDemo:
             run.send_signal(signal.SIGINT)
             word(page, "run ended")
             playwright.expect(page.locator("#trouble")).to_contain_text(
-                re.compile(r"^the run has ended \(.*\): what is shown is old; ")
+                re.compile(r"^the run has ended \(.*\): the values shown are old; ")
             )
             assert part(page, "field").get_attribute("data-live") == "no"
             playwright.expect(part(page, "stamp")).to_contain_text("last contact")
             page.keyboard.press("r")
-            logged(page, "not done: there is no connection")
+            logged(page, "command not sent: no connection")
             assert page.locator("#log").get_by_text("earlier taps forgotten").count() == 0
 
     def test_the_next_run_is_found_and_nothing_of_the_one_before_kept(self, open_page):
@@ -64,7 +64,7 @@ class TestDemo:
             page.keyboard.press("Space")
         port = re.search(r":(\d+)/", run.url)[1]
         with edge_sr("--source", "demo:loop", "--view", port, "--view-token", TOKEN):
-            logged(page, "another run has begun")
+            logged(page, "a new run has begun")
             page.wait_for_selector(".sensor:not(#first)")
             assert page.locator("#first").count() == 0
             playwright.expect(page.locator("#pause")).to_have_attribute("aria-pressed", "false")
@@ -78,7 +78,7 @@ class TestDemo:
                 socket = full.enter_context(connect(f"ws{run.url[4:].replace('?', 'ws?')}", max_queue=None))
                 socket.send('{"cmd": "pause", "on": true}')
             page.goto(run.url)
-            playwright.expect(trouble).to_contain_text(f"{MOST_VIEWERS} look already")
+            playwright.expect(trouble).to_contain_text(f"too many viewers ({MOST_VIEWERS})")
             socket.close()
             page.wait_for_selector(".sensor")
             playwright.expect(trouble).to_be_hidden()

@@ -112,16 +112,17 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
         port = taken.getsockname()[1]
         assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
     assert capsys.readouterr().err == (
-        f"edge-sr: no live page: port {port} of 127.0.0.1 is in use; name another with --view, or 0 for any free one\n"
+        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: address in use; "
+        "name another port with --view, or 0 for any free one\n"
     )
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--view-host", "0.0.0.0"], "--view-host is of the live page, which was not asked for: add --view"),
-        (["--view-token", "x" * 20], "--view-token is of the live page"),
-        (["--view-record-dir", "."], "--view-record-dir is of the live page"),
+        (["--view-host", "0.0.0.0"], "--view-host requires --view"),
+        (["--view-token", "x" * 20], "--view-token requires --view"),
+        (["--view-record-dir", "."], "--view-record-dir requires --view"),
         (
             ["--view", "0", "--view-record-dir", "/dev/null"],
             "--view-record-dir /dev/null: expected a folder that may be",

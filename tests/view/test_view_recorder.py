@@ -14,7 +14,7 @@ from edge.pipeline.commands import Command, Commands, obey
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
-from edge.view.viewer_commands import hear
+from edge.view.viewer_commands import execute
 from edge.view.viewer_state import Viewer
 from firmware_bridge.recording.formats import load_recording
 
@@ -202,7 +202,7 @@ class TestRecorder:
             zero = reset
 
         asked = Commands()
-        hear('{"cmd": "record", "on": true}', Viewer(), asked)
+        execute('{"cmd": "record", "on": true}', Viewer(), asked)
         obey(asked, Untouched())
 
     def test_commands_to_record_are_done_and_the_others_handed_on(self, tmp_path):
@@ -210,7 +210,7 @@ class TestRecorder:
         commands = Commands()
         commands.record = recorder.record
         for message in ({"cmd": "zero"}, {"cmd": "record", "on": True}, {"cmd": "reset"}, {"cmd": "jump"}):
-            hear(json.dumps(message), Viewer(), commands)
+            execute(json.dumps(message), Viewer(), commands)
         assert recorder.path is None  # not before the loop asks
         assert list(commands.poll()) == [Command("zero"), Command("reset")]
         wait_for(lambda: recorder.wait() or recorder.path is not None)

@@ -111,14 +111,15 @@ class TestPage:
 
     def test_a_port_in_use_is_one_line(self, page, tmp_path):
         words = (
-            rf"no live page: port {page.port} of 127.0.0.1 is in use; name another with --view, or 0 for any free one"
+            rf"no live page: cannot listen on 127.0.0.1:{page.port}: address in use; "
+            "name another port with --view, or 0 for any free one"
         )
         with pytest.raises(SinkError, match=words):
             LiveView("127.0.0.1", page.port, None, tmp_path, CONTRACT, Commands())
 
     @pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
     def test_an_address_that_is_not_ours_is_one_line(self, tmp_path, host):
-        with pytest.raises(SinkError, match=rf"no live page: {host} is no address of this machine; name one with"):
+        with pytest.raises(SinkError, match=rf"no live page: {host} is not an address of this machine; name one with"):
             LiveView(host, 0, None, tmp_path, CONTRACT, Commands())
 
 
@@ -212,7 +213,7 @@ class TestCommands:
         with page.viewer() as viewer, page.viewer() as other:
             viewer.send('{"cmd": "jump"}')
             answer = frame(viewer, "event")[0]
-            assert answer["event"] == "refused" and "is no command: expected" in answer["note"]
+            assert answer["event"] == "refused" and "is not a command: expected" in answer["note"]
             for sink in page.view.sinks:
                 sink.tell(Event(1, "lost", None, "gone"), {})
             assert frame(other, "event")[0]["event"] == "lost"

@@ -5,7 +5,6 @@ FRAMES frames to its end, so that readings and truth are available at any lower 
 of the press, readings at 0 are zero, and values between frames are interpolated linearly.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_reader import read_npz
+from train.data.array_file import MOST_FACTS_BYTES, Axes, arrays_sha256, check_axes, write_arrays
 from train.errors import DatasetError
 from train.physics.resample import resample, resample_touching
 from train.physics.sensor_noise import Nuisances, Seed, read_windows
@@ -25,10 +24,8 @@ from train.physics.simulated_sensor import FINE_SCALE, FRAMES
 SCHEMA: Final = "tactile-edge-sr sequences"
 VERSION: Final = 1
 
-_MOST_FACTS_BYTES: Final = 1 << 22
-"""Largest configuration read, in bytes; real ones take a few kB."""
 _RESAMPLED_AT_ONCE: Final = 256
-_AXES: Final[Mapping[str, tuple[str, str]]] = {
+_AXES: Final[Axes] = {
     "surfaces": ("U", "n"),
     "poses": ("float64", "nk3"),
     "counts": ("float32", "nkf3rc"),
@@ -37,7 +34,6 @@ _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "unit_patterns": ("float16", "nlhw"),
     "touching": ("bool", "nlhw"),
 }
-"""Type and axes of each array; a letter is the same length everywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +148,7 @@ class Sequences:
 
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""
-        digest = hashlib.sha256(json.dumps([self.scale, self.seed, self.config], sort_keys=True).encode())
-        for name in _AXES:
-            array = np.ascontiguousarray(getattr(self, name))
-            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-            digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
-        return digest.hexdigest()
+        return arrays_sha256([self.scale, self.seed, self.config], {name: getattr(self, name) for name in _AXES})
 
     def save(self, path: Path) -> None:
         """Write the sequences as one npz, atomically.
@@ -168,16 +159,7 @@ class Sequences:
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = {"scale": self.scale, "seed": self.seed, "config": self.config, "sha256": self.sha256()}
-
-        def write(draft: Path) -> None:
-            with draft.open("wb") as file:
-                np.savez(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=json.dumps(facts), **arrays)
-
-        try:
-            # Only the facts are read back: reading all arrays would need as much memory again.
-            write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], _MOST_FACTS_BYTES), keep_before=False)
-        except OSError as error:
-            raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
+        write_arrays(path, SCHEMA, VERSION, facts, arrays)
 
 
 def load_sequences(path: Path) -> Sequences:
@@ -187,28 +169,30 @@ def load_sequences(path: Path) -> Sequences:
         DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
     """
     try:
-        about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
+        about = read_npz(path, ("schema", "version", "facts"), MOST_FACTS_BYTES)
         if str(about.get("schema")) != SCHEMA:
-            raise DatasetError(f"{path} is no file of sequences: make one with 'python -m train.generate'")
+            raise DatasetError(f"{path} is not a file of sequences: make one with 'python -m train.generate'")
         if (version := int(about["version"])) > VERSION:
             raise DatasetError(f"{path} has schema version {version}, newer than {VERSION}: update this program")
         facts: Any = json.loads(str(about["facts"]))
         found = read_npz(path, _AXES, path.stat().st_size)  # nothing in it is compressed
         arrays = {name: found[name] for name in _AXES}
         arrays["touching"] = _unpacked(arrays["touching"], arrays["unit_patterns"])
-        told: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
+        stated: dict[str, Any] = {name: facts.get(name) for name in ("scale", "seed", "config")}
         hashed = str(facts.get("sha256"))[:64]
     except DatasetError:
         raise
     except FileNotFoundError:
         raise DatasetError(f"{path}: no such file; make one with 'python -m train.generate {path}'") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise DatasetError(f"{path} is no file of sequences, or a damaged one ({error}): make it again") from error
-    _check_axes(path, arrays)
-    loaded = Sequences(**arrays, **told)
+        raise DatasetError(f"{path} is not a file of sequences, or a damaged one ({error}): make it again") from error
+    maps = check_axes(path, _AXES, arrays, f=FRAMES)["l"]
+    if maps not in (1, FRAMES):
+        raise DatasetError(f"{path}: {maps} maps for a press, expected 1 or {FRAMES}")
+    loaded = Sequences(**arrays, **stated)
     if (found := loaded.sha256()) != hashed:
-        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it says {hashed}: make it again")
-    _check_facts(path, told)
+        raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed}: make it again")
+    _check_facts(path, stated)
     return loaded
 
 
@@ -290,7 +274,7 @@ def _unpacked(touching: NDArray[np.uint8], patterns: NDArray[np.float16]) -> NDA
     if not patterns.ndim:
         raise ValueError("unit_patterns has no axes")
     if touching.ndim != patterns.ndim or touching.shape[-1] != -(-patterns.shape[-1] // 8):
-        raise ValueError(f"touching is {touching.shape}, which is no mask of {patterns.shape}")
+        raise ValueError(f"touching is {touching.shape}, which is not a mask of {patterns.shape}")
     return np.unpackbits(touching, axis=-1, count=patterns.shape[-1]).astype(bool)
 
 
@@ -298,17 +282,3 @@ def _check_facts(path: Path, facts: Mapping[str, Any]) -> None:
     kinds = {"scale": int, "seed": int, "config": dict}
     if not all(type(facts.get(name)) is kind for name, kind in kinds.items()) or facts["scale"] < 1:
         raise DatasetError(f"{path}: scale, seed or config is missing or of another type: make it again")
-
-
-def _check_axes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    lengths = {"f": FRAMES, "3": 3}
-    for name, (kind, axes) in _AXES.items():
-        array = arrays[name]
-        fits = array.ndim == len(axes) and (array.dtype.kind == kind if kind == "U" else array.dtype == kind)
-        if not fits or any(
-            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
-        ):
-            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
-            raise DatasetError(f"{path}: {name} is {array.dtype} {array.shape}, expected {kind} ({expected})")
-    if lengths["l"] not in (1, FRAMES):
-        raise DatasetError(f"{path}: {lengths['l']} maps for a press, expected 1 or {FRAMES}")

@@ -20,7 +20,7 @@ def load_taps(paths: Sequence[Path]) -> PressSet | Sequences:
     presses = [_holds_presses(path) for path in paths]
     if any(presses) and not all(presses):
         names = " and ".join(str(path) for path, yes in zip(paths, presses, strict=True) if not yes)
-        raise DatasetError(f"{names} of train.generate beside presses: train on files of one kind")
+        raise DatasetError(f"{names}: made by train.generate, the others are presses: train on files of one kind")
     if all(presses):
         return join_presses([load_presses(path) for path in paths])
     return join([load_sequences(path) for path in paths])

@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m train.data.frozen_presses", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
+    parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="file of train.data.make_presses")
     parser.add_argument("out", type=Path, metavar="OUT.npz")
     options = parser.parse_args(arguments)
     try:

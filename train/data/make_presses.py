@@ -1,4 +1,4 @@
-"""Make a set of presses on all cores; a run that was cut short goes on where it was.
+"""Make a set of presses on all cores; an interrupted run continues.
 
     python -m train.data.make_presses data/gripped.npz --count 24000
     python -m train.data.make_presses data/parts.npz --mesh part.stl --count 2000
@@ -47,7 +47,7 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
     facts = world.facts()
     if path.exists():
         if (there := load_presses(path)).config != facts:
-            raise DatasetError(f"{path} is there and was made otherwise: delete it, or write to another file")
+            raise DatasetError(f"{path} exists and was made with other settings: delete it, or write to another file")
         return there
     folder = path.with_name(path.name + ".parts")
     try:
@@ -65,7 +65,7 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
                 bar.advance()
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
     if any(part.config != facts for part in parts):
-        raise DatasetError(f"{folder} holds parts that were made otherwise: delete it")
+        raise DatasetError(f"{folder} holds parts that were made with other settings: delete it")
     if not any(len(part) for part in parts):
         raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
     made = replace(join_presses(parts), config=facts)
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"train.data.make_presses: {error}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("train.data.make_presses: interrupted; the same command goes on from here\n")
+        sys.stderr.write("train.data.make_presses: interrupted; the same command continues\n")
         return _INTERRUPTED
     rate = len(made) * made.taps / (time.monotonic() - started_s)
     sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
@@ -126,22 +126,24 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m train.data.make_presses", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("out", type=Path, metavar="OUT.npz")
-    parser.add_argument("--count", type=int, default=24_000, help="sequences (24000)")
-    parser.add_argument("--taps", type=int, default=1, help="presses in each, turned by 5 degrees (1)")
-    parser.add_argument("--per-pad", type=int, default=24, help="sequences of one pad (24)")
+    parser.add_argument("--count", type=int, default=24_000, help="number of sequences (24000)")
+    parser.add_argument("--taps", type=int, default=1, help="presses in each sequence, turned by 5 degrees (1)")
+    parser.add_argument("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     parser.add_argument(
         "--families",
         default="all",
-        help=f"all; even, as many of each; figures; none; or names with commas: {', '.join(SHARES)} (all)",
+        help=f"all; even (equally many of each); figures; none; or names with commas: {', '.join(SHARES)} (all)",
     )
     parser.add_argument(
-        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="an STL, OBJ or PLY to add"
+        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add"
     )
     parser.add_argument("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
-    parser.add_argument("--spread", type=float, default=1.0, help="of the pads' constants; 0: the nominal pad (1)")
-    parser.add_argument("--seed", type=int, default=1, help="of pads, shapes and drags (1)")
-    parser.add_argument("--jobs", type=int, default=-1, help="processes, -1 for one on each core (-1)")
-    parser.add_argument("--compress", action="store_true", help="a smaller file, slower to write")
+    parser.add_argument(
+        "--spread", type=float, default=1.0, help="spread of the pads' constants; 0: the nominal pad (1)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of pads, shapes and drags (1)")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
+    parser.add_argument("--compress", action="store_true", help="write a smaller file, more slowly")
     return parser
 
 

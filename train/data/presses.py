@@ -1,9 +1,8 @@
 """Presses to train and evaluate on, with the constants of each pad, as one npz file with a hash."""
 
-import contextlib
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -12,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.recording.npz_reader import read_npz
+from train.data.array_file import MOST_FACTS_BYTES, Axes, arrays_sha256, check_axes, write_arrays
 from train.errors import DatasetError
 
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 2
 """Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets."""
-_MOST_FACTS_BYTES: Final = 1 << 22
-_AXES: Final[Mapping[str, tuple[str, str]]] = {
+_MOST_BYTES: Final = 1 << 33
+_AXES: Final[Axes] = {
     "family": ("U", "n"),
     "pad": ("int64", "n"),
     "constants": ("float32", "np"),
@@ -31,7 +31,6 @@ _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "twist_nmm": ("float32", "n"),
     "indentation_mm": ("float32", "n"),
 }
-"""Type and axes of each array; a letter is the same length everywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +85,7 @@ class PressSet:
 
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""
-        digest = hashlib.sha256(json.dumps(self.config, sort_keys=True).encode())
-        for name in _AXES:
-            array = np.ascontiguousarray(getattr(self, name))
-            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-            digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
-        return digest.hexdigest()
+        return arrays_sha256(self.config, {name: getattr(self, name) for name in _AXES})
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
         """Write the presses as one npz, atomically.
@@ -101,38 +95,30 @@ class PressSet:
         """
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
-        facts = json.dumps({"config": self.config, "sha256": self.sha256()})
-        draft = path.with_name(path.name + ".draft")
-        write = np.savez_compressed if compressed else np.savez
-        try:
+        facts = {"config": self.config, "sha256": self.sha256()}
+        with suppress(OSError):  # the writing reports it
             path.parent.mkdir(parents=True, exist_ok=True)
-            with draft.open("wb") as file:
-                write(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
-            draft.replace(path)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                draft.unlink()
-            raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
+        write_arrays(path, SCHEMA, VERSION, facts, arrays, compressed=compressed)
 
 
-def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
+def load_presses(path: Path) -> PressSet:
     """Load a file that `PressSet.save` has written.
 
     Raises:
         DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
     """
     try:
-        about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
+        about = read_npz(path, ("schema", "version", "facts"), MOST_FACTS_BYTES)
         if str(about["schema"]) != SCHEMA or int(about["version"]) > VERSION:
             raise DatasetError(
                 f"{path} is {str(about['schema'])[:60]!r} of version {about['version']}, expected {SCHEMA!r} of "
                 f"at most {VERSION}: make it with 'python -m train.data.make_presses'"
             )
         facts: Any = json.loads(str(about["facts"]))
-        arrays = dict(read_npz(path, _AXES, most_bytes))
+        arrays = dict(read_npz(path, _AXES, _MOST_BYTES))
         width = arrays["patterns"].shape[-1]
         arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
-        _check_axes(path, arrays)
+        check_axes(path, _AXES, arrays)
         loaded = PressSet(**arrays, config=facts["config"])
         hashed = str(facts["sha256"])
     except FileNotFoundError:
@@ -140,7 +126,7 @@ def load_presses(path: Path, most_bytes: int = 1 << 33) -> PressSet:
     except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         if isinstance(error, DatasetError):
             raise
-        raise DatasetError(f"{path} is no file of presses, or a damaged one ({error}): make it again") from error
+        raise DatasetError(f"{path} is not a file of presses, or a damaged one ({error}): make it again") from error
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
     return loaded
@@ -163,15 +149,3 @@ def join_presses(parts: Sequence[PressSet]) -> PressSet:
     arrays = {name: np.concatenate([getattr(part, name) for part in padded]) for name in _AXES}
     arrays["pad"] = np.concatenate(pads)
     return PressSet(**arrays, config={"parts": [part.config for part in parts]} if len(parts) > 1 else parts[0].config)
-
-
-def _check_axes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    lengths = {"3": 3}
-    for name, (kind, axes) in _AXES.items():
-        array = arrays[name]
-        fits = array.ndim == len(axes) and (array.dtype.kind == kind if kind == "U" else array.dtype == kind)
-        if not fits or any(
-            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
-        ):
-            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
-            raise DatasetError(f"{path}: {name} is {array.dtype} {array.shape}, expected {kind} ({expected})")

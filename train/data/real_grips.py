@@ -126,11 +126,11 @@ def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def linear_from_others(fitted_on: NDArray[np.floating], z: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return each taxel of z (n, taxels) from the others, by least squares over the rows of `fitted_on` (m, taxels)."""
-    said = np.empty_like(z)
+    estimates = np.empty_like(z)
     for taxel in range(_TAXELS):
         others = np.arange(_TAXELS) != taxel
-        said[:, taxel] = z[:, others] @ fit_linear_map(fitted_on[:, others], fitted_on[:, [taxel]])[:, 0]
-    return said
+        estimates[:, taxel] = z[:, others] @ fit_linear_map(fitted_on[:, others], fitted_on[:, [taxel]])[:, 0]
+    return estimates
 
 
 def from_other_trials(trials: Sequence[str], z: Sequence[NDArray[np.floating]]) -> list[NDArray[np.floating]]:

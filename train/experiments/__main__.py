@@ -17,28 +17,28 @@ from train.errors import TrainError
 from train.experiments.support.workbench import Workbench
 
 EXPERIMENTS: Final = {
-    "families": "the shipped model on every family of shapes, beside baselines",
+    "families": "the shipped model on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
-    "trained_out": "the paper's networks and compact ones, trained alike for many epochs",
+    "trained_out": "the paper's and compact networks, trained for many epochs",
     "table4": "STSR at five scales",
     "angle": "MTSR-2 by angle between its taps",
     "taps": "one to seven taps",
-    "bound": "what taps can tell at best",
+    "bound": "the least error that taps allow",
     "force": "error by contact force",
     "force-recovery": "force through press, hold and release",
     "unseen": "surfaces that were not trained on",
-    "real": "real grips: are faces drawn as faces, and do patterns explain readings",
+    "real": "real grips: shape of faces, patterns against readings",
     "robust": "error against the severity of nuisances",
-    "dead": "dead taxels, found and unfound",
+    "dead": "dead taxels, detected and undetected",
     "gains-from-contacts": "gains and constants of a sensor from its own contacts",
-    "zeroing": "drift followed, holds not eaten",
-    "calibration": "how true the deviations are",
-    "confidence": "expected error and early stop against what came out",
+    "zeroing": "drift followed, holds not absorbed",
+    "calibration": "coverage of the deviations",
+    "confidence": "expected error and early stop against true error",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
-    "free_sides": "the pad with its free sides by FEM against the infinite layer",
+    "free_sides": "the pad's free sides by FEM against the infinite layer",
     "curved": "several PSFs by height against FEM",
     "psf_speed": "patterns a second of the PSF by FFT and direct",
 }
@@ -62,23 +62,25 @@ def main(arguments: list[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="\n".join(f"  {name:19} {what}" for name, what in EXPERIMENTS.items()),
     )
-    parser.add_argument("names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="which, in this order")
-    parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
-    parser.add_argument("--data", type=Path, default=Path("data"), help="datasets, made where they lack")
     parser.add_argument(
-        "--checkpoints", type=Path, default=Path("checkpoints"), help="networks, trained where they lack"
+        "names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="experiments, run in this order"
     )
-    parser.add_argument("--quick", action="store_true", help="everything tiny, to see that it runs")
+    parser.add_argument("--reports", type=Path, default=Path("reports"), help="where to write (default: reports)")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets; missing ones are made")
+    parser.add_argument(
+        "--checkpoints", type=Path, default=Path("checkpoints"), help="folder of the networks; missing ones are trained"
+    )
+    parser.add_argument("--quick", action="store_true", help="use tiny settings, as a test of the command")
     parser.add_argument(
         "--found",
         action="store_true",
-        help="trained_out: judge the networks that are there, trained on any machine, and leave out the others",
+        help="trained_out: evaluate the networks in --checkpoints, trained on any machine, and leave out missing ones",
     )
     parser.add_argument(
         "--models", type=Path, default=BUNDLE_DIR, help="folder of the shipped models (default: the bundled ones)"
     )
     parser.add_argument(
-        "--before", type=Path, metavar="FILE", help="pads: a model of an earlier release, to be put beside the shipped"
+        "--before", type=Path, metavar="FILE", help="pads: model of an earlier release, to compare with the shipped one"
     )
     options = parser.parse_args(arguments)
     bench = Workbench(options.data, options.checkpoints, options.quick, options.found, options.models, options.before)
@@ -90,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
     except (TrainError, EdgeError) as error:
         sys.exit(f"experiments: {error}")
     except KeyboardInterrupt:
-        sys.exit("experiments: stopped; the same command goes on where it was")
+        sys.exit("experiments: stopped; the same command continues")
 
 
 if __name__ == "__main__":

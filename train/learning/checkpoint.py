@@ -130,7 +130,7 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
         "device": device_name(device),
         "processes": world,
         "threads": torch.get_num_threads(),
-        **_judged(net, validation),
+        **_evaluated(net, validation),
     }
     if rank == 0:
         # The report is written last, so that it never describes weights that do not exist.
@@ -171,7 +171,7 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
         net.load_state_dict(torch.load(path, weights_only=True))
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise CheckpointError(f"{path} and {path.stem}.json are no checkpoint of train.fit: {reason}") from error
+        raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {reason}") from error
     return net.eval(), report
 
 
@@ -227,7 +227,7 @@ def _psnr(net: PatternNet, validation: FrozenSet) -> float:
     return float(psnr_db(patterns, validation.patterns(), validation.full_scale_mm).mean())
 
 
-def _judged(net: PatternNet, validation: FrozenSet) -> Mapping[str, float]:
+def _evaluated(net: PatternNet, validation: FrozenSet) -> Mapping[str, float]:
     """Return figures on the validation set, and set the factor of the deviations."""
     patterns, deviations = infer(net, validation.windows(net.taps))
     truth, full_scale = validation.patterns(), validation.full_scale_mm

@@ -91,7 +91,7 @@ def load_mixture(path: Path) -> ContactMixture:
         if mixture.means.shape[1:] != (1 + len(INPUTS), CHANNELS):
             raise ValueError(f"means are {mixture.means.shape}")
     except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path} is no mixture of contacts ({error}): delete it, it is made again") from error
+        raise DatasetError(f"{path} is not a mixture of contacts ({error}): delete it, it is made again") from error
     return mixture
 
 

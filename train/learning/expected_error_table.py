@@ -53,7 +53,7 @@ def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np
     for window, truth in zip(frozen.windows(contract.taps, given), frozen.patterns(), strict=True):
         pattern, deviation = model.run(contract.scale_window(window)), model.deviation
         if deviation is None:
-            raise ValueError(f"model '{model.name}' gives no deviation: there is nothing to be told of its errors")
+            raise ValueError(f"model '{model.name}' gives no deviation, so its error cannot be predicted")
         about, size = doubt(pattern, deviation)
         rows.append((about, float(np.sqrt(np.mean((pattern - truth) ** 2))), size))
     return np.array(rows).T

@@ -67,7 +67,7 @@ class Estimate:
         return _LEVEL_90 * self.deviations
 
     @property
-    def told(self) -> NDArray[np.bool_]:
+    def determined(self) -> NDArray[np.bool_]:
         """True for constants (p,) that contacts determine: well within the prior, and not at an end of the range."""
         return (self.deviations[CHANNELS:] < _TOLD * CONSTANT_SPREAD) & (np.abs(self.constants) < 1)
 

@@ -337,10 +337,12 @@ class _Keeper:
             state = torch.load(self._path, map_location=device, weights_only=True)
         except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
             reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise NotResumableError(f"{self._path} is no state of a run ({reason}): delete it to start anew") from error
+            raise NotResumableError(
+                f"{self._path} is not a run's state ({reason}): delete it to start again"
+            ) from error
         if not isinstance(state, dict) or state.get("recipe") != self._hash:
             raise NotResumableError(
-                f"{self._path} is of a run with another recipe or on other data: delete it to start anew"
+                f"{self._path} is of a run with another recipe or on other data: delete it to start again"
             )
         for name, part in self._parts.items():
             part.load_state_dict(state[name])

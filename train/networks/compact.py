@@ -59,7 +59,7 @@ class CompactNet(PatternNet):
         scale: pattern pixels per taxel pitch, even.
         channels: of the trunk, a multiple of the symmetries.
         blocks: residual blocks of the trunk.
-        known: numbers that say what is known of the pad, see train.physics.pad_draws.
+        known: numbers that say constants of the pad, see train.physics.pad_draws.
         group: symmetries. Mirror images are those of one tap alone: a mirrored pad is turned the other way from tap to
             tap. At the same work quarter turns leave twice the free numbers, and training mirrors windows instead.
 
@@ -231,5 +231,5 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta
     size = truth_size(truth)
     error = (pattern.detach() - truth).abs() / size
     spread = deviation / sqrt(2) / size + _LEAST_SHARE
-    misjudged = spread.detach().pow(beta) * (spread.log() + error / spread)
-    return relative_rms_error(pattern, truth) + misjudged.mean()
+    uncertainty_error = spread.detach().pow(beta) * (spread.log() + error / spread)
+    return relative_rms_error(pattern, truth) + uncertainty_error.mean()

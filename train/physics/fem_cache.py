@@ -34,9 +34,9 @@ class Mesh(NamedTuple):
 
 
 FINEST: Final = Mesh(10, 8)
-REFEREE_POISSON: Final = 0.495
+"""Mesh whose nodes are the pixels of the 40 x 40 pattern."""
+REFERENCE_POISSON: Final = 0.495
 """Poisson's ratio of rubber. The layer's own value is lower to account for free sides, which the elements have."""
-"""The nodes of FINEST are the pixels of the 40 x 40 pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def relief(surface: str) -> Relief:
     return Relief(surface, surface_mesh(surface))
 
 
-LAYER: Final = replace(Layer(), poisson=REFEREE_POISSON)
+LAYER: Final = replace(Layer(), poisson=REFERENCE_POISSON)
 """Layer of the pad as it is modelled by the finite elements."""
 _FIGURES: Final = ("force_n", "newton_steps", "residual", "run_s")
 

@@ -27,7 +27,8 @@ from train.physics.mooney_rivlin import C2_SHARE, MooneyRivlin
 try:
     import felupe
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(f"the FEM referee needs felupe (GPL): {how_to_install('fem')}", name="felupe") from error
+    message = f"the FEM reference needs felupe (GPL): {how_to_install('fem')}"
+    raise ModuleNotFoundError(message, name="felupe") from error
 
 _RESIDUAL: Final = 1e-6
 """Out-of-balance forces at which a step is done, as a share of the reactions."""

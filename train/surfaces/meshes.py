@@ -79,9 +79,9 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     if len(faces) > MAX_TRIANGLES:
         raise MeshError(f"{path}: {len(faces)} triangles; at most {MAX_TRIANGLES} are taken: reduce the mesh")
     if faces.min() < 0 or faces.max() >= len(corners):
-        raise MeshError(f"{path}: broken: triangles name corners outside the {len(corners)} there are; save it anew")
+        raise MeshError(f"{path}: broken: triangles name corners outside the {len(corners)} there are; save it again")
     if bad := int((~np.isfinite(corners[faces]).all(axis=(1, 2))).sum()):
-        raise MeshError(f"{path}: {bad} of {len(faces)} triangles have corners that are no finite number; repair it")
+        raise MeshError(f"{path}: {bad} of {len(faces)} triangles have corners that are not finite numbers; repair it")
     return corners, faces
 
 
@@ -98,7 +98,7 @@ def _parse(path: Path, content: bytes, suffix: str) -> tuple[NDArray[np.float64]
             faces.append(np.asarray(getattr(body, "faces", faces[0]), dtype=np.int64).reshape(-1, 3) + count)
             count += len(corners[-1])
     except Exception as error:  # a parser raises any exception on a broken file, and each means that the file is broken
-        raise MeshError(f"{path}: no {suffix[1:].upper()} file, or one cut short or broken; save it anew") from error
+        raise MeshError(f"{path}: no {suffix[1:].upper()} file, or one cut short or broken; save it again") from error
     return np.concatenate(corners), np.concatenate(faces)
 
 

@@ -118,16 +118,16 @@ def image_map(data: bytes) -> NDArray[np.float32]:
     """Return the map (H, W), or (3, H, W), in an Image that `image` made.
 
     Raises:
-        CdrError: it is no Image.
+        CdrError: it is not an Image.
         ValueError: the Image is of another encoding or byte order.
     """
-    said = IMAGE.decode(data)
-    if said["encoding"] not in ("32FC1", "32FC3") or said["is_bigendian"]:
-        raise ValueError(f"an image of encoding {said['encoding'][:20]!r}, expected 32FC1 or 32FC3, little-endian")
-    pixels = said["data"].view("<f4")
-    if said["encoding"] == "32FC1":
-        return pixels.reshape(said["height"], said["width"])
-    return pixels.reshape(said["height"], said["width"], 3).transpose(2, 0, 1)
+    image = IMAGE.decode(data)
+    if image["encoding"] not in ("32FC1", "32FC3") or image["is_bigendian"]:
+        raise ValueError(f"an image of encoding {image['encoding'][:20]!r}, expected 32FC1 or 32FC3, little-endian")
+    pixels = image["data"].view("<f4")
+    if image["encoding"] == "32FC1":
+        return pixels.reshape(image["height"], image["width"])
+    return pixels.reshape(image["height"], image["width"], 3).transpose(2, 0, 1)
 
 
 def wrench(result: Result, unix_ns: int) -> bytes | None:

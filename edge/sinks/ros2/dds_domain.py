@@ -39,7 +39,9 @@ def configuration(environment: Mapping[str, str]) -> str:
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
     if reach == "OFF":
-        raise UsageError("ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so that nobody finds us: set it to LOCALHOST or SUBNET")
+        raise UsageError(
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, which hides edge-sr from other nodes: set it to LOCALHOST or SUBNET"
+        )
     general = ""
     if reach == "LOCALHOST":
         general, peers = f"{_LOOPBACK}<AllowMulticast>false</AllowMulticast>", ["localhost", *peers]

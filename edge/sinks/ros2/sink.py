@@ -243,9 +243,9 @@ class Ros2Sink(Sink):
         for name, sensor in self._sensors.items():
             trouble = "; ".join(sensor.trouble.values()) or None
             silence_s = (now_ns - sensor.last.scan.time_ns) / 1e9 if self._of_now else None
-            said = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
-            said = Diagnosis(Level.STALE, "ended", said.values) if ended else said
-            statuses.append((f"{self._base}: {name}", name, said))
+            diagnosis = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
+            diagnosis = Diagnosis(Level.STALE, "ended", diagnosis.values) if ended else diagnosis
+            statuses.append((f"{self._base}: {name}", name, diagnosis))
         self._counters_before = self._counters
         self._publish(self._diagnostics, diagnostics_message(statuses, now_ns + self._unix_offset_ns))
 

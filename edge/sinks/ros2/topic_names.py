@@ -21,8 +21,8 @@ def base_topic(text: str) -> str:
     topic = text.removeprefix("/")
     if not all(_ALLOWED.fullmatch(token) for token in topic.split("/")):
         raise UsageError(
-            f"topic {text!r} is none of ROS: expected letters, digits and _ between single slashes, no digit first, "
-            "such as ros2:skin or ros2:/gripper/skin"
+            f"topic {text!r} is not a ROS topic: expected letters, digits and _ between single slashes, no digit "
+            "first, such as ros2:skin or ros2:/gripper/skin"
         )
     return topic
 

@@ -46,7 +46,7 @@ const REFUSED = [403, 503]; // access refused; too many viewers
 
 class Link {
   constructor({ onFrame, onChange }) {
-    Object.assign(this, { onFrame, onChange, socket: null, up: false, tries: 0, timer: 0, heardS: nowS(), nextS: null, ended: false, why: null });
+    Object.assign(this, { onFrame, onChange, socket: null, up: false, tries: 0, timer: 0, receivedS: nowS(), nextS: null, ended: false, why: null });
     const token = takeToken();
     this.path = token === null ? "/ws" : `/ws?token=${encodeURIComponent(token)}`;
   }
@@ -57,16 +57,16 @@ class Link {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}${this.path}`);
     socket.binaryType = "arraybuffer";
-    socket.onmessage = ({ data }) => this.hear(socket, data);
+    socket.onmessage = ({ data }) => this.take(socket, data);
     socket.onclose = (event) => this.lose(socket, event.code);
-    this.heardS = nowS();
+    this.receivedS = nowS();
     this.socket = socket;
     this.onChange();
   }
 
-  hear(socket, data) {
+  take(socket, data) {
     if (socket !== this.socket || typeof data === "string") return;
-    this.heardS = nowS();
+    this.receivedS = nowS();
     if (!this.up) {
       this.up = true; // set first, because the handler of the first frame may send an answer
       this.tries = 0;
@@ -103,7 +103,7 @@ class Link {
 
   /** Drop a silent socket: a program that sends nothing is gone, even if the socket still looks open. */
   look() {
-    if (this.socket === null || nowS() - this.heardS < SILENT_S) return;
+    if (this.socket === null || nowS() - this.receivedS < SILENT_S) return;
     const socket = this.socket;
     this.lose(socket);
     socket.close();

@@ -61,26 +61,6 @@ function thumb(tap) {
   return item;
 }
 
-// ---- Numbers of a sensor ----
-
-const NUMBERS = {
-  Touch: [
-    ["force", "force", "big"], ["area", "area", "big"], ["centre", "centroid_mm"], ["taps used", "taps_used"], ["another tap", "another_tap"],
-  ],
-  Wrench: [
-    ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure at", "centre_of_pressure_mm"],
-    ["sensitivity", "wrench_origin"],
-  ],
-  Doubt: [
-    ["to be believed", "trusted"], ["mismatch", "mismatch"], ["tap mismatch", "tap_mismatch"], ["90 % within", "interval_mm"],
-    ["expected RMSE", "expected_rmse_mm"],
-  ],
-  Pace: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["pattern", "reused_from"], ["model", "model"]],
-  Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
-  Baseline: [["which", "baseline"], ["from", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["own, step", "own"]],
-};
-const LOSSES = new Set(["dropped", "missed", "late", "torn_wire", "unwritten"]);
-const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand" };
 const SCALE_BARS_MM = [50, 20, 10, 5, 2, 1, 0.5];
 const LEAST_COUNTS = 200; // so that noise at rest stays dark
 const LEAST_SHEAR_COUNTS = 100;
@@ -88,26 +68,3 @@ const LEAST_MM = 0.02;
 const LEAST_DEVIATION_MM = 0.01;
 const FRESH_S = 0.3;
 const SHEAR_SHARE = 0.4; // length of the arrow of a force that is all shear, as a share of the pattern's width
-
-const TOO_LIGHT = "too light to tell";
-
-/** Return the texts of the numbers by which a pattern is believed or not; `checks`: whether the model has any. */
-function trustTexts({ state, trusted, untrusted_reason: reason, mismatch, tap_mismatch: taps }, checks) {
-  const unknown = state !== "contact" ? "\u2013" : checks ? TOO_LIGHT : "not checked";
-  return {
-    trusted: trusted === true ? "yes" : trusted === false ? `no: ${reason}` : unknown,
-    mismatch: percent(mismatch),
-    tap_mismatch: taps?.length ? taps.map((share) => number(share, 2)).join(", ") : "\u2013",
-  };
-}
-
-function wrenchTexts({ wrench, wrench_origin: origin }) {
-  const list = (values, decimals, unit) => (values ? `${values.map((value) => number(value, decimals)).join(", ")}${THIN}${unit}` : "\u2013");
-  return {
-    wrench_force: list(wrench?.force_n, 2, "N"),
-    wrench_torque: list(wrench?.torque_n_mm.slice(0, 2), 1, "N\u00a0mm"),
-    wrench_twist: amount(wrench?.torque_n_mm[2], 1, "N\u00a0mm"),
-    centre_of_pressure_mm: list(wrench?.centre_of_pressure_mm, 1, "mm"),
-    wrench_origin: origin ?? "\u2013",
-  };
-}

@@ -26,7 +26,7 @@ const page = {
   hello: null,
   sensors: new Map(),
   state: { recording: false },
-  told: 0, // number of the run's latest event that is in the log
+  eventNumber: 0, // number of the run's latest event that is in the log
   paused: false,
   pausedS: 0,
   auto: memory.get("scale") === "auto",
@@ -48,7 +48,7 @@ function log(what, { key = what, bad = false, ageS = 0 } = {}) {
   const first = list.firstElementChild;
   if (first?.dataset.key === key) {
     first.dataset.times = String(Number(first.dataset.times) + 1);
-    [clock, what, `${first.dataset.times} times`].forEach((said, place) => { first.children[place].textContent = said; });
+    [clock, what, `${first.dataset.times} times`].forEach((text, place) => { first.children[place].textContent = text; });
     return;
   }
   const line = document.createElement("li");
@@ -71,12 +71,12 @@ function paintPage() {
   const source = hello?.source ?? "device";
   show(origin, hello !== null && source !== "device");
   origin.dataset.source = source;
-  say(origin, source === "replay" ? "REPLAY: nothing here is happening now" : "EMULATED: there is no sensor behind this");
-  const models = new Set([...page.sensors.values()].map((sensor) => sensor.said?.model ?? hello.model));
+  say(origin, source === "replay" ? "REPLAY: a recording, not live data" : "EMULATED: these are not data of a sensor");
+  const models = new Set([...page.sensors.values()].map((sensor) => sensor.result?.model ?? hello.model));
   say(byId("about"), hello === null ? "" : [hello.name, ...(models.size ? models : [hello.model])].join(", "));
   paintTrouble();
   byId("pause").setAttribute("aria-pressed", String(page.paused));
-  byId("pause").firstChild.textContent = page.paused ? "Go on " : "Pause ";
+  byId("pause").firstChild.textContent = page.paused ? "Resume " : "Pause ";
   const recording = Boolean(page.state.recording);
   byId("record").setAttribute("aria-pressed", String(recording));
   byId("record").firstChild.textContent = recording ? "Recording " : "Record ";
@@ -99,8 +99,8 @@ function paintTrouble() {
   show(trouble, lost || page.paused);
   trouble.dataset.kind = lost ? "lost" : "pause";
   const since = ago(nowS() - page.lostS);
-  const what = page.hello === null ? "no connection to edge-sr" : `${link.ended ? `the run has ended (${since})` : `connection lost ${since}`}: what is shown is old`;
-  say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor goes on. Space goes on here`);
+  const what = page.hello === null ? "no connection to edge-sr" : `${link.ended ? `the run has ended (${since})` : `connection lost ${since}`}: the values shown are old`;
+  say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor continues. Press space to resume`);
 }
 
 const lostWord = () => (page.link.ended ? "run ended" : "connection lost");
@@ -113,7 +113,7 @@ function titleText(source) {
 
 // ---- Frames from the program ----
 
-const hear = {
+const frameHandlers = {
   hello(header) {
     if (header.version !== VERSION) log(`this page is of another version (${VERSION}) than edge-sr (${header.version}): load it again`, { bad: true });
     if (page.hello !== null && page.hello.run !== header.run) forgetRun();
@@ -127,11 +127,11 @@ const hear = {
     if (page.hello === null) return;
     const sensor = sensorOf(header.sensor);
     if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the pause reached the program, and not again
-    else sensor.hear(header, maps);
+    else sensor.take(header, maps);
   },
   event({ note, event, sensor, number, age_s = 0 }) {
-    if (number <= page.told) return; // a new connection, also a reconnect, gets the latest events again
-    page.told = number ?? page.told; // the answer to this page alone has no number
+    if (number <= page.eventNumber) return; // a new connection, also a reconnect, gets the latest events again
+    page.eventNumber = number ?? page.eventNumber; // the answer to this page alone has no number
     const refused = ["refused", "in_contact", "given_up"].includes(event);
     const key = COUNTED.includes(event) ? `${event} ${sensor}` : note;
     log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink", "suspected"].includes(event), ageS: age_s });
@@ -186,16 +186,16 @@ function forgetRun() {
   for (const sensor of page.sensors.values()) sensor.remove();
   page.sensors.clear();
   page.paused = false;
-  page.told = 0;
+  page.eventNumber = 0;
   forgetRefusal();
-  log("another run has begun");
+  log("a new run has begun");
 }
 
 // ---- Commands ----
 
 function command(what) {
   const sent = page.link.send(what);
-  if (!sent) log("not done: there is no connection to edge-sr", { bad: true });
+  if (!sent) log("command not sent: no connection to edge-sr", { bad: true });
   return sent;
 }
 
@@ -247,13 +247,13 @@ function pressed(event) {
 
 page.link = new Link({
   onFrame({ header, maps }) {
-    hear[header.kind]?.(header, maps);
+    frameHandlers[header.kind]?.(header, maps);
     painter.ask();
   },
   onChange() {
     const { link } = page;
     if (link.tries === 1 && !link.up && page.hello !== null && link.nextS !== null) {
-      page.lostS = link.heardS;
+      page.lostS = link.receivedS;
       announce(lostWord());
     }
     if (link.why !== null) announce(link.why);

@@ -2,7 +2,7 @@
 
 class Sensor {
   constructor(name, hello) {
-    Object.assign(this, { name, hello, said: null, heardS: 0, pattern: null, deviation: null, touchedS: 0, zeroed: null, taps: null, cursor: null });
+    Object.assign(this, { name, hello, result: null, receivedS: 0, pattern: null, deviation: null, touchedS: 0, zeroed: null, taps: null, cursor: null });
     Object.assign(this, { trace: new Trace(), touched: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
@@ -63,10 +63,10 @@ class Sensor {
 
   // -- frames --
 
-  hear(header, maps) {
-    const first = this.said === null;
-    this.said = header;
-    this.heardS = nowS() - (header.age_s ?? 0);
+  take(header, maps) {
+    const first = this.result === null;
+    this.result = header;
+    this.receivedS = nowS() - (header.age_s ?? 0);
     this.silentS = null;
     this.trace.add(header.trace ?? []);
     this.zeroed = maps.zeroed ?? null;
@@ -74,21 +74,21 @@ class Sensor {
     if (maps.pattern) {
       this.pattern = maps.pattern;
       this.deviation = maps.deviation ?? null;
-      this.touchedS = this.heardS;
+      this.touchedS = this.receivedS;
       this.touched = header;
       this.highest = largest(maps.pattern.values, this.highest);
     } else if (header.baseline === null) {
       this.pattern = this.deviation = null; // no earlier pattern is valid without a baseline
     }
-    this.tellNotes(header, first);
+    this.logNotes(header, first);
     this.dirty = true;
   }
 
   /** Log notes once if only their numbers change; a step in rest level is an event of its own. */
-  tellNotes({ note, note_kinds = [], dead }, first) {
-    const told = note_kinds.filter((kind) => kind !== "rest_level");
-    const kinds = told.length === 0 ? "" : JSON.stringify([told, dead]);
-    if (kinds !== "" && kinds !== this.noteKinds && !(first && this.said.state === "zeroing")) {
+  logNotes({ note, note_kinds = [], dead }, first) {
+    const shown = note_kinds.filter((kind) => kind !== "rest_level");
+    const kinds = shown.length === 0 ? "" : JSON.stringify([shown, dead]);
+    if (kinds !== "" && kinds !== this.noteKinds && !(first && this.result.state === "zeroing")) {
       log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}` });
     }
     this.noteKinds = kinds;
@@ -133,23 +133,23 @@ class Sensor {
     if (this.pattern === null) return `${place}: no pattern`;
     const unit = this.unit();
     const at = row * cols + col;
-    const doubt = this.deviation === null ? "" : ` \u00b1 ${amount(this.deviation.values[at], 3, unit)}`;
-    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${doubt}${this.live() ? "" : ", not live"}`;
+    const uncertainty = this.deviation === null ? "" : ` \u00b1 ${amount(this.deviation.values[at], 3, unit)}`;
+    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${uncertainty}${this.live() ? "" : ", not live"}`;
   }
 
   // -- state --
 
-  unit() { return this.said?.pattern_unit || this.hello.pattern_unit || "mm"; }
+  unit() { return this.result?.pattern_unit || this.hello.pattern_unit || "mm"; }
 
-  ageS() { return nowS() - this.heardS; }
+  ageS() { return nowS() - this.receivedS; }
 
   /** True if the sensor is silent: the program reports it, or the newest result is old. */
-  away() { return this.silentS !== null || (this.said !== null && this.ageS() > 1); }
+  away() { return this.silentS !== null || (this.result !== null && this.ageS() > 1); }
 
   /** True if the pattern shown is of the newest scan; after a dropped scan the pattern before stays for a moment. */
   newest() {
     if (this.pattern === null) return false;
-    return this.touchedS === this.heardS || (this.said.state === "dropped" && this.heardS - this.touchedS < FRESH_S);
+    return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < FRESH_S);
   }
 
   live() { return this.newest() && page.link.up && !this.away() && !page.paused; }
@@ -158,25 +158,25 @@ class Sensor {
   old() { return this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest()); }
 
   /** Return the result of the pattern shown if that is the newest; else the newest result. */
-  made() { return this.newest() ? this.touched : this.said; }
+  made() { return this.newest() ? this.touched : this.result; }
 
   /** True if the pattern shown is not to be believed, also when it is old. */
   doubted() { return this.pattern !== null && this.touched.trusted === false; }
 
-  /** Return why the pattern shown is not to be believed, or that it is too light to tell; null if all is well. */
+  /** Return why the pattern shown is not to be believed, or that it is too light to check; null if all is well. */
   verdict() {
     if (this.doubted()) return `not to be believed: ${this.touched.untrusted_text}`;
     const unknown = this.pattern !== null && this.touched.trusted === null && this.hello.checks;
-    return unknown ? `${TOO_LIGHT} whether this is to be believed` : null;
+    return unknown ? `${TOO_LIGHT} whether the pattern is to be believed` : null;
   }
 
   word() {
     if (!page.link.up) return ["lost", lostWord()];
     if (page.paused) return ["paused", "paused"];
-    if (this.said === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
+    if (this.result === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
     if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
     if (this.newest() && this.doubted()) return ["doubted", "contact, not believed"];
-    const state = this.said.state === "dropped" ? "contact" : this.said.state; // a newer scan was already waiting
+    const state = this.result.state === "dropped" ? "contact" : this.result.state; // a newer scan was already waiting
     return [state, state];
   }
 
@@ -196,7 +196,7 @@ class Sensor {
   paintWord() {
     const [state, word] = this.word();
     const { badge, why, zero } = this.part;
-    const source = this.said?.source ?? this.hello.source;
+    const source = this.result?.source ?? this.hello.source;
     if (this.part.word.dataset.state !== state) {
       announce(`sensor ${this.name}: ${word}`);
       this.part.word.dataset.state = state;
@@ -205,7 +205,7 @@ class Sensor {
     show(badge, source !== "device");
     badge.dataset.source = source;
     say(badge, source.toUpperCase());
-    say(why, this.said?.note ?? "");
+    say(why, this.result?.note ?? "");
     this.root.classList.toggle("lost", state === "lost" || state === "silent");
     show(zero, page.sensors.size > 1);
   }
@@ -244,7 +244,7 @@ class Sensor {
 
   stampText() {
     if (page.paused && this.newest()) return `paused ${ago(nowS() - page.pausedS)}`;
-    if (this.pattern === null) return this.said === null ? "no scan yet" : this.said.baseline === null ? "no baseline yet" : "no contact yet";
+    if (this.pattern === null) return this.result === null ? "no scan yet" : this.result.baseline === null ? "no baseline yet" : "no contact yet";
     return `last contact ${ago(nowS() - this.touchedS)}`;
   }
 
@@ -288,9 +288,9 @@ class Sensor {
     const { taxels, shear, dead } = this.part;
     show(this.part["shear-legend"], this.zeroed !== null);
     const [context, width, height] = blank(shear);
-    const deaths = Object.entries(this.said?.dead ?? {});
+    const deaths = Object.entries(this.result?.dead ?? {});
     show(dead, deaths.length > 0);
-    say(dead, `not believed: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
+    say(dead, `dead, not used: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
     if (this.zeroed === null) {
       taxels.getContext("2d").clearRect(0, 0, taxels.width, taxels.height);
       say(this.part["taxels-high"], "counts");
@@ -298,7 +298,7 @@ class Sensor {
       const [, rows, cols] = this.zeroed.shape;
       const [count, values] = [rows * cols, this.zeroed.values];
       const z = values.subarray(2 * count, 3 * count);
-      const believed = Array.from(z, (value, taxel) => (this.said.dead?.[taxel] ? 0 : value));
+      const believed = Array.from(z, (value, taxel) => (this.result.dead?.[taxel] ? 0 : value));
       const high = roundUp(largest(believed, LEAST_COUNTS));
       paintMap(taxels, z, rows, cols, high, CIVIDIS);
       say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
@@ -312,7 +312,7 @@ class Sensor {
     const count = rows * cols;
     let longest = LEAST_SHEAR_COUNTS;
     for (let taxel = 0; taxel < count; taxel++) {
-      if (!this.said.dead?.[taxel]) longest = Math.max(longest, Math.hypot(values[taxel], values[count + taxel]));
+      if (!this.result.dead?.[taxel]) longest = Math.max(longest, Math.hypot(values[taxel], values[count + taxel]));
     }
     longest = roundUp(longest);
     const cell = Math.min(width / cols, height / rows);
@@ -321,7 +321,7 @@ class Sensor {
     context.font = '10px system-ui, "DejaVu Sans", sans-serif';
     context.textAlign = "center";
     for (let taxel = 0; taxel < count; taxel++) {
-      if (this.said.dead?.[taxel]) continue;
+      if (this.result.dead?.[taxel]) continue;
       const [x, y] = [((taxel % cols) + 0.5) * (width / cols), (Math.floor(taxel / cols) + 0.5) * (height / rows)];
       const z = values[2 * count + taxel];
       const ink = level(z, high) > 0.6 * LEVELS ? ["#000", "#fff6"] : ["#fff", "#0006"];
@@ -367,42 +367,21 @@ class Sensor {
   }
 
   paintTraces() {
-    const newtons = known(this.said?.force_n);
+    const newtons = known(this.result?.force_n);
     const span = page.spanS;
     say(this.part.span, `last ${span}${THIN}s`);
     paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts");
     paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2");
-    say(this.part["force-now"], newtons ? amount(this.said.force_n, 2, "N") : amount(this.said?.force_counts, 0, "counts"));
+    say(this.part["force-now"], newtons ? amount(this.result.force_n, 2, "N") : amount(this.result?.force_counts, 0, "counts"));
     say(this.part["area-now"], amount(this.made()?.area_mm2, 0, "mm\u00b2"));
   }
 
   paintNumbers() {
-    const said = this.said;
+    const result = this.result;
     const made = this.made();
-    if (said === null) return;
-    const counters = said.counters ?? {};
-    const drift = said.drift_counts;
-    const texts = {
-      force: this.part["force-now"].textContent,
-      area: this.part["area-now"].textContent,
-      centroid_mm: made.centroid_mm ? `${made.centroid_mm.map((mm) => number(mm, 1)).join(", ")}${THIN}mm` : "\u2013",
-      ...wrenchTexts(made),
-      ...trustTexts(made, this.hello.checks),
-      taps_used: made.taps_used ? `${made.taps_used} of ${this.hello.taps}` : "\u2013",
-      another_tap: made.another_tap === true ? "would help" : made.another_tap === false ? "would not help" : "\u2013",
-      interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
-      expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
-      reused_from: !this.live() ? "\u2013" : `${known(made.reused_from) ? "unchanged" : "new"}${made.estimate === "smooth" ? ", smooth" : ""}`,
-      rate_hz: amount(said.rate_hz, 1, "Hz"),
-      run_time_us: amount(made.run_time_us, 0, "\u00b5s"),
-      latency_us: amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms"),
-      model: said.model ?? "\u2013",
-      baseline: said.baseline ?? "none",
-      baseline_origin: ORIGINS[said.baseline_origin] ?? said.baseline_origin ?? "\u2013",
-      baseline_age_s: said.baseline === null ? "\u2013" : duration(said.baseline_age_s),
-      drift: drift ? `${drift.common.map((counts) => number(counts, 1)).join(" ")}` : "\u2013",
-      own: drift ? `${number(drift.own, 1)}, ${number(drift.step, 0)} counts` : "\u2013",
-    };
+    if (result === null) return;
+    const counters = result.counters ?? {};
+    const texts = numberTexts(this);
     for (const [key, element] of Object.entries(this.fields)) {
       if (!LOSSES.has(key)) say(element, texts[key]);
       else {
@@ -411,6 +390,6 @@ class Sensor {
       }
     }
     this.fields.trusted.classList.toggle("warn", made.trusted === false);
-    this.fields.baseline_age_s.classList.toggle("warn", said.baseline !== null && !known(said.baseline_age_s));
+    this.fields.baseline_age_s.classList.toggle("warn", result.baseline !== null && !known(result.baseline_age_s));
   }
 }

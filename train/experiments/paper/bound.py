@@ -157,8 +157,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.say(
         f"The 18 surfaces, known but for their place, at the end of each test tap (frame {FRAMES} of {FRAMES}, "
         f"{TEST_FORCE_N:g} N). Cross-talk and hysteresis are left out of the bound, so it is a little too good. A "
-        "chip's gain is the same in all taps: where the pad is turned between them, the quotient of two readings tells "
-        "of the place and not of the gain, which one tap cannot tell apart."
+        "chip's gain is the same in all taps: where the pad is turned between them, the quotient of two readings "
+        "depends on the place and not on the gain, which one tap cannot separate."
     )
     report.table(rows, "Least error that taps allow, and error of the networks.")
     with report.figure() as figure:

@@ -59,9 +59,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     report = Report("curved", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "Surfaces at p5 r0; which pixels touch is the layer's answer, the same for all methods. One PSF: tPSF, its "
-        f"plateau at the indentation. One PSF, heights: the surface's own height where it touches, and one PSF beside "
-        f"that. Several: so, with up to {PLANES} planes by height, each with a PSF of its own. Errors are "
-        "RMS over the 40 x 40 window in % of the indentation, mean over the steps; what heaps up beside the contact "
+        f"plateau at the indentation. One PSF, heights: the surface's own height where it touches, and one PSF around "
+        f"it. Several: so, with up to {PLANES} planes by height, each with a PSF of its own. Errors are "
+        "RMS over the 40 x 40 window in % of the indentation, mean over the steps; what heaps up around the contact "
         "counts as 0 in the first column, as no PSF pulls, and as it is in the second. "
         f"Truth is FEM at {meshes[0]}."
     )

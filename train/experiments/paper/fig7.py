@@ -24,7 +24,7 @@ from train.physics.elastic_layer import Layer
 from train.physics.fem_cache import (
     CENTRE,
     FINEST,
-    REFEREE_POISSON,
+    REFERENCE_POISSON,
     SCALE,
     Mesh,
     Verdict,
@@ -108,8 +108,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(
         [_row(method, truth, layer.maps, indentation_mm) for method in methods],
         f"RMS error over the 40 x 40 window, in % of the indentation; truth is FEM at {meshes[0]}. Mean over "
-        "surfaces and steps, in brackets the best and the worst surface. What heaps up beside the contact counts as 0, "
-        "as no PSF pulls, but for the column that says so.",
+        "surfaces and steps, in brackets the best and the worst surface. What heaps up around the contact counts as 0, "
+        "as no PSF pulls, except in the column that is named so.",
     )
     report.say(_verdict(methods, truth, indentation_mm))
     report.table(_by_step(methods, truth, indentation_mm, force_n), "RMS error by step, in [um].", "steps")
@@ -269,8 +269,8 @@ def _how(surfaces: int, steps: int, psf: str) -> str:
         f"against FEM ({psf}). Depth x indentation: the touching pixels at the indentation, sharp. Depth x force, as "
         "the paper has it: one factor fitted in the same way. layer: bonded layer without sides, Polonsky-Keer, "
         f"Poisson's ratio {Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's ratio "
-        f"{REFEREE_POISSON:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie beside "
-        "them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
+        f"{REFERENCE_POISSON:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
+        "to them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
         "was worked out."
     )
 

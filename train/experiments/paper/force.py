@@ -78,7 +78,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         "range, every scan read by a sensor of its own with all nuisances at their defaults. Small shapes are as deep "
         f"as they may ({MAX_INDENTATION_MM} mm) before high forces, so those have fewer taps. PSNR and SSIM are "
         "against the declared full scale: the less there is, the better they look. Relative error is RMS error over "
-        "the truth's RMS, and SSIM at own scale has each truth's peak as full scale: they tell how true the shape is."
+        "the truth's RMS, and SSIM at own scale has each truth's peak as full scale: they measure errors of shape."
     )
     report.say(_finding(bins, figures))
     report.table(

@@ -111,7 +111,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         "the press best, which leaves out what shape and gain do to the factor. Loop: largest difference between press "
         "and release at equal true force. At no load: mean |force|, and false contacts: scans whose pattern sums up to "
         f"more than {CLAIM_N:g} N, and scans that pass the runtime's contact threshold ({ON_COUNTS:g} counts of summed "
-        "z), behind which no pattern is made; that threshold misses loaded scans, too."
+        "z), below which no pattern is made; that threshold misses loaded scans, too."
     )
     for condition in CONDITIONS:
         report.say(_finding(condition, [row for row in rows if row["nuisances"] == condition]))
@@ -151,7 +151,7 @@ def _row(condition: str, gauge: Gauge, presses: list[dict[str, float]]) -> Row:
     columns = {
         "error": "error %",
         "own": "with its own factor %",
-        "gated": "behind the threshold %",
+        "gated": "above the threshold %",
         "loop": "loop %",
         "rest": "at no load %",
         "false": "false contact, % of scans",

@@ -13,7 +13,7 @@ from edge.terminal.progress_bar import tracked
 from train.data.dataset import Sequences
 from train.experiments.support.methods import classical_methods
 from train.experiments.support.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
-from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells, thinned
+from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
 from train.report import Report, Row, bootstrap_interval
 
@@ -44,13 +44,13 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Train absent networks, evaluate all methods, and write table and plot."""
     data = mixed(bench)
     sets = {split: bench.frozen(split) for split in ("validation", "test")}
-    judged = {split: thinned(frozen, ONE_IN) for split, frozen in sets.items()}
+    evaluated = {split: frozen.thinned(ONE_IN) for split, frozen in sets.items()}
     rows, test_psnr = [], {}
-    for row, figures in (*_classical(bench, data, judged), *_networks(bench, data, sets["validation"], judged)):
+    for row, figures in (*_classical(bench, data, evaluated), *_networks(bench, data, sets["validation"], evaluated)):
         rows.append(row)
         test_psnr[str(row["method"])] = figures["psnr_db"]
     report = Report("table3", folder, __file__, bench.used, quick=bench.quick)
-    test = judged["test"]
+    test = evaluated["test"]
     report.say(
         f"{len(test)} frames of {len(test.surface)} taps a set, one in {ONE_IN} evenly over each tap, the same for "
         f"every row; full scale {test.full_scale_mm} mm. PSNR with its 95 % interval by tap. Run time: one window, "
@@ -73,22 +73,26 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def _classical(bench: Workbench, data: Sequences, judged: Sets) -> Iterator[tuple[Row, Figures]]:
+def _classical(bench: Workbench, data: Sequences, evaluated: Sets) -> Iterator[tuple[Row, Figures]]:
     for method in classical_methods(bench, data, CLASSICAL):
-        patterns = {split: method.patterns(frozen.windows(1)) for split, frozen in judged.items()}
-        yield _row(method.name, method.name, judged, patterns, method.contact_level, method.cost)
+        patterns = {split: method.patterns(frozen.windows(1)) for split, frozen in evaluated.items()}
+        yield _row(method.name, method.name, evaluated, patterns, method.contact_level, method.cost)
 
 
-def _networks(bench: Workbench, data: Sequences, validation: FrozenSet, judged: Sets) -> Iterator[tuple[Row, Figures]]:
+def _networks(
+    bench: Workbench, data: Sequences, validation: FrozenSet, evaluated: Sets
+) -> Iterator[tuple[Row, Figures]]:
     seed_networks = [seed_size(name) for name in (SEED_NETWORKS[1:4] if bench.quick else SEED_NETWORKS)]
-    networks = [(training.network, training, judged["validation"]) for training in (*seed_networks, SEED_STSR_LONGER)]
+    networks = [
+        (training.network, training, evaluated["validation"]) for training in (*seed_networks, SEED_STSR_LONGER)
+    ]
     networks += [(name, compact(name), validation) for name in COMPACT_NETWORKS]
     for network, training, calibrated_on in tracked(networks, "networks", "network"):
-        net, told = trained(bench, training, data, calibrated_on)
+        net, facts = trained(bench, training, data, calibrated_on)
         name = training.name.removeprefix("seed-") if training.network == network else f"compact {network}"
-        patterns = {split: infer(net, frozen.windows(net.taps))[0] for split, frozen in judged.items()}
-        costs = cost_cells(net) | bench.training_cells(told)
-        yield _row(name.removeprefix("quick-"), network, judged, patterns, told["contact_level"], costs)
+        patterns = {split: infer(net, frozen.windows(net.taps))[0] for split, frozen in evaluated.items()}
+        costs = cost_cells(net) | bench.training_cells(facts)
+        yield _row(name.removeprefix("quick-"), network, evaluated, patterns, facts["contact_level"], costs)
 
 
 def _row(
@@ -110,8 +114,8 @@ def _epochs(rows: list[Row], sequences: int) -> str:
         for row in rows
         if "steps" in row and not str(row["method"]).startswith("compact")
     }
-    told = ", ".join(f"{name} {epochs:.2f}" for name, epochs in of.items())
-    return f"The networks of the paper were trained by the clock, on this machine for so many epochs: {told}."
+    facts = ", ".join(f"{name} {epochs:.2f}" for name, epochs in of.items())
+    return f"The networks of the paper were trained for a fixed time, on this machine for so many epochs: {facts}."
 
 
 def _verdicts(test_psnr: Mapping[str, NDArray[np.float64]], taps: NDArray[np.integer]) -> str:

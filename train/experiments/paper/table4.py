@@ -23,14 +23,14 @@ def run(bench: Workbench, folder: Path) -> Path:
         validation, test = (bench.frozen(split, scale=scale) for split in ("validation", "test"))
         if scale != 10:  # the base is evaluated at its own scale
             trained(bench, at_scale(10), data, bench.frozen("validation"))
-        net, told = bench.network(at_scale(scale), data, validation)
+        net, facts = bench.network(at_scale(scale), data, validation)
         row: Row = {"scale": f"x{scale}", "pattern": "{} x {}".format(*test.unit_patterns.shape[1:])}
         for split, frozen in (("validation", validation), ("test", test)):
-            figures = judge(infer(net, frozen.windows(1))[0], frozen, told["contact_level"])
+            figures = judge(infer(net, frozen.windows(1))[0], frozen, facts["contact_level"])
             row |= error_cells(figures, frozen, split)
         means.append(float(figures["psnr_db"].mean()))
         row |= {"paper's test PSNR dB": paper_db, "paper's test SSIM": paper_ssim}
-        rows.append(row | cost_cells(net) | bench.training_cells(told))
+        rows.append(row | cost_cells(net) | bench.training_cells(facts))
     report = Report("table4", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "The compact STSR. Truth is made at x20 and brought to each scale with anti-aliasing. At x10 the layers that"

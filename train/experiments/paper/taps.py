@@ -22,24 +22,24 @@ def run(bench: Workbench, folder: Path) -> Path:
     rows: list[Row] = []
     gains: dict[str, list[tuple[float, float, float]]] = {"a network for each": [], "MTSR-7 given fewer": []}
     networks = [trained(bench, alike(name), data, validation) for name in names]
-    figures = [judge(infer(net, test.windows(net.taps))[0], test, told["contact_level"]) for net, told in networks]
-    for name, (net, told), found in zip(names, networks, figures, strict=True):
+    figures = [judge(infer(net, test.windows(net.taps))[0], test, facts["contact_level"]) for net, facts in networks]
+    for name, (net, facts), found in zip(names, networks, figures, strict=True):
         row: Row = {"network": name, "taps given": net.taps} | error_cells(found, test, "test")
         gain = _gain(found, figures[0], test.tap)
         gains["a network for each"].append(gain)
-        rows.append(row | _cell(gain) | cost_cells(net) | bench.training_cells(told))
-    net, told = networks[-1]
+        rows.append(row | _cell(gain) | cost_cells(net) | bench.training_cells(facts))
+    net, facts = networks[-1]
     for given in tracked(range(1, MAX_TAPS + 1), "taps", "run"):
-        found = judge(infer(net, test.windows(MAX_TAPS, given))[0], test, told["contact_level"])
+        found = judge(infer(net, test.windows(MAX_TAPS, given))[0], test, facts["contact_level"])
         row = {"network": names[-1], "taps given": given} | error_cells(found, test, "test")
         gain = _gain(found, figures[0], test.tap)
         gains["MTSR-7 given fewer"].append(gain)
         rows.append(row | _cell(gain) | cost_cells(net))
-    told_apart = sum(low > 0 or high < 0 for curve in gains.values() for _, low, high in curve)
+    distinct = sum(low > 0 or high < 0 for curve in gains.values() for _, low, high in curve)
     report = Report("taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         "Compact networks on the same targets, all trained on from one of a single tap for as long. "
-        f"Of {2 * MAX_TAPS - 1} ways with other taps or another network, {told_apart} can be told apart from STSR "
+        f"Of {2 * MAX_TAPS - 1} ways with other taps or another network, {distinct} differ significantly from STSR "
         "(95 % interval of the difference, by tap)."
     )
     report.table(rows, "By number of taps, test set.")

@@ -31,32 +31,32 @@ def run(bench: Workbench, folder: Path) -> Path:
     rows: list[Row] = []
     course: list[Row] = []
     psnr: Psnr = {}
-    for training, net, told in _networks(bench):
+    for training, net, facts in _networks(bench):
         name = _name(training)
         patterns = {split: infer(net, frozen.windows(net.taps))[0] for split, frozen in sets.items()}
-        figures = {split: judge(patterns[split], frozen, told["contact_level"]) for split, frozen in sets.items()}
+        figures = {split: judge(patterns[split], frozen, facts["contact_level"]) for split, frozen in sets.items()}
         row: Row = {"network": name, "epochs": round(epochs(training), 1)}
         for split, frozen in sets.items():
             row |= error_cells(figures[split], frozen, split)
         psnr[name] = figures["test"]["psnr_db"]
         if net.taps > 1:
-            alone = judge(infer(net, test.windows(net.taps, given=1))[0], test, told["contact_level"])
+            alone = judge(infer(net, test.windows(net.taps, given=1))[0], test, facts["contact_level"])
             psnr[name + _ONE_TAP] = alone["psnr_db"]
         one_tap = psnr.get(name + _ONE_TAP)
         row |= {f"test PSNR dB{_ONE_TAP}": None if one_tap is None else with_interval(one_tap, test.tap)}
         row |= cost_cells(net)
-        rows.append(row | {"its own min": round(told["elapsed_s"] / 60, 1), "trained on": told["device"]})
-        course.append(_course(name, told))
+        rows.append(row | {"its own min": round(facts["elapsed_s"] / 60, 1), "trained on": facts["device"]})
+        course.append(_course(name, facts))
     report = Report("trained_out", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{len(test)} frames of {len(test.surface)} taps a set; full scale {test.full_scale_mm} mm. PSNR with its 95 % "
         f"interval by tap. A name's numbers are passes over the same {SEQUENCES} sequences, from nothing and, after a "
         "+, on from the STSR of that kind; every part is one cycle of the learning rate, batches of 64, in bfloat16. "
-        "Minutes are those of a network's own part, with up to four others beside it on the device. Run time: one "
-        "window, torch, one thread, on the machine that judged."
+        "Minutes are those of a network's own part, with up to four others at once on the device. Run time: one "
+        "window, torch, one thread, on the machine that evaluated it."
     )
     if absent := [_name(training) for training in OUT if _name(training) not in psnr]:
-        report.say(f"Not there, so not judged: {', '.join(absent)}.")
+        report.say(f"Missing, so not evaluated: {', '.join(absent)}.")
     report.say(_verdicts(psnr, test.tap))
     report.table(rows, "Validation and test set, x10.")
     report.table(
@@ -103,10 +103,10 @@ def _name(training: Training) -> str:
     return training.name.removeprefix("out-").replace("-", " ")
 
 
-def _course(name: str, told: Mapping[str, Any]) -> Row:
-    steps = told["steps"]
+def _course(name: str, facts: Mapping[str, Any]) -> Row:
+    steps = facts["steps"]
     return {"network": name} | {
-        f"{point['step'] / steps:.0%}": round(point["validation PSNR dB"], 2) for point in told["course"]
+        f"{point['step'] / steps:.0%}": round(point["validation PSNR dB"], 2) for point in facts["course"]
     }
 
 

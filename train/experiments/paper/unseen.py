@@ -104,7 +104,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         "are set on the 15 surfaces at the validation position (on the 18 for `18 + figures`)."
     )
     verdict = [row for given in GIVEN for pair in _PAIRS for row in verdict_rows(scores, given, *pair)]
-    report.table(verdict, "What figures beside the 15 surfaces change, frame by frame.", "verdict")
+    report.table(verdict, "What figures added to the 15 surfaces change, frame by frame.", "verdict")
     for given in GIVEN:
         report.say("\n".join(_verdict(scores, given, *pair) for pair in _PAIRS))
     report.table(rows, "`covered` and `width` are of the 90 % interval, the width in % of the frame's indentation.")
@@ -192,13 +192,13 @@ def _verdict(scores: _Scores, given: int, mixed: str, alone: str) -> str:
     bound_db = float(scores[_ALL_BOTH, _NEW, given].psnr_db.mean() - scores[_BOTH, _NEW, given].psnr_db.mean())
     width = {tested: scores[mixed, tested, given].width_percent for tested in (_OLD, *_UNSEEN)}
     wider = [f"{width[tested] / width[_OLD]:.2f} ({tested})" for tested in _UNSEEN]
-    said = {tested: f"{change_db:+.2f} dB" for tested, change_db in lift_db.items()}
+    change = {tested: f"{change_db:+.2f} dB" for tested, change_db in lift_db.items()}
     return (
         f"- `{mixed}` against `{alone}`, with {given} tap{'s' * (given > 1)}: figures change the PSNR by "
-        f"{said[_ALL_UNSEEN]} on unseen surfaces (bound {LEAST_LIFT_DB:+.1f}) and by {said[_OLD]} on the fifteen seen "
-        f"ones (bound {-MOST_LOSS_DB:+.1f}): the bound is {'met' if met else 'not met'}. Of the unseen, the three held "
-        f"out change by {said[_NEW]}, glyphs by {said[_GLYPHS]}, polygons by {said[_POLYGONS]}. To train on the three "
-        "themselves, too, beside all figures, adds "
+        f"{change[_ALL_UNSEEN]} on unseen surfaces (bound {LEAST_LIFT_DB:+.1f}) and by {change[_OLD]} on the fifteen "
+        f"seen ones (bound {-MOST_LOSS_DB:+.1f}): the bound is {'met' if met else 'not met'}. Of the unseen, the three "
+        f"held out change by {change[_NEW]}, glyphs by {change[_GLYPHS]}, polygons by {change[_POLYGONS]}. To train on "
+        "the three themselves, too, in addition to all figures, adds "
         f"{bound_db:+.2f} dB. With figures, the 90 % interval is as wide as on seen surfaces times {', '.join(wider)}."
     )
 

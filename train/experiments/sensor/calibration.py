@@ -58,8 +58,8 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     report = Report("calibration", folder, __file__, bench.used, quick=bench.quick)
     report.say(
-        "Deviations are scaled once, on the validation position; here they are judged at the test position, on the 18 "
-        f"surfaces and on {TEST_FIGURES} glyphs that no network was trained on. Intervals of the mean are by tap."
+        "Deviations are scaled once, on the validation position; here they are evaluated at the test position, on the "
+        f"18 surfaces and on {TEST_FIGURES} glyphs that no network was trained on. Intervals of the mean are by tap."
     )
     report.say(_coverage_verdict(found))
     report.table(_reliability_rows(found, nets), "Pixels in [%] that intervals of each level cover.")
@@ -258,8 +258,8 @@ def _plot(report: Report, found: _Found, by_distance: list[Row], by_wave: Mappin
         for number, (name, rows) in enumerate(by_wave.items()):
             wave_mm = [row["wavelength mm"] for row in rows]
             for what, marker in (("deviation", "o-"), ("error", "x:")):
-                told = [_mean(row[what]) for row in rows]
-                waves.plot(wave_mm, told, marker, color=f"C{number}", label=f"{name}, {what}")
+                means = [_mean(row[what]) for row in rows]
+                waves.plot(wave_mm, means, marker, color=f"C{number}", label=f"{name}, {what}")
         wave_mm = np.geomspace(min(WAVELENGTHS_MM), max(WAVELENGTHS_MM), 100)
         waves.plot(wave_mm, let_through(wave_mm), "k--", label="layer lets through")
         levels.set(xlabel="level of the interval [%]", ylabel="pixels covered [%]")

@@ -34,7 +34,7 @@ _TEST: Final = "test"
 
 
 @dataclass(frozen=True, slots=True)
-class _Judged:
+class _Evaluated:
     """Frames of a set for one number of taps, (n,) each: expected and true RMS error in [mm], and expected gain."""
 
     tap: NDArray[np.integer]
@@ -48,7 +48,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     models = [ModelSession(path) for path in (bundled_models()[:2] if bench.quick else bundled_models())]
     sets = _sets(bench)
     found = {
-        (model.name, name, given): judged(model, given, frozen)
+        (model.name, name, given): evaluated(model, given, frozen)
         for model in tracked(models, "judging", "model")
         for name, frozen in sets.items()
         for given in range(1, model.contract.taps + 1)
@@ -92,21 +92,21 @@ def _sets(bench: Workbench) -> dict[str, FrozenSet]:
     }
 
 
-def judged(model: Model, given: int, frozen: FrozenSet) -> _Judged:
+def evaluated(model: Model, given: int, frozen: FrozenSet) -> _Evaluated:
     """Return expectations and errors of every frame, with the newest `given` taps."""
     about, error_mm, size_mm = doubts_and_errors(model, given, frozen)
     found = [
         expect_of(model.contract.confidence, given, *of) for of in zip(about.tolist(), size_mm.tolist(), strict=True)
     ]
-    told = [expected for expected in found if expected is not None]
-    if len(told) < len(found):
-        raise TrainError(f"model '{model.name}' does not tell what to expect of {given} taps: export it again")
-    gains = [expected.gain for expected in told if expected.gain is not None]
-    expected_mm = np.array([expected.rmse for expected in told])
-    return _Judged(frozen.tap, expected_mm, error_mm, np.array(gains) if gains else None)
+    expectations = [expected for expected in found if expected is not None]
+    if len(expectations) < len(found):
+        raise TrainError(f"model '{model.name}' does not state the expected error of {given} taps: export it again")
+    gains = [expected.gain for expected in expectations if expected.gain is not None]
+    expected_mm = np.array([expected.rmse for expected in expectations])
+    return _Evaluated(frozen.tap, expected_mm, error_mm, np.array(gains) if gains else None)
 
 
-_Found = Mapping[tuple[str, str, int], _Judged]
+_Found = Mapping[tuple[str, str, int], _Evaluated]
 """Results by model, set and number of taps."""
 
 
@@ -185,7 +185,7 @@ def _gain_rows(model: str, found: _Found) -> list[Row]:
     ]
 
 
-def _gain(seen: _Judged) -> NDArray[np.float64]:
+def _gain(seen: _Evaluated) -> NDArray[np.float64]:
     return np.zeros(len(seen.tap)) if seen.gain is None else seen.gain
 
 

@@ -34,7 +34,7 @@ from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.generation_config import SEED
 from train.data.real_grips import recorded_sets, recording_paths, recordings_folder
-from train.experiments.support.workbench import Workbench, thinned
+from train.experiments.support.workbench import Workbench
 from train.physics.sensor_noise import LARGEST_COUNTS
 from train.report import Report, Row, with_interval
 
@@ -53,7 +53,7 @@ _MASKS: Final = 8
 
 
 @dataclass
-class Told:
+class Played:
     """Output of the runtime for every frame.
 
     Attributes:
@@ -72,7 +72,7 @@ class Told:
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `dead`; the full run takes a few minutes."""
     frozen = load_frozen_set(bench.use(BUNDLE_DIR / "frozen.npz"))
-    frozen = thinned(frozen, len(frozen) // 4 if bench.quick else _FRAMES_APART)
+    frozen = frozen.thinned(len(frozen) // 4 if bench.quick else _FRAMES_APART)
     estimator = load_estimator(bench.use(TAXELS), (USPA44.rows, USPA44.cols))
     report = Report("dead", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -108,7 +108,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | None, dead: int, fault: str) -> Told:
+def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | None, dead: int, fault: str) -> Played:
     """Run every frame, at the end of its taps, through a runtime whose sensor has `dead` taxels.
 
     Args:
@@ -118,7 +118,7 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
         dead: number of dead taxels.
         fault: one of FAULTS.
     """
-    told = Told()
+    played = Played()
     rank = np.random.default_rng([SEED, 1]).random((len(frozen.surface), _TAXELS)).argsort(axis=1)
     high = np.array(LARGEST_COUNTS)[:, None]
     for frame, tap in enumerate(frozen.tap.tolist()):
@@ -150,12 +150,12 @@ def play(model: ModelSession, frozen: FrozenSet, estimator: TaxelEstimator | Non
         none = np.zeros(shape, dtype=np.float32)
         factor = model.contract.interval_factor or 0.0
         pattern = None if result is None else result.pattern
-        told.patterns.append(none if pattern is None else pattern)
+        played.patterns.append(none if pattern is None else pattern)
         deviation = None if result is None else result.deviation
-        told.half_width_mm.append(none if deviation is None else factor * deviation)
-        told.run_time_us.append(took_us)
-        told.delays_scans += [known] if known is not None else []
-    return told
+        played.half_width_mm.append(none if deviation is None else factor * deviation)
+        played.run_time_us.append(took_us)
+        played.delays_scans += [known] if known is not None else []
+    return played
 
 
 def _course(frozen: FrozenSet, frame: int, taps: int, free: int) -> Iterator[NDArray[np.integer]]:
@@ -179,22 +179,22 @@ def _fail(
         raw[:, failing] = stuck[:, failing]
 
 
-def _row(model: ModelSession, frozen: FrozenSet, told: Told, dead: int, fault: str, state: str) -> Row:
-    patterns, widths_mm = np.stack(told.patterns), np.stack(told.half_width_mm)
-    said: Row = {"model": model.name, "dead": dead, "fault": fault if dead else "none", "taxels": state}
+def _row(model: ModelSession, frozen: FrozenSet, played: Played, dead: int, fault: str, state: str) -> Row:
+    patterns, widths_mm = np.stack(played.patterns), np.stack(played.half_width_mm)
+    row: Row = {"model": model.name, "dead": dead, "fault": fault if dead else "none", "taxels": state}
     if not patterns.any():
-        return said | {"no pattern": len(patterns), "found after scans": max(told.delays_scans, default=None)}
+        return row | {"no pattern": len(patterns), "found after scans": max(played.delays_scans, default=None)}
     figures = judge(patterns, frozen, model.contract.contact_level, widths_mm)
     narrow = interval_coverage(patterns, frozen.patterns(), widths_mm / (WIDENING[dead] if state == "found" else 1))
-    return said | {
+    return row | {
         "PSNR dB": with_interval(figures["psnr_db"], frozen.tap),
         "worst tenth dB": round(float(np.quantile(figures["psnr_db"], 0.1)), 1),
         "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
         "IoU": round(float(figures["contact_iou"].mean()), 3),
         "covered %": f"{100 * figures['coverage_90'].mean():.1f} ({100 * narrow.mean():.1f})",
-        "no pattern": sum(not pattern.any() for pattern in told.patterns),
-        "found after scans": max(told.delays_scans, default=None),
-        "run time us p50": round(float(np.median(told.run_time_us)), 0),
+        "no pattern": sum(not pattern.any() for pattern in played.patterns),
+        "found after scans": max(played.delays_scans, default=None),
+        "run time us p50": round(float(np.median(played.run_time_us)), 0),
     }
 
 

@@ -50,7 +50,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     validation = freeze_presses(bench.presses("validation", VALIDATION), SEED)
     baselines, chosen = fit_baselines(bench.presses("gripped", TRAINING), validation)
     best = max(baselines, key=lambda one: one.validation_db).name
-    found = _judged(model, baselines, wide)
+    found = _evaluated(model, baselines, wide)
 
     report = Report("families", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -98,7 +98,7 @@ _NOMINAL: Final = (
 )
 
 
-def _judged(model: ModelSession, baselines: list[Baseline], wide: FrozenPresses) -> dict[str, Found]:
+def _evaluated(model: ModelSession, baselines: list[Baseline], wide: FrozenPresses) -> dict[str, Found]:
     frozen, newest = wide.as_frozen_set(), wide.windows(1)[:, 0]
     found: dict[str, Found] = {}
     for known in _MODEL:

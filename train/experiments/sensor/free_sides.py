@@ -244,8 +244,8 @@ def _fitted(pads: list[_Pads], start: FreeSides, most: int) -> FreeSides:
 
     def surface(values: NDArray[np.float64]) -> NDArray[np.float64]:
         sides = with_gives(values)
-        judged = [_judge(pad, _compliance(sides, pad.layer), name) for pad in pads for name in _CONTACTS]
-        return np.array([(np.log(stiffer), apart / 2) for stiffer, apart in judged]).ravel()
+        compared = [_judge(pad, _compliance(sides, pad.layer), name) for pad in pads for name in _CONTACTS]
+        return np.array([(np.log(stiffer), apart / 2) for stiffer, apart in compared]).ravel()
 
     found = with_gives(fit(np.ravel(start.gives), surface))
     for name in _DIRECTIONS:

@@ -58,7 +58,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.say(
         "A place's gain is that of its chip's axis, N(1, .075), times what its magnet's seat and moment do to z under "
         "an even load. Errors are of log-gains: in truth z's mean is 0, in the estimate each axis'. Intervals: 90 %. "
-        "Constants are over half their range, in which the prior's RMS error is .58; a constant is told where its "
+        "Constants are over half their range, in which the prior's RMS error is .58; a constant is determined if its "
         "deviation is below .7 of the prior's, and otherwise keeps its prior."
     )
     for caption, flat in ((f"{world.per_pad} mixed contacts", False), (f"{_FLAT_GRIPS} flat grips", True)):
@@ -116,7 +116,7 @@ def _simulated(
     ]
     report.show(rows, f"Gains, {caption}, {len(found)} sensors.")
     middle = np.array([one.constants for one in found])
-    told = np.array([one.told for one in found])
+    determined = np.array([one.determined for one in found])
     off = np.abs(middle - pad)
     inside = off <= half[:, CHANNELS:]
     report.show(
@@ -125,9 +125,9 @@ def _simulated(
                 "constant": name,
                 "correlation": round(float(np.corrcoef(middle[:, at], pad[:, at])[0, 1]), 2),
                 "RMS error": round(_rms(off[:, at]), 2),
-                "told %": round(100 * float(told[:, at].mean())),
-                "told ones in the interval %": round(100 * float(inside[told[:, at], at].mean()))
-                if told[:, at].any()
+                "determined %": round(100 * float(determined[:, at].mean())),
+                "determined ones in the interval %": round(100 * float(inside[determined[:, at], at].mean()))
+                if determined[:, at].any()
                 else None,
             }
             for at, name in enumerate(INPUTS)

@@ -144,11 +144,11 @@ def run(bench: Workbench, folder: Path) -> Path:
     degraded = [_degraded(one.patterns, operator) for one in whole]
     hidden = [np.full_like(one, np.nan) for one in z]
     for taxel in tracked(range(_TAXELS), "hidden", "taxel"):
-        for grip, said in zip(grips, hidden, strict=True):
-            said[:, taxel] = _degraded(play(grip, model, taxel).patterns, operator)[:, taxel]
+        for grip, estimates in zip(grips, hidden, strict=True):
+            estimates[:, taxel] = _degraded(play(grip, model, taxel).patterns, operator)[:, taxel]
 
     classical = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)
-    told = {
+    methods = {
         model.name: (
             [one.patterns for one in whole],
             hidden,
@@ -164,9 +164,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.say(_unexplained(_presses(bench, "validation"), operator))
     rows: list[Row] = [
         {"method": name}
-        | _cells(patterns, [_degraded(part, operator) for part in patterns], said, z)
+        | _cells(patterns, [_degraded(part, operator) for part in patterns], estimates, z)
         | {"run time us": round(us, 1)}
-        for name, (patterns, said, us) in told.items()
+        for name, (patterns, estimates, us) in methods.items()
     ]
     trials = [grip.trial for grip in grips]
     if len(set(trials)) > 1:
@@ -178,9 +178,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(
         [
             {"trial": grip.trial, "sensor": grip.free.sensor, "scans": len(one.zeroed)}
-            | _cells([one.patterns], [back], [said], [mine], interval=False)
+            | _cells([one.patterns], [back], [estimates], [mine], interval=False)
             | {"bilinear, hidden taxel counts": _rms([neighbours_mean(mine)], [mine], interval=False)}
-            for grip, one, back, said, mine in zip(grips, whole, degraded, hidden, z, strict=True)
+            for grip, one, back, estimates, mine in zip(grips, whole, degraded, hidden, z, strict=True)
         ],
         f"{model.name} by trial and sensor.",
         "trials",
@@ -236,10 +236,10 @@ def _cells(
 
 
 def _rms(
-    said: Sequence[NDArray[np.floating]], z: Sequence[NDArray[np.floating]], *, interval: bool = True
+    estimates: Sequence[NDArray[np.floating]], z: Sequence[NDArray[np.floating]], *, interval: bool = True
 ) -> str | float:
     """Return the RMS error in counts where predictions exist, with its interval by trial and sensor."""
-    squares = [((one - true) ** 2).mean(axis=1) for one, true in zip(said, z, strict=True)]
+    squares = [((one - true) ** 2).mean(axis=1) for one, true in zip(estimates, z, strict=True)]
     groups = np.repeat(np.arange(len(squares)), [len(part) for part in squares])
     joined = np.concatenate(squares)
     known = np.isfinite(joined)
@@ -255,7 +255,7 @@ def _method(whole: Sequence[Played], model: str) -> str:
     size = np.sqrt(np.mean(np.concatenate([z_of(one.zeroed) for one in whole]) ** 2))
     return (
         f"{scans} scans of {len(whole)} recordings in which some taxel is pressed, z RMS {size:.0f} counts, through "
-        f"edge.perception.runtime with {model} and the baseline of the free pad; nothing is known of the pads, and "
+        f"edge.perception.runtime with {model} and the baseline of the free pad; the pads are unknown, and "
         f"nothing is "
         "fitted on real readings but in the last two rows of the first table. Share: of the pad above half of the "
         "pattern's 95th percentile, wanted .9; std / mean: over the inner 80 %, wanted .25 at most; medians of scans. "
@@ -272,7 +272,7 @@ def _unexplained(presses: PressSet, operator: NDArray[np.floating]) -> str:
     percent = 100 * np.mean(left**2) / np.mean(read**2)
     return (
         f"True patterns of {len(presses)} validation presses leave {percent:.0f} % of their z's energy unexplained by "
-        "the operator: pads and gains differ, and none is known."
+        "the operator: pads and gains differ, and are unknown."
     )
 
 
@@ -283,11 +283,11 @@ def _with_gains(
     mended = []
     for grip, back in zip(grips, degraded, strict=True):
         mine = [other.free.sensor == grip.free.sensor and other.trial != grip.trial for other in grips]
-        said, true = (
+        estimates, true = (
             np.concatenate([part for part, yes in zip(parts, mine, strict=True) if yes]) for parts in (degraded, z)
         )
-        known = np.isfinite(said).all(axis=1)
-        mended.append(back * (true * said)[known].sum(axis=0) / (said**2)[known].sum(axis=0))
+        known = np.isfinite(estimates).all(axis=1)
+        mended.append(back * (true * estimates)[known].sum(axis=0) / (estimates**2)[known].sum(axis=0))
     return mended
 
 

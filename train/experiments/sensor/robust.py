@@ -154,8 +154,8 @@ def _against_one_tap(gains: Mapping[str, NDArray[np.float64]], tap: NDArray[np.i
         (better if low > 0 else worse if high < 0 else []).append(f"{place} ({gain_db.mean():+.2f} dB)")
     return (
         f"{four} against {one}, where the 95 % interval of the difference leaves out 0: better at "
-        f"{'; '.join(better) or 'nothing'}; worse at {'; '.join(worse) or 'nothing'}; not told apart at the other "
-        f"{len(gains) - len(better) - len(worse)} of {len(gains)}."
+        f"{'; '.join(better) or 'nothing'}; worse at {'; '.join(worse) or 'nothing'}; no significant difference at "
+        f"the other {len(gains) - len(better) - len(worse)} of {len(gains)}."
     )
 
 

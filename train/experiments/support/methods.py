@@ -58,9 +58,9 @@ def compact_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -
     validation = bench.frozen("validation")
     methods: list[Method] = []
     for name in names:
-        net, told = trained(bench, compact(name), data, validation)
+        net, facts = trained(bench, compact(name), data, validation)
         run = partial(_infer, net)
-        methods.append(Method(name, net.taps, told["contact_level"], cost_cells(net), run))
+        methods.append(Method(name, net.taps, facts["contact_level"], cost_cells(net), run))
     return methods
 
 

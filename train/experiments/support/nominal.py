@@ -14,7 +14,7 @@ from firmware_bridge.scans.pad_constants import GAINS, Pad
 from train.data.generation_config import random_figures
 from train.experiments.support.scores import pattern_cells
 from train.experiments.support.shipped import ALL, NOTHING, PAD, infer
-from train.experiments.support.workbench import Workbench, thinned
+from train.experiments.support.workbench import Workbench
 from train.physics.pad_draws import INPUTS, NOMINAL
 from train.physics.sensor_noise import Nuisances
 from train.report import Row
@@ -33,7 +33,7 @@ def nominal_rows(bench: Workbench, model: ModelSession) -> list[Row]:
     figures = random_figures(TEST_FIGURES, TEST_FIGURES, TEST_SEED)
     kinds = {"glyphs": figures[:TEST_FIGURES], "polygons": figures[TEST_FIGURES:]}
     bundled = load_frozen_set(bench.use(BUNDLE_DIR / "frozen.npz"))
-    sets = {"frozen.npz": (thinned(bundled, 8) if bench.quick else bundled, bench.frozen("test", nuisances=even))}
+    sets = {"frozen.npz": (bundled.thinned(8) if bench.quick else bundled, bench.frozen("test", nuisances=even))}
     for name, surfaces in kinds.items():
         read = (bench.frozen("test", surfaces), bench.frozen("test", surfaces, nuisances=even))
         sets[name] = (at_full_press(read[0]), at_full_press(read[1]))

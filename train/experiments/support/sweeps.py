@@ -110,8 +110,8 @@ def with_lost_scans(frozen: FrozenSet, chance: float) -> FrozenSet:
     """Return the set with random scans replaced by the scan before; the first frame of a tap is never lost."""
     came = np.random.default_rng([SEED, 2]).random(len(frozen)) >= chance
     came |= np.diff(frozen.tap, prepend=-1) != 0
-    heard = np.maximum.accumulate(np.where(came, np.arange(len(frozen)), 0))
-    return replace(frozen, newest=frozen.newest[heard])
+    latest = np.maximum.accumulate(np.where(came, np.arange(len(frozen)), 0))
+    return replace(frozen, newest=frozen.newest[latest])
 
 
 def mistaken(sequences: Sequences, wrong: int) -> Sequences:

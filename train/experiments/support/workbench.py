@@ -29,6 +29,7 @@ from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
 from train.physics.sensor_noise import Nuisances
+from train.physics.simulated_sensor import FRAMES
 from train.report import Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import MAX_TAPS, Split
@@ -139,7 +140,7 @@ class Workbench:
     ) -> FrozenSet:
         """Return a frozen set made like the bundled one, with other surfaces, nuisances, scale or options if passed."""
         frozen = freeze(self.held_out(split, surfaces, **options), nuisances or Nuisances(), SEED, scale=scale)
-        return thinned(frozen, 8) if self.quick else frozen
+        return frozen.thinned(FRAMES) if self.quick else frozen  # one frame a tap
 
     def _made(self, name: str, config: Generation) -> Sequences:
         self.data_folder.mkdir(parents=True, exist_ok=True)
@@ -187,12 +188,6 @@ def _quick(training: Training) -> Training:
     options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
-
-
-def thinned(frozen: FrozenSet, one_in: int) -> FrozenSet:
-    """Return one frame in `one_in`, evenly over every tap: networks of the paper's size take long to evaluate."""
-    frames = ("newest", "tap", "indentation_mm", "force_n")
-    return replace(frozen, **{name: getattr(frozen, name)[one_in // 2 - 1 :: one_in] for name in frames})
 
 
 def _short_hash(config: Generation) -> str:
