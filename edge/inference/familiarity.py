@@ -5,6 +5,7 @@ same; the networks and their limits travel in a model's contract.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -57,31 +58,35 @@ def amplitude(tap: NDArray[np.float32]) -> float:
 
 
 def contact_features(tap: NDArray[np.float32], pad_row: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the features of one tap (3, rows, cols) in network units, with the model's pad input."""
-    size = amplitude(tap)
-    features = np.empty(tap.size + 1 + pad_row.size, dtype=np.float32)
-    shape = features[: tap.size]
-    np.multiply(tap.reshape(-1), 1 / size, out=shape)
-    np.clip(shape, -_MOST, _MOST, out=shape)
-    features[tap.size] = math.log(size)
-    features[tap.size + 1 :] = pad_row
+    """Return the features (1, inputs) of one tap (3, rows, cols) in network units, with the model's pad input."""
+    features = np.empty((1, tap.size + 1 + pad_row.size), dtype=np.float32)
+    features[0, tap.size] = math.log(_put_shape(tap, features[0, : tap.size]))
+    features[0, tap.size + 1 :] = pad_row
     return features
 
 
-def tap_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:
-    """Return the features of an earlier tap beside the newest one, both (3, rows, cols) in network units.
+def tap_features(window: NDArray[np.float32], steps: Sequence[int] | None = None) -> NDArray[np.float32]:
+    """Return the features (K - 1, inputs) of the earlier taps of a window, each beside the newest one.
 
     Args:
-        newest: the tap that goes on.
-        earlier: the tap that should be of the same contact.
-        steps: turns of the schedule between them.
+        window: (K, 3, rows, cols) in network units, newest tap first.
+        steps: turns of the schedule from the newest tap to each earlier one; by default 1, 2, ...
     """
-    sizes = amplitude(newest), amplitude(earlier)
-    features = np.empty(2 * newest.size + 4, dtype=np.float32)
-    one, difference = features[: newest.size], features[newest.size : 2 * newest.size]
-    np.multiply(newest.reshape(-1), 1 / sizes[0], out=one)
-    np.multiply(earlier.reshape(-1), 1 / sizes[1], out=difference)
-    np.clip(features[: 2 * newest.size], -_MOST, _MOST, out=features[: 2 * newest.size])
-    difference -= one
-    features[2 * newest.size :] = (math.log(sizes[0]), math.log(sizes[1]), steps, steps * steps)
+    readings = window[0].size
+    features = np.empty((len(window) - 1, 2 * readings + 4), dtype=np.float32)
+    newest, differences, sizes = features[:, :readings], features[:, readings : 2 * readings], features[:, -4:]
+    size = math.log(_put_shape(window[0], newest[0]))
+    newest[1:] = newest[0]
+    for row, tap in enumerate(window[1:]):
+        step = row + 1 if steps is None else steps[row]
+        sizes[row] = (size, math.log(_put_shape(tap, differences[row])), step, step * step)
+    differences -= newest
     return features
+
+
+def _put_shape(tap: NDArray[np.float32], place: NDArray[np.float32]) -> float:
+    """Put the readings of a tap, over its amplitude, into a row, and return the amplitude."""
+    size = amplitude(tap)
+    np.multiply(tap.reshape(-1), 1 / size, out=place)
+    np.clip(place, -_MOST, _MOST, out=place)
+    return size

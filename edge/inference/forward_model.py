@@ -6,7 +6,7 @@ only in part (`unexplained`), because pads, gains and large deformations differ;
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -18,14 +18,17 @@ from firmware_bridge.pad_geometry import AXES
 
 GRID: Final = 8
 """Cells of the pattern along a side: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
-_DRAG_GRID: Final = 4
+_CELLS: Final = GRID**2
 KPA: Final = 30.0
 """Tangential traction that counts as 1, in [kPa]."""
-FEATURES: Final = GRID**2 + 2 * _DRAG_GRID**2
+_DRAG_GRID: Final = 4
+"""Cells of the drag along a side in the contract; the traction has twice as many, and four of them share a weight."""
+FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2
+_INPUTS: Final = 3 * _CELLS
 _KEYS: Final = ("operator", "inverse", "spread", "noise", "model_error")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ForwardModel:
     """Operator from pattern and traction to the readings of a 4 x 4 sensor, linear in the pad's constants.
 
@@ -48,8 +51,11 @@ class ForwardModel:
     limit: float = math.inf
 
     def of_pad(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the operator (48, FEATURES) of a pad by its constants (p,) over their spread, 0 where unknown."""
-        return np.tensordot(values, self.operator[1:], 1).astype(np.float32) + self.operator[0]
+        """Return the operator of a pad for `features`, by its constants (p,) over their spread, 0 where unknown."""
+        short = np.tensordot(values, self.operator[1:], 1) + self.operator[0]
+        drag = short[:, _CELLS:].reshape(len(short), 2, _DRAG_GRID, 1, _DRAG_GRID, 1)
+        spread = np.broadcast_to(drag / 4, (*drag.shape[:3], 2, _DRAG_GRID, 2)).reshape(len(short), -1)
+        return np.concatenate([short[:, :_CELLS], spread], axis=1, dtype=np.float32)
 
     def mismatch(
         self,
@@ -70,17 +76,21 @@ class ForwardModel:
             traction: (3, h, w) in [kPa].
             gain_error: standard deviation of the gains that remain.
         """
-        readings = tap.reshape(-1)
-        z = tap[2].reshape(-1)
-        square = float(z @ z) / z.size
-        variance = readings * readings
-        variance *= np.float32(gain_error**2)
-        per_axis = self.noise * self.noise + self.model_error * self.model_error * np.float32(square)
-        variance.reshape(len(AXES), -1)[...] += per_axis[:, None]
-        left = operator @ features(pattern, traction) - readings
+        readings, z = tap.reshape(-1), tap[2].reshape(-1)
+        energy = readings * readings
+        weight = energy * np.float32(gain_error**2)
+        noise, model_error = self._variances
+        weight += model_error * np.float32((z @ z) / z.size) + noise
+        np.reciprocal(weight, out=weight)
+        left = operator @ features(pattern, traction)
+        left -= readings
         left *= left
-        left /= variance
-        return float(left.sum()) / max(float((readings * readings / variance).sum()), 1e-12)
+        return float(left @ weight) / max(float(energy @ weight), 1e-12)
+
+    @cached_property
+    def _variances(self) -> NDArray[np.float32]:
+        """Variances (2, 48) of noise, and of the operator's error over the square of the amplitude."""
+        return np.repeat(np.square([self.noise, self.model_error]), self.operator.shape[1] // len(AXES), axis=1)
 
     def smooth(
         self, tap: NDArray[np.float32], shape: tuple[int, int]
@@ -136,19 +146,28 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
 
 
 def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what the operator is applied to, (FEATURES,): means of the pattern's cells, then of the drag's."""
-    down = _pooling(pattern.shape[0], GRID) @ pattern @ _pooling(pattern.shape[1], GRID).T
-    drag = _pooling(traction.shape[1], _DRAG_GRID) @ traction[:2] @ _pooling(traction.shape[2], _DRAG_GRID).T
-    return np.concatenate([down.ravel(), drag.ravel() / np.float32(KPA)], dtype=np.float32)
+    """Return what a pad's operator is applied to: means of the pattern's cells, then the drag x, y in KPA."""
+    inputs = np.empty(_INPUTS, dtype=np.float32)
+    np.matmul(
+        _pooling(pattern.shape[0]) @ pattern, _pooling(pattern.shape[1]).T, out=inputs[:_CELLS].reshape(GRID, GRID)
+    )
+    np.multiply(traction[:2].reshape(-1), np.float32(1 / KPA), out=inputs[_CELLS:])
+    return inputs
+
+
+def condensed(inputs: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return features (n, inputs) with the means of four cells of the drag each, (n, FEATURES)."""
+    drag = inputs[:, _CELLS:].reshape(len(inputs), 2, _DRAG_GRID, 2, _DRAG_GRID, 2).mean(axis=(3, 5))
+    return np.concatenate([inputs[:, :_CELLS], drag.reshape(len(inputs), -1)], axis=1)
 
 
 @lru_cache
-def _pooling(length: int, cells: int) -> NDArray[np.float32]:
-    """Return the matrix (cells, length) of means over equal parts of a side."""
-    edges = np.linspace(0, length, cells + 1)
+def _pooling(length: int) -> NDArray[np.float32]:
+    """Return the matrix (GRID, length) of means over equal parts of a side."""
+    edges = np.linspace(0, length, GRID + 1)
     places = np.arange(length)
     share = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
-    return (share.clip(0) / (length / cells)).astype(np.float32)
+    return (share.clip(0) / (length / GRID)).astype(np.float32)
 
 
 @lru_cache

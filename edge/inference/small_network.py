@@ -43,15 +43,15 @@ class SmallNetwork:
         if width != 1:
             raise ValueError(f"{width} outputs, expected 1")
 
-    def __call__(self, features: NDArray[np.float32]) -> float:
-        """Return the output for a row of features (inputs,)."""
-        row = features
+    def __call__(self, features: NDArray[np.float32]) -> list[float]:
+        """Return the output for each row of features (n, inputs)."""
+        rows = features
         for weights, offsets in self._layers[:-1]:
-            row = row @ weights
-            row += offsets
-            np.maximum(row, 0.0, out=row)
+            rows = rows @ weights
+            rows += offsets
+            np.maximum(rows, 0.0, out=rows)
         weights, offsets = self._layers[-1]
-        return float((row @ weights)[0] + offsets[0])
+        return (rows @ weights + offsets).ravel().tolist()
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the layers as JSON, in half precision."""

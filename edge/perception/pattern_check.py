@@ -94,8 +94,7 @@ class PatternCheck:
             taps: taps in it; the rest is empty.
         """
         check = self._trust.tap
-        scores = (check.network(tap_features(window[0], window[step], step)) for step in range(1, taps))
-        return [_share(score - check.limit) for score in scores]
+        return [_share(score - check.limit) for score in check.network(tap_features(window[:taps]))]
 
     def judge(
         self,
@@ -118,15 +117,15 @@ class PatternCheck:
         if strength < self._least:
             return Verdict(checked=False, reason="stuck" if repeats >= REPEATS else None)
         trust = self._trust
-        score = trust.contact.network(contact_features(newest, self._pad_row)) - trust.contact.limit
-        self._weigh(tap, strength, score + trust.contact.limit)
+        (score,) = trust.contact.network(contact_features(newest, self._pad_row))
+        self._weigh(tap, strength, score)
         mismatch = None
         if traction is not None:
             mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
-        elif score > 0:
+        elif score > trust.contact.limit:
             reason = "unfamiliar"
         elif mismatch is not None and mismatch > trust.forward.limit:
             reason = "unexplained"

@@ -184,7 +184,7 @@ class TestPages:
     def test_families(self, bench, tmp_path, monkeypatch):
         monkeypatch.setattr(nominal, "TEST_FIGURES", 2)
         page = families.run(bench, tmp_path).read_text()
-        assert page.startswith("# families\n") and "quick run" in page and "contract version 5" in page
+        assert page.startswith("# families\n") and "quick run" in page and "contract version 6" in page
         methods = {row["method"]: row for row in rows_of(tmp_path / "families-methods.csv")}
         assert {"model", "model, all known", "bilinear", "linear map", "nearest 8", "kriging"} <= set(methods)
         assert all(float(row["run time us"]) > 0 for row in methods.values())

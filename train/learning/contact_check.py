@@ -62,7 +62,7 @@ def drawn_readings(presses: PressSet, seed: int) -> tuple[NDArray[np.float32], N
 
 def features_of(counts: NDArray[np.float32], pads: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features of readings (n, 3, rows, cols) in counts, with the pad inputs (n, p)."""
-    return np.stack([contact_features(tap, pad) for tap, pad in zip(counts / _UNIT, pads, strict=True)])
+    return np.concatenate([contact_features(tap, pad) for tap, pad in zip(counts / _UNIT, pads, strict=True)])
 
 
 def moved(rng: np.random.Generator, counts: NDArray[np.float32], *, mirror: bool = True) -> NDArray[np.float32]:
@@ -97,5 +97,5 @@ def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float,
     """Return the check whose limit a share of these presses exceeds, read by sensors of several certainties."""
     readings, pads = drawn_readings(presses, seed)
     strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
-    scores = np.array([network(row) for row in features_of(readings[strong], pads[strong])])
-    return Check(network, limit_of(scores, false_alarms))
+    scores = network(features_of(readings[strong], pads[strong]))
+    return Check(network, limit_of(np.array(scores), false_alarms))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.familiarity import QUIET_UNITS
-from edge.inference.forward_model import GRID, ForwardModel, features, forward_model
+from edge.inference.forward_model import GRID, ForwardModel, condensed, features, forward_model
 from firmware_bridge.pad_geometry import AXES
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.press_batches import read_presses
@@ -27,7 +27,7 @@ def fit_forward_model(presses: PressSet, seed: int = 0) -> ForwardModel:
     """
     clean = _units(presses.counts[:, 0])
     size = _amplitude(clean)[:, None]
-    inputs = np.stack([features(*maps) for maps in zip(*_maps(presses), strict=True)]) / size
+    inputs = condensed(np.stack([features(*maps) for maps in zip(*_maps(presses), strict=True)])) / size
     constants = presses.constants.astype(np.float64)
     columns = np.concatenate([inputs, *(inputs * constants[:, [number]] for number in range(len(INPUTS)))], axis=1)
     weights = _least_squares(columns, clean / size)

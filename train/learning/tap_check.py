@@ -68,13 +68,12 @@ def turned(rng: np.random.Generator, windows: NDArray[np.float32]) -> NDArray[np
 
 def pair_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:
     """Return the features (n, inputs) of pairs of taps, both (n, 3, rows, cols) in counts."""
-    pairs = zip(newest / _UNIT, earlier / _UNIT, strict=True)
-    return np.stack([tap_features(one, other, steps) for one, other in pairs])
+    pairs = np.stack([newest, earlier], axis=1) / _UNIT
+    return np.concatenate([tap_features(pair, (steps,)) for pair in pairs])
 
 
 def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
     """Return the check whose limit a share of the earlier taps of these presses exceeds."""
     windows = read_twice(presses, seed)
     rows = [pair_features(windows[:, 0], windows[:, steps], steps) for steps in range(1, presses.taps)]
-    scores = np.array([network(row) for row in np.concatenate(rows)])
-    return Check(network, limit_of(scores, false_alarms))
+    return Check(network, limit_of(np.array(network(np.concatenate(rows))), false_alarms))
