@@ -24,7 +24,7 @@ from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
 
 PICTURES: Final = Path(__file__).with_name("pictures")
-TAKEN: Final = 5
+TAKEN: Final = 6
 DESKTOP: Final = (1280, 800)
 PHONE: Final = (390, 844)
 HELD_SCANS: Final = 3000
@@ -41,8 +41,22 @@ def held_demo() -> NDArray[np.int32]:
         counts, tap, depth_mm = data["counts"].astype(np.int32), data["tap"], data["indentation_mm"]
     last = np.flatnonzero(tap == tap.max())
     peak = last[np.argmax(depth_mm[last])]
-    noise = np.random.default_rng(1).integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (HELD_SCANS, *counts.shape[1:]))
-    return np.concatenate([counts[: peak + 1], (counts[peak] + noise).astype(np.int32)])
+    return np.concatenate([counts[: peak + 1], counts[peak] + noise()])
+
+
+def magnet_near() -> NDArray[np.int32]:
+    """Return counts (n, 3, 4, 4) of the demo's pad at rest, followed by a long press with the magnet near it."""
+    with np.load(demo_recording()) as data:
+        counts, tap, scene = data["counts"].astype(np.int32), data["tap"], data["scene"]
+    rest, scenes = counts[: np.argmax(tap >= 0)], counts[scene == scene.max()]
+    peak = scenes[scenes[:, 2].sum(axis=(1, 2)).argmax()]
+    return np.concatenate([rest, np.broadcast_to(peak, (HELD_SCANS, *peak.shape)) + noise()])
+
+
+def noise() -> NDArray[np.int32]:
+    """Return noise (n, 3, 4, 4) in counts for a long hold, without which a taxel would repeat itself."""
+    rng = np.random.default_rng(1)
+    return rng.integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (HELD_SCANS, 3, 4, 4)).astype(np.int32)
 
 
 def emulator(folder: Path, *tracks: NDArray[np.int32]) -> Emulator:
@@ -124,6 +138,11 @@ def main() -> None:
             page = look(browser, url, DESKTOP, "light")
             await_hold(page)
             keep(page, "two", bar)
+        with emulator(Path(folder), magnet_near()) as bus, live_page(bus.port) as (_, url):
+            page = look(browser, url, DESKTOP, "light")
+            page.locator(".doubted").wait_for()
+            page.wait_for_timeout(1000 * LOOKS_S)
+            keep(page, "untrusted", bar)
         browser.close()
 
 
