@@ -3,7 +3,6 @@
 import os
 import re
 from dataclasses import replace
-from io import BytesIO
 from itertools import count
 from pathlib import Path
 
@@ -28,10 +27,8 @@ from browser_samples import (
     word,
 )
 from edge_samples import make_pad_contract
-from matplotlib.image import imread
-from view_samples import CONTRACT, Press, live_page, wait_for
+from view_samples import Press, live_page, wait_for
 
-from edge.perception.event import Event
 from edge.perception.wrench import Wrench
 from edge.sinks.binary_message import unpack
 from edge.view.static_page import page_script
@@ -350,79 +347,3 @@ def test_force_and_torque_are_told_and_drawn_where_the_model_gives_them(open_pag
         page = open_page(shown.view.url)
         live(page)
         assert number(page, "wrench_force").count() == 0
-
-
-def red_share(page):
-    """Return the share of red in a picture of the pattern."""
-    picture = imread(BytesIO(part(page, "field").screenshot()))
-    return float(np.mean((picture[..., 0] > 0.55) & (picture[..., 0] > 2 * picture[..., 1])))
-
-
-@pytest.mark.parametrize("viewport", [(1280, 800), (844, 390)])
-def test_a_pattern_that_is_not_believed_cannot_be_taken_for_one_that_is(open_page, tmp_path, viewport):
-    checked = replace(CONTRACT, trust={"made": "of something"})
-    verdicts = {
-        True: {"trusted": True, "mismatch": 0.021, "tap_mismatch": (0.0, 0.25), "estimate": "network"},
-        False: {"trusted": False, "mismatch": 0.4, "untrusted_reason": "unfamiliar", "estimate": "smooth"},
-        None: {"trusted": None, "estimate": "network"},
-    }
-    with live_page(tmp_path, contract=checked) as shown:
-        made, numbers, verdict = Press().next(), count(1), [True]
-
-        def again():
-            """The same contact, as in the test before."""
-            again = next(numbers)
-            scan = replace(made.scan, number=again, time_ns=again * PERIOD_NS)
-            return replace(made, scan=scan, **verdicts[verdict[0]])
-
-        shown.press.next = again
-        with shown.playing():
-            page = open_page(shown.view.url, viewport=dict(zip(("width", "height"), viewport, strict=True)))
-            live(page)
-            playwright.expect(number(page, "trusted")).to_have_text("yes")
-            playwright.expect(number(page, "mismatch")).to_have_text("2.1\u202f%")
-            playwright.expect(number(page, "tap_mismatch")).to_have_text("0.00, 0.25")
-            playwright.expect(part(page, "verdict")).to_be_hidden()
-            playwright.expect(number(page, "reused_from")).to_have_text("new")
-            assert red_share(page) < 0.01
-            verdict[0] = False
-            word(page, "contact, not believed")
-            playwright.expect(part(page, "verdict")).to_have_text(
-                "not to be believed: readings like no contact (a magnet or steel near? the id map? the axes?)"
-            )
-            playwright.expect(part(page, "verdict")).to_be_in_viewport()
-            playwright.expect(page.locator("#live")).to_have_text("sensor 4: contact, not believed")
-            playwright.expect(number(page, "trusted")).to_have_text("no: unfamiliar")
-            playwright.expect(number(page, "reused_from")).to_have_text("new, smooth")
-            assert red_share(page) > 0.25
-            page.keyboard.press("Space")
-            word(page, "paused")
-            assert red_share(page) > 0.25, "it stays what it was while it is looked at"
-            page.keyboard.press("Space")
-            verdict[0] = None
-            playwright.expect(part(page, "verdict")).to_have_text(
-                "too light to check whether the pattern is to be believed"
-            )
-            playwright.expect(number(page, "trusted")).to_have_text("too light to check")
-            word(page, "contact")
-            assert red_share(page) < 0.01
-    with live_page(tmp_path) as shown, shown.playing():
-        page = open_page(shown.view.url)
-        live(page)
-        playwright.expect(part(page, "verdict")).to_be_hidden()
-        playwright.expect(number(page, "trusted")).to_have_text(re.compile("not checked|\u2013"))
-
-
-def test_a_dropped_tap_is_told_as_an_event_and_a_suspected_sensor_in_red(open_page, tmp_path):
-    with live_page(tmp_path) as shown:
-        page = open_page(shown.view.url)
-        for kind, detail in (
-            ("tap_dropped", "the tap before does not belong to this contact, and is forgotten"),
-            ("suspected", ""),
-        ):
-            for sink in shown.view.sinks:
-                sink.tell(Event(0, kind, "4", detail), {})
-        logged(page, "sensor 4: the tap before does not belong to this contact, and is forgotten")
-        playwright.expect(page.locator("#log .bad")).to_have_text(
-            re.compile("several contacts in a row read like none")
-        )
