@@ -17,12 +17,14 @@ from train.physics.sensor_noise import Nuisances, read_windows
 _NOTHING: Final = 0.35
 _ALL: Final = 0.35
 """Shares of windows with no or all constants of the pad as input; in the others each is drawn with probability .5."""
-_GAINS: Final = 0.45
-"""Share of windows with the sensor's gains as input."""
+_GAIN_SPREADS: Final = ((0.4, 1.0), (0.15, 1.6), (0.15, 0.1), (0.15, 0.3), (0.15, 0.6))
+"""Share of windows, and the spread of their gains over that of a new sensor.
+
+The first two are new sensors, the second kind wider than most; in the others calibration leaves a tenth to three fifths
+of the spread, which the certainty of the gains states.
+"""
 _SURE: Final = 0.1
 """Standard deviation of a constant used as input, over its spread: error that calibration leaves."""
-_LEFT_GAIN: Final = 0.015
-"""Standard deviation of a gain used as input: error that calibration leaves."""
 
 
 class PressBatches:
@@ -72,11 +74,14 @@ class PressBatches:
         rng = np.random.default_rng([self._seed, 1, number])
         index = np.concatenate([part(number) for part in self._parts])
         picked = self._presses.pick(index)
-        gains_known = rng.permutation(len(index)) < round(_GAINS * len(index))
+        certainty = np.zeros(len(index), dtype=np.float32)
         readings = np.empty_like(picked.counts)
-        for part, gain_spread in ((gains_known, _LEFT_GAIN), (~gains_known, self._nuisances.gain_spread)):
-            if part.any():
-                nuisances = replace(self._nuisances, gain_spread=gain_spread)
+        ends = np.rint(np.cumsum([share for share, _ in _GAIN_SPREADS]) * len(index)).astype(int)[:-1]
+        for part, (_, spread) in zip(np.split(rng.permutation(len(index)), ends), _GAIN_SPREADS, strict=True):
+            if len(part):
+                certainty[part] = max(1 - spread, 0)
+                new = Nuisances() if spread < 1 else self._nuisances
+                nuisances = replace(self._nuisances, gain_spread=spread * new.gain_spread)
                 readings[part] = read_presses(picked.pick(part), nuisances, int(rng.integers(2**62)))
         taps = len(self._given)
         there = np.ones(len(index), dtype=np.int64)
@@ -88,7 +93,7 @@ class PressBatches:
         batch = Batch(
             window=network_input(readings),
             pattern=torch.from_numpy(picked.patterns.astype(np.float32)),
-            pad=torch.from_numpy(self._known(rng, picked.constants, gains_known)),
+            pad=torch.from_numpy(self._known(rng, picked.constants, certainty)),
             traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
         )
         if taps > 1 or not self._mirror:  # a mirrored pad would turn the other way from tap to tap
@@ -97,13 +102,13 @@ class PressBatches:
 
     @staticmethod
     def _known(
-        rng: np.random.Generator, constants: NDArray[np.float32], gains_known: NDArray[np.bool_]
+        rng: np.random.Generator, constants: NDArray[np.float32], certainty: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         toss = rng.random(len(constants))[:, None]
         coins = rng.random(constants.shape) < 0.5
         known = np.where(toss < _NOTHING, False, (toss < _NOTHING + _ALL) | coins)
         unsure = (_SURE * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
-        return known_numbers(constants + unsure, known, gains_known)
+        return known_numbers(constants + unsure, known, certainty)
 
 
 class _Part:

@@ -132,7 +132,7 @@ INPUTS: Final = (
 """Constants that a network takes as optional inputs."""
 
 KNOWN: Final = 2 * len(INPUTS) + 1
-"""Number of pad inputs of a network: values, a flag for each of them, and a flag for the gains."""
+"""Number of pad inputs of a network: values, a flag for each of them, and the certainty of the gains."""
 
 
 def draw_pad(rng: np.random.Generator, spread: float = 1.0) -> Pad:
@@ -157,14 +157,15 @@ def constants(pad: Pad) -> NDArray[np.float32]:
 
 
 def known_numbers(
-    scaled: NDArray[np.float32], known: NDArray[np.bool_], gains_known: NDArray[np.bool_]
+    scaled: NDArray[np.float32], known: NDArray[np.bool_], certainty: NDArray[np.floating] | NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Return the pad inputs (n, KNOWN) of a network; all zeros without any constant.
 
     Args:
         scaled: constants over their spread, (n, len(INPUTS)).
         known: flags of the constants to pass on, same shape.
-        gains_known: (n,), True where readings were divided by the sensor's gains.
+        certainty: (n,) of the gains that readings were divided by: 1 less their deviation over the spread of a new
+            sensor's, 1 for the true gains and 0 for none.
     """
     flags = known.astype(np.float32)
-    return np.concatenate([scaled * flags, flags, gains_known.astype(np.float32)[:, None]], axis=1)
+    return np.concatenate([scaled * flags, flags, certainty.astype(np.float32)[:, None]], axis=1)
