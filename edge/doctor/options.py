@@ -8,9 +8,10 @@ from edge.terminal.argument_types import Parser, add_source, positive
 
 DOCTOR_HELP: Final = """\
 Keep the pad free and still until you
-are asked to press its corners. Hold it
-as patterns are to be drawn; that is
-what top and left mean.
+are asked to press its corners, and to
+grip something flat. Hold the pad as
+patterns are to be drawn; that is what
+top and left mean.
 
 examples:
   edge-sr doctor
@@ -41,7 +42,13 @@ def doctor_parser() -> argparse.ArgumentParser:
     add("--drift-s", metavar="T", type=positive, default=DOCTOR_DRIFT_S, help=drift_help)
     add("--baseline", metavar="FILE", type=Path, help="stored baseline, to see whether something lies on the pad")
     add("--no-press", action="store_true", help="do not ask for presses on the corners")
+    add("--no-grip", action="store_true", help="do not ask for grips of something flat")
     add("--weight-g", metavar="G", type=positive, help="ask for a weight on the pad; gives counts per newton")
+    add(
+        "--forget-gains",
+        metavar="SENSOR",
+        help="remove what was learned of its gains from the file of --sensor, and end",
+    )
     add("--out", metavar="FILE", type=Path, help="write what was found into a sensor file")
     add("--json", action="store_true", help="one JSON document on stdout")
     return parser
