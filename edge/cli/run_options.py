@@ -246,6 +246,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     )
     add("--every-scan", action="store_true", help="infer also where nothing has changed since the pattern before")
     add("--every-tap", action="store_true", help="use also taps that are not expected to help")
+    add("--no-learn", dest="learn", action="store_false", help="do not learn the gains of the sensor from contacts")
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:

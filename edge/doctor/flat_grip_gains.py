@@ -94,7 +94,7 @@ def load_table(path: Path) -> FlatGripTable:
     return table
 
 
-def grip_features(grips: Sequence[NDArray[np.floating]]) -> NDArray[np.float64] | None:
+def grip_features(grips: Sequence[NDArray[np.floating]]) -> NDArray[np.floating] | None:
     """Return the features of a sensor's grips; NaN for those of an axis without a drag, None without a strong grip."""
     used = [found for found in map(_used, grips) if found is not None]
     if not used:
@@ -138,7 +138,7 @@ def _tilt(read: NDArray[np.float64], means: NDArray[np.float64], weight: NDArray
 
 def _slopes(
     used: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]], weights: Sequence[NDArray[np.float64]]
-) -> NDArray[np.float64]:
+) -> NDArray[np.floating]:
     """Return the slopes (3, GAINS) of readings over the means of z, x and y, with a level of its own for each grip."""
     square, product = np.diag(_RIDGE), np.zeros((3, GAINS))
     for (read, means), weight in zip(used, weights, strict=True):

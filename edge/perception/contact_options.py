@@ -23,6 +23,7 @@ class RuntimeOptions:
         every_scan: infer also where nothing has changed beyond noise since the last pattern.
         every_tap: use all available taps, also those that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
+        learn: learn the gains of the channels from contacts.
 
     Raises:
         UsageError: the contact thresholds or the time are out of range.
@@ -34,6 +35,7 @@ class RuntimeOptions:
     every_scan: bool = False
     every_tap: bool = False
     follow_drift: bool = True
+    learn: bool = True
 
     def __post_init__(self) -> None:
         on_counts, off_counts = self.contact_on_counts, self.contact_off_counts

@@ -9,7 +9,9 @@ from typing import Final, Literal, NamedTuple, get_args
 
 from firmware_bridge.links.base import Notice, NoticeKind
 
-EventKind = Literal[NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level"]
+EventKind = Literal[
+    NoticeKind, "sink", "reset", "zeroing", "zeroed", "refused", "in_contact", "given_up", "rest_level", "gains_learned"
+]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
 NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]
@@ -33,7 +35,7 @@ class Event:
             Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
             has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
-            its end.
+            its end; "gains_learned", gains learned from contacts are in use.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
 
@@ -65,7 +67,7 @@ class Event:
                 return f"zeroing refused: sensor {self.sensor} is in contact: {remedy}"
             case "given_up":
                 return f"sensor {self.sensor}: zeroing given up, the old baseline stays: {self.detail}"
-            case "rest_level":
+            case "rest_level" | "gains_learned":
                 return f"sensor {self.sensor}: {self.detail}"
             case _:
                 return self.detail

@@ -18,7 +18,7 @@ from edge.inference.bundled import FLAT_GRIPS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import load_sensor_file
-from train.data.flat_grips import DRAGS, LEVELS
+from train.data.grip_ramps import DRAGS, LEVELS
 from train.learning.flat_grips import draw_gains, grips_of_pad, log_gains
 
 PERIOD_S = 0.01

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edge.doctor.flat_grip_gains import FEATURES, FlatGripTable, grip_features
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS
-from train.data.flat_grips import even_gains, flat_grips, read_grips
+from train.data.grip_ramps import even_gains, flat_grips, read_grips
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import draw_pad
 

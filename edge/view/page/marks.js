@@ -71,7 +71,7 @@ const NUMBERS = {
     ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure at", "centre_of_pressure_mm"],
     ["sensitivity", "wrench_origin"],
   ],
-  Doubt: [["90 % within", "interval_mm"], ["expected RMSE", "expected_rmse_mm"], ["pattern", "reused_from"]],
+  Doubt: [["90 % within", "interval_mm"], ["expected RMSE", "expected_rmse_mm"], ["pattern", "reused_from"], ["gains", "gains_certainty"]],
   Pace: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["model", "model"]],
   Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
   Baseline: [["which", "baseline"], ["from", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["own, step", "own"]],

@@ -22,7 +22,7 @@ _SPREAD: Final = 0.2
 _TILT: Final = np.tan(np.radians(0.25))
 """Standard deviation of the face's slope along x and y: a hand lets the face lie down on the pad."""
 _ROCK: Final = 0.3
-"""How much the slope changes during a grip, over that at its beginning."""
+"""Largest change of the slope during a grip, over the slope at its beginning."""
 _DRAG_COUNTS: Final = 250.0
 """Mean change of x or y at the end of a drag; each drag's differs by a fifth."""
 _FRICTION: Final = (0.4, 1.0)
