@@ -113,6 +113,9 @@ class Stream:
         finally:
             if self._keeper is not None:
                 self._keeper.close()
+                if self._keeper.trouble is not None:
+                    detail = f"learned gains are not kept: {self._keeper.trouble}"
+                    self._tell(Event(self._clock_ns(), "note", None, detail))
 
     def _made(self) -> Iterator[Result]:
         for taken in self._taken():

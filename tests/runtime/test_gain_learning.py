@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, make_pad_contract
+from edge_samples import BASELINE, FakeLink, FakeModel, make_pad_contract
 from runtime_samples import make_runtime
 
 from edge.cli import main as cli
@@ -15,6 +15,8 @@ from edge.perception.gain_following import HELD_SCANS, GainFollower
 from edge.perception.gain_learning import BOUND, REMEMBERED, SOLVE_EVERY, ContactModel, GainLearner, load_contact_model
 from edge.perception.result import Result
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
+from edge.pipeline.result_stream import Stream
+from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import GAINS, Pad
@@ -274,6 +276,16 @@ class TestKeeping:
         keeper.close()
         assert keeper.trouble is not None and "gone.toml: cannot be read" in keeper.trouble
 
+    def test_a_stream_reports_that_gains_cannot_be_kept(self, file):
+        events = []
+        with Source(FakeLink([]), sensor_file=load_sensor_file(file)) as source:
+            stream = Stream(source, make_runtime(FakeModel()), on_event=events.append)
+            file.unlink()
+            stream._keeper.keep("4", LEARNED)
+            assert list(stream) == []
+        assert [event.kind for event in events] == ["note"]
+        assert "learned gains are not kept: " in events[0].text and "cannot be read" in events[0].text
+
     def test_one_command_forgets_them(self, file, capsys):
         keep_learned(file, "4", LEARNED)
         assert cli.main(["doctor", "--sensor", str(file), "--forget-gains", "4"]) == 0
@@ -286,3 +298,22 @@ class TestKeeping:
             forget_learned(file, "4")
         assert cli.main(["doctor", "--forget-gains", "4"]) == 2
         assert "add --sensor FILE" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(("kind", "kept"), [("device", True), ("emulated", False), ("replay", False)])
+    def test_a_stream_keeps_what_its_runtime_learns_of_a_device(self, file, kind, kept):
+        series, scans = ScanSeries("4", USPA44), []
+        for contact in draw_contacts(100, draw_gains()):
+            for felt in (contact, np.zeros((3, 4, 4))):
+                counts = np.rint(BASELINE.counts + felt).astype(np.int32)
+                scans.append([series.close(counts, 10_000_000 * (len(scans) + 1))])
+        link = FakeLink(scans, kind=kind)
+        link.patient = True  # else newer scans overtake contacts, and those get no pattern
+        with Source(link, sensor_file=load_sensor_file(file)) as source:
+            model = FakeModel(make_pad_contract(taps=1))
+            runtime = make_runtime(model, contacts=MODEL, source=kind)
+            last = list(Stream(source, runtime))[-1]
+        learned = load_sensor_file(file).sensors["4"].learned
+        assert last.gains_certainty is not None and last.gains_certainty > 0.1
+        assert (learned is not None) == kept
+        if learned is not None:
+            assert learned.gains_certainty == pytest.approx(last.gains_certainty, abs=1e-6)
