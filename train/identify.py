@@ -28,7 +28,7 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
 from train.learning.contact_mixture import CONSTANTS, normalise
-from train.learning.gain_estimate import learned, pad_learned
+from train.learning.gain_estimate import learned
 from train.physics.pad_draws import RANGES
 
 _APART: Final = 0.1
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for sensor, counts in contacts.items():
             learner = learned(counts, model)
             name = sensor.removeprefix(_PREFIX)
-            pads[name] = pad_learned(learner)
+            pads[name] = learner.pad()
             sys.stdout.write(table(name, learner.contacts, pads[name]) + "\n")
         if options.out is not None:
             save_sensor_file(options.out, extended(options.out, pads))

@@ -34,7 +34,9 @@ class GainFollower:
         """Begin with the gains of a pad, if it has any."""
         self.waiting = False
         self._learner = GainLearner(model, pad)
-        self._used = Pad() if pad is None else pad
+        self._used = self._by_hand = Pad() if pad is None else replace(pad, gains=None, gain_half_widths=None)
+        if pad is not None:
+            self._used = pad
         self._strongest = np.zeros(0, dtype=np.float32)
         self._force_counts = 0.0
         self._seen = 0
@@ -43,6 +45,11 @@ class GainFollower:
     def contacts(self) -> int:
         """Number of distinct contacts so far."""
         return self._learner.contacts
+
+    @property
+    def learned(self) -> Pad:
+        """Pad by the contacts alone."""
+        return self._learner.pad()
 
     def see(self, result: Result, counts: NDArray[np.float32]) -> bool:
         """Take note of a contact's result and its readings (3, rows, cols); return whether it is time to learn.
@@ -67,8 +74,8 @@ class GainFollower:
         if new.gains is None or new.gains_certainty < max(_LEAST_CERTAINTY, used.gains_certainty):
             return None
         shift = np.log(new.gains) - (0.0 if used.gains is None else np.log(used.gains))
-        surer = new.gains_certainty >= used.gains_certainty + SURER
+        surer = new.gains_certainty >= used.gains_certainty + SURER or not set(new.constants) <= set(used.constants)
         if not surer and np.sqrt(np.square(shift).mean()) < SHIFTED:
             return None
-        self._used = replace(used, gains=new.gains, gain_half_widths=new.gain_half_widths)
+        self._used = new.behind(self._by_hand)
         return self._used

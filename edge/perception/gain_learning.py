@@ -19,7 +19,7 @@ from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.npz_reader import read_npz
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, UNMEASURED_CERTAINTY, Pad
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
 
 TAXELS: Final = USPA44.taxel_count
 LARGEST_COUNTS: Final = (1390.0, 1390.0, 13400.0)
@@ -46,6 +46,10 @@ _UNEXPLAINED: Final = 40.0
 """Squared distance from every component, over its mean on an even sensor, beyond which a contact teaches nothing."""
 _EVEN: Final = 1e-3
 """Deviation to which each axis' mean is held: that of z is counts per newton, and of x and y the in-plane share."""
+_OPEN: Final = 1 / np.sqrt(3)
+"""Prior deviation of a constant over half of its range: uniform within it."""
+_DETERMINED: Final = 0.7
+"""Largest deviation of a constant that counts as determined, over that of its prior."""
 _LEAST_DEVIATION: Final = 1e-3
 _LEAN: Final = 0.025
 _UNEVEN_COUNTS: Final = 30.0
@@ -56,6 +60,10 @@ _BIASED: Final = 30.0
 _STEPS: Final = 4
 _LONGEST_STEP: Final = 0.1
 _MOST_BYTES: Final = 1 << 23
+_ARRAYS: Final = (
+    *("share", "means", "factors", "widening", "bias"),
+    *("names", "middles", "halves", "constant_widening"),
+)
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
 _ROWS: Final = np.concatenate([np.arange(GAINS), np.arange(2 * TAXELS), np.arange(2 * TAXELS, GAINS), np.arange(GAINS)])
 """Channel that each parameter acts on: inverse gains, leans, unevenness, offsets."""
@@ -74,6 +82,8 @@ class ContactModel:
         precisions: (k, GAINS, GAINS).
         widening: factor on deviations, so that 90 % intervals hold nine in ten gains of simulated sensors.
         bias: (GAINS,), mean error of the log-gains of simulated sensors after many contacts.
+        constants: name of each of the p constants, middle of its range, and half of the range.
+        constant_widening: factor on their deviations, likewise.
     """
 
     log_shares: NDArray[np.float64]
@@ -81,6 +91,8 @@ class ContactModel:
     precisions: NDArray[np.float32]
     widening: float
     bias: NDArray[np.float64]
+    constants: tuple[tuple[str, float, float], ...]
+    constant_widening: float
 
 
 def load_contact_model(path: Path = CONTACTS) -> ContactModel:
@@ -90,15 +102,17 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         EdgeError: the file cannot be read, or is of another pad.
     """
     try:
-        arrays = read_npz(path, ["share", "means", "factors", "widening", "bias"], _MOST_BYTES)
+        arrays = read_npz(path, _ARRAYS, _MOST_BYTES)
+        names, middles, halves = (arrays[name].tolist() for name in ("names", "middles", "halves"))
+        constants = tuple(zip(names, middles, halves, strict=True))
         factors = arrays["factors"].astype(np.float64)
         count = len(factors)
-        if factors.shape != (count, GAINS, GAINS) or arrays["means"].shape[::2] != (count, GAINS):
+        if factors.shape != (count, GAINS, GAINS) or arrays["means"].shape != (count, 1 + len(constants), GAINS):
             raise ValueError(f"factors are {factors.shape}, expected (k, {GAINS}, {GAINS})")
         log_size = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
         if not np.isfinite(log_size).all():
             raise ValueError("a component is singular")
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise EdgeError(
             f"{path} cannot be read ({error}): make it with 'python -m train.learning.contact_mixture'"
         ) from error
@@ -108,6 +122,8 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         (factors.transpose(0, 2, 1) @ factors).astype(np.float32),
         float(arrays["widening"]),
         arrays["bias"].astype(np.float64).reshape(GAINS),
+        constants,
+        float(arrays["constant_widening"]),
     )
 
 
@@ -159,9 +175,26 @@ class GainLearner:
         return (np.exp(-biased * self._model.bias) / self._best[:GAINS]).clip(1 - BOUND, 1 + BOUND)
 
     def pad(self) -> Pad:
-        """Return the gains with half widths of their 90 % intervals."""
+        """Return the gains with half widths of their 90 % intervals, and with intervals the constants that show."""
         half = (LEVEL_90 * self.deviations).clip(0, 1)
-        return Pad(gains=tuple(self.gains.round(4).tolist()), gain_half_widths=tuple(half.round(4).tolist()))
+        constants: dict[str, float] = {}
+        intervals: dict[str, tuple[float, float]] = {}
+        for at in np.flatnonzero(self.determined):
+            name, middle, spread = self._model.constants[at]
+            if name in PAD_RANGES:
+                value = self.constants[at]
+                ends = np.clip(value + LEVEL_90 * self.constant_deviations[at] * np.array([-1, 1]), -1, 1)
+                low, constants[name], high = (
+                    float(f"{middle + spread * one:.4g}") for one in (ends[0], value, ends[1])
+                )
+                intervals[name] = (low, high)
+        gains = tuple(self.gains.round(4).tolist())
+        return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=tuple(half.round(4).tolist()))
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """Constants (p,) that are well within the prior, and not at an end of their range."""
+        return (self.constant_deviations < _DETERMINED * _OPEN) & (np.abs(self.constants) < 1)
 
     def again(self) -> "GainLearner":
         """Return a learner that has learned nothing yet and begins to look from these results: for a further pass."""
@@ -268,9 +301,9 @@ class GainLearner:
         self._best += step * min(1.0, _LONGEST_STEP / max(longest, 1e-9))
         self._best[:GAINS] = self._best[:GAINS].clip(1 / (1 + BOUND), 1 / (1 - BOUND))
         self._best[_LINEAR:] = self._best[_LINEAR:].clip(-1.2, 1.2)
-        spread = self._model.widening * np.sqrt(np.diag(covariance).clip(0))
-        self.deviations = spread[:GAINS] / self._best[:GAINS]
-        self.constant_deviations = np.minimum(spread[_LINEAR:], 1 / np.sqrt(3))
+        spread = np.sqrt(np.diag(covariance).clip(0))
+        self.deviations = self._model.widening * spread[:GAINS] / self._best[:GAINS]
+        self.constant_deviations = np.minimum(self._model.constant_widening * spread[_LINEAR:], _OPEN)
         self._find_centres()
         return longest > 1e-3
 

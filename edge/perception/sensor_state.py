@@ -110,7 +110,7 @@ class Sensor:
         pad = None if self.follower is None else self.follower.learn(self.watch.dead)
         if pad is None or self.follower is None:
             return
-        self.pad = self._learned = pad
+        self.pad, self._learned = pad, self.follower.learned
         self.take_pad(contract)
         self.last = None  # its pattern was made with other gains
         widths = pad.gain_half_widths or ()

@@ -67,8 +67,7 @@ def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = Fals
     before = entry.learned
     if (emulated and not entry.emulated) or (before is not None and before.gains_certainty > learned.gains_certainty):
         return
-    gains = Pad(gains=learned.gains, gain_half_widths=learned.gain_half_widths)
-    entry = replace(entry, learned=gains)
+    entry = replace(entry, learned=learned)
     save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: entry}), keep_before=False)
 
 

@@ -110,6 +110,18 @@ class Pad:
         deviation = math.sqrt(sum(width**2 for width in self.gain_half_widths) / len(self.gains)) / LEVEL_90
         return min(max(1 - deviation / GAIN_SPREAD, 0.0), 1.0)
 
+    def behind(self, other: "Pad") -> "Pad":
+        """Return another pad, with the constants and gains of this one where the other has none."""
+        constants = self.constants | other.constants
+        intervals = {name: ends for name, ends in self.intervals.items() if name not in other.constants}
+        own = self if other.gains is None else other
+        return Pad(
+            **constants,
+            intervals=intervals | dict(other.intervals),
+            gains=own.gains,
+            gain_half_widths=own.gain_half_widths,
+        )
+
     def turned(self, found: Mounting) -> "Pad":
         """Return the same pad under a mounting that was corrected by `found`: its gains follow the places and axes."""
         if self.gains is None:

@@ -71,11 +71,13 @@ class SensorEntry:
 
     @property
     def used_pad(self) -> Pad | None:
-        """Pad with the learned gains where they are surer than those by hand."""
+        """Pad with what was learned where that is not there by hand, and with learned gains that are surer."""
         learned, pad = self.learned, self.pad
-        if learned is None or (pad is not None and pad.gains_certainty >= learned.gains_certainty):
-            return pad
-        return replace(pad or Pad(), gains=learned.gains, gain_half_widths=learned.gain_half_widths)
+        if learned is None or pad is None:
+            return learned or pad
+        if pad.gains_certainty < learned.gains_certainty:
+            pad = replace(pad, gains=None, gain_half_widths=None)
+        return learned.behind(pad)
 
 
 @dataclass(frozen=True)

@@ -277,3 +277,15 @@ def test_numpys_numbers_are_written_as_numbers_and_a_silent_taxel_not_at_all(tmp
     with pytest.raises(SensorFileError, match="a taxel of sensor 4 was silent while zeroing: zero again"):
         save_sensor_file(tmp_path / "t.toml", SensorFile(sensors={"4": SensorEntry(baseline=silent)}))
     assert not (tmp_path / "t.toml").exists()
+
+
+def test_learned_constants_are_used_where_there_are_none_by_hand():
+    gains = {"gains": (1.0,) * 48, "gain_half_widths": (0.05,) * 48}
+    learned = Pad(
+        poisson=0.42, thickness_mm=5.0, intervals={"poisson": (0.41, 0.43), "thickness_mm": (4.8, 5.2)}, **gains
+    )
+    by_hand = Pad(thickness_mm=4.0, gains=(0.9,) * 48, gain_half_widths=(0.01,) * 48)
+    used = SensorFile(sensors={"4": SensorEntry(pad=by_hand, learned=learned)}).pads["4"]
+    assert used.constants == {"thickness_mm": 4.0, "poisson": 0.42} and used.intervals == {"poisson": (0.41, 0.43)}
+    assert used.gains == by_hand.gains and used.gain_half_widths == by_hand.gain_half_widths
+    assert SensorFile(sensors={"4": SensorEntry(learned=learned)}).pads["4"] == learned

@@ -38,7 +38,7 @@ def make_model(seed=0, kinds=3):
     covariances = mixing @ mixing.transpose(0, 2, 1) + 1e-3 * np.eye(GAINS)
     logs = -0.5 * np.linalg.slogdet(covariances)[1] - np.log(kinds)
     precisions = np.linalg.inv(covariances).astype(np.float32)
-    return ContactModel(logs, means, precisions, 1.0, np.zeros(GAINS)), covariances
+    return ContactModel(logs, means, precisions, 1.0, np.zeros(GAINS), (("poisson", 0.445, 0.045),), 1.0), covariances
 
 
 MODEL, COVARIANCES = make_model()

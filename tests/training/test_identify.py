@@ -10,7 +10,7 @@ from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
 from train.experiments.sensor import gains_from_contacts as experiment
 from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z
-from train.learning.gain_estimate import CONSTANT_SPREAD, determined, learned, pad_learned, pad_of
+from train.learning.gain_estimate import learned, pad_of
 
 FOLDER = recordings_folder()
 
@@ -63,9 +63,9 @@ def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
     _, _, found = sensor(mixture, 3)
     silent = [0, 1, 3, 4, 5, 6]
     np.testing.assert_allclose(found.constants[silent], 0, atol=1e-9)
-    np.testing.assert_allclose(found.constant_deviations[silent], CONSTANT_SPREAD)
-    assert determined(found).tolist() == [False, False, True, False, False, False, False]
-    pad = pad_learned(found)
+    np.testing.assert_allclose(found.constant_deviations[silent], 1 / np.sqrt(3))
+    assert found.determined.tolist() == [False, False, True, False, False, False, False]
+    pad = found.pad()
     assert list(pad.constants) == list(pad.intervals) == ["in_plane_share"]
     assert "not told" in identify.table("4", found.contacts, pad)
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from edge.perception.gain_learning import LARGEST_COUNTS, LEAST_COUNTS, ContactModel, GainLearner
 from firmware_bridge.pad_geometry import AXES, USPA44
+from firmware_bridge.scans.pad_constants import LEVEL_90
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet, load_presses
 from train.data.simulated_sensors import CALIBRATION, contacts_of, sensor_of, true_log_gains
@@ -34,6 +35,11 @@ CONSTANTS: Final = (
     "cross_talk",
 )
 """Constants that differ from pad to pad and change a contact's shape; each over half of its range."""
+_SCALES: Final = (
+    *((name, sum(RANGES[name]) / 2, (RANGES[name][1] - RANGES[name][0]) / 2) for name in CONSTANTS[:-1]),
+    (CONSTANTS[-1], Nuisances().cross_talk / 2, Nuisances().cross_talk / 2),
+)
+"""Name, middle and half range of each."""
 _COMPONENTS: Final = 48
 _ROUNDS: Final = 12
 _RIDGE: Final = 1e-4
@@ -60,7 +66,9 @@ class ContactMixture:
         """Return the means (k, channels) on a pad of these constants, (p,) over half of their ranges."""
         return np.append(1.0, constants) @ self.means
 
-    def model(self, widening: float = 1.0, bias: NDArray[np.floating] | None = None) -> ContactModel:
+    def model(
+        self, widening: float = 1.0, bias: NDArray[np.floating] | None = None, constant_widening: float = 1.0
+    ) -> ContactModel:
         """Return the mixture as a running sensor learns by it."""
         log_size = np.linalg.slogdet(self.covariances)[1]
         return ContactModel(
@@ -69,6 +77,8 @@ class ContactMixture:
             np.linalg.inv(self.covariances).astype(np.float32),
             widening,
             np.zeros(CHANNELS) if bias is None else np.asarray(bias, dtype=np.float64),
+            _SCALES,
+            constant_widening,
         )
 
 
@@ -157,30 +167,34 @@ def fit_mixture(
     return mixture
 
 
-def calibrated(
-    mixture: ContactMixture, sensors: Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]
-) -> ContactModel:
-    """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten gains.
-
-    Args:
-        mixture: distribution of contacts.
-        sensors: contacts (n, 3, rows, cols) of each, and its true log-gains (channels,).
-    """
-    plain = mixture.model()
-    bias = _symmetric(np.mean([_off(plain, contacts, true)[0] for contacts, true in sensors], axis=0))
-    model = mixture.model(1.0, bias)
-    ratios = np.concatenate([np.abs(off) / deviation for off, deviation in (_off(model, *one) for one in sensors)])
-    return mixture.model(float(np.quantile(ratios, 0.9)) / 1.645, bias)
+Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
+"""Contacts (n, 3, rows, cols) of a sensor, its true log-gains (channels,), and the constants (p,) of its pad."""
 
 
-def _off(
-    model: ContactModel, contacts: NDArray[np.floating], true: NDArray[np.floating]
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
+    """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
+    plain = [_taught(mixture.model(), contacts) for contacts, _, _ in sensors]
+    off = [np.log(one.gains) - true for one, (_, true, _) in zip(plain, sensors, strict=True)]
+    bias = _symmetric(np.mean(off, axis=0))
+    taught = [_taught(mixture.model(1.0, bias), contacts) for contacts, _, _ in sensors]
+    gains = [(np.log(one.gains) - true) / one.deviations for one, (_, true, _) in zip(taught, sensors, strict=True)]
+    constants = [
+        ((one.constants - true) / one.constant_deviations)[:-1][one.determined[:-1]]
+        for one, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
+    ]
+    return mixture.model(_widening(gains), bias, _widening(constants))
+
+
+def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:
+    return float(np.quantile(np.abs(np.concatenate(ratios)), 0.9)) / LEVEL_90
+
+
+def _taught(model: ContactModel, contacts: NDArray[np.floating]) -> GainLearner:
     learner = GainLearner(model)
     for contact in contacts:
         learner.learn(contact)
     learner.solve()
-    return np.log(learner.gains) - true, learner.deviations
+    return learner
 
 
 def _symmetric(bias: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -257,7 +271,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         mixture = fit_mixture(load_presses(options.presses))
         presses = make_presses(CALIBRATION, options.sensors or options.presses.with_name("calibration.npz"))
         sensors = [
-            (contacts_of(presses, CALIBRATION, number), true_log_gains(*sensor_of(CALIBRATION, number)))
+            (
+                contacts_of(presses, CALIBRATION, number),
+                true_log_gains(*sensor_of(CALIBRATION, number)),
+                scaled_constants(sensor_of(CALIBRATION, number)[0]),
+            )
             for number in range(CALIBRATION.chunks)
         ]
         write_model(options.out, mixture, calibrated(mixture, sensors))
@@ -278,6 +296,10 @@ def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> Non
         means=mixture.means.astype(np.float16),
         factors=factors.astype(np.float16),
         widening=np.float32(model.widening),
+        names=np.array([name for name, _, _ in model.constants]),
+        middles=np.array([middle for _, middle, _ in model.constants]),
+        halves=np.array([half for _, _, half in model.constants]),
+        constant_widening=np.float32(model.constant_widening),
         bias=model.bias.astype(np.float32),
     )
 

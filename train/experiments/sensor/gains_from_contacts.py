@@ -38,7 +38,7 @@ from train.experiments.support.workbench import Workbench
 from train.identify import distinct
 from train.learning.contact_mixture import CHANNELS, CONSTANTS, Z, scaled_constants
 from train.learning.flat_grips import grips_of_pad, log_gains
-from train.learning.gain_estimate import CONSTANT_SPREAD, determined, learned
+from train.learning.gain_estimate import learned
 from train.report import Report, Row
 
 SENSORS: Final = World(count=4800, per_pad=200, seed=9015)
@@ -135,7 +135,7 @@ def _constants(world: World, contacts: Sequence[NDArray[np.floating]], model: Co
     true = np.array([scaled_constants(sensor_of(world, number)[0]) for number in range(world.chunks)])
     found = np.array([one.constants for one in learners])
     half = LEVEL_90 * np.array([one.constant_deviations for one in learners])
-    told = np.array([determined(one) for one in learners])
+    told = np.array([one.determined for one in learners])
     rows: list[Row] = []
     for at, name in enumerate(CONSTANTS[:-1]):
         off, sure = np.abs(found[:, at] - true[:, at]), told[:, at]
@@ -144,7 +144,7 @@ def _constants(world: World, contacts: Sequence[NDArray[np.floating]], model: Co
                 "constant": name,
                 "correlation": round(float(np.corrcoef(found[:, at], true[:, at])[0, 1]), 2),
                 "RMS error over half its range": round(_rms(off), 2),
-                "prior": round(CONSTANT_SPREAD, 2),
+                "prior": round(float(1 / np.sqrt(3)), 2),
                 "determined %": round(100 * float(sure.mean())),
                 "of these in the interval %": round(100 * float((off <= half[:, at])[sure].mean()))
                 if sure.any()
