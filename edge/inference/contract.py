@@ -305,7 +305,12 @@ def _check(values: Mapping[str, Any]) -> None:
         refuse("test_error", "a map from taps to metrics")
     _check_pad_and_traction(values, refuse)
     try:
-        trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])))
+        trust = trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])))
+        readings = len(AXES) * values["rows"] * values["cols"]
+        if trust is not None and trust.forward.operator.shape[1] != readings:
+            raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")
+        if trust is not None and not values["takes_gains"]:
+            raise ValueError("for a model that takes gains")
     except ValueError as error:
         raise ModelError(f"contract key 'trust' is damaged ({error}): export the model again") from error
 

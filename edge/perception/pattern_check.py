@@ -127,9 +127,9 @@ class PatternCheck:
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
-        elif score > trust.contact.limit:
+        elif not score <= trust.contact.limit:  # NaN fails here too, as below
             reason = "unfamiliar"
-        elif mismatch is not None and mismatch > trust.forward.limit:
+        elif mismatch is not None and not mismatch <= trust.forward.limit:
             reason = "unexplained"
         elif self.suspected:
             reason = "sensor"
@@ -149,7 +149,7 @@ class PatternCheck:
                 self._evidence = min(max(self._evidence + step, 0.0), _MOST)
                 self.suspected = self._evidence > (_LIMIT / 2 if self.suspected else _LIMIT)
             self._tap, self._strongest = tap, -math.inf
-        if strength > self._strongest:
+        if strength > self._strongest and math.isfinite(score):
             self._strongest, self._score = strength, score
 
 
@@ -165,4 +165,6 @@ def dropped_taps(belonging: Sequence[float]) -> int:
 
 
 def _share(log_odds: float) -> float:
+    if math.isnan(log_odds):
+        return 1.0
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))

@@ -15,7 +15,7 @@ from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import Event, EventKind, Note, Untimed
 from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
-from edge.perception.pattern_check import PatternCheck
+from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
@@ -262,7 +262,7 @@ class Runtime:
             gains_certainty=sensor.gains_certainty,
             **known,
         )
-        made_by = (self._model.name, tap.tap, taps_used, filled)
+        made_by = (self._model.name, tap.tap, taps_used, filled, watch.most_repeats >= REPEATS)
         return result, None if window is None else _Due(sensor, window, tap.tap, made_by)
 
     def _take_events(self, sensor: Sensor, time_ns: int) -> tuple[Event, ...]:
@@ -277,8 +277,10 @@ class Runtime:
         before = due.sensor.last
         if self._every_scan or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
             return None
-        result = replace(result, **{name: getattr(before, name) for name in MADE})
-        return replace(result, reused_from=before.scan.number)
+        made = {name: getattr(before, name) for name in MADE}
+        # The pattern may be of fewer taps than there are, where one did not belong.
+        window = None if result.window is None else result.window[: before.taps_used]
+        return replace(result, **made, taps_used=before.taps_used, window=window, reused_from=before.scan.number)
 
     def _infer(self, due: Mapping[int, "_Due"], results: list[Result]) -> None:
         """Put the patterns that are due into their results."""
