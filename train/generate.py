@@ -135,8 +135,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
     options = _parser().parse_args(arguments)
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), _TRACKER_QUIET)))
-    # Joblib warns when an interruption leaves chunks unsolved, which is intended here.
-    warnings.filterwarnings("ignore", r"\d+ tasks which were still being processed")
+    # Joblib warns when an interruption leaves chunks unsolved, or solved and not yet fetched, which is intended here.
+    warnings.filterwarnings("ignore", r"\d+ tasks (which were still being processed|have been successfully executed)")
     started_s = time.monotonic()
     try:
         config = _config(options)

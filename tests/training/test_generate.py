@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 
 import joblib
@@ -185,6 +186,17 @@ def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     assert complaint.decode() == "train.generate: interrupted; the same command continues\n"
     assert not out
     assert any(parts.glob("*.npz"))
+
+
+@pytest.mark.parametrize("unused", ["", "1 tasks have been successfully executed  but not used. Additionally, "])
+def test_what_joblib_warns_of_after_an_interruption_is_not_shown(tmp_path, monkeypatch, recwarn, unused):
+    def interrupted(*_):
+        warnings.warn(f"{unused}4 tasks which were still being processed have been cancelled.", stacklevel=1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(generating, "generate", interrupted)
+    assert main([str(tmp_path / "cut.npz"), "--count", "2"]) == 130
+    assert not list(recwarn)
 
 
 def test_a_semaphore_that_is_gone_already_adds_no_line(tmp_path):
