@@ -18,21 +18,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge.errors import (
-    EdgeError,
-    MessageError,
-    ModelError,
-    SinkClosedError,
-    SinkError,
-    UsageError,
-    WindowError,
-)
+from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, SinkError, UsageError, WindowError
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
+from edge.perception.gain_learning import load_contact_model
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from edge.perception.wrench import Wrench
@@ -253,6 +246,7 @@ def open_runtime(
     every_tap: bool = False,
     follow_drift: bool = True,
     fallback: bool = True,
+    learn: bool = True,
 ) -> Runtime:
     """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
 
@@ -272,25 +266,26 @@ def open_runtime(
         every_tap: use also taps that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
         fallback: replace a pattern that is not to be believed by the smooth one.
+        learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
 
     Raises:
         ModelError: the model does not exist, cannot be used, or is for another sensor.
         RecordingError: the baseline file cannot be used, or its taxel order is not that of the sensor file.
         UsageError: the source is not open; a baseline is of another grid; a number is out of range.
     """
-    kind, known = source.kind, source.sensor_file
+    known, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
-        source=kind,
-        # The estimator of dead taxels was fitted on presses of this pad alone.
-        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if known.geometry == USPA44 else None,
+        source=source.kind,
+        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if nominal else None,
+        contacts=load_contact_model() if nominal and learn else None,
         geometry=known.geometry,
         baselines=references(baselines, known),
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,
         options=RuntimeOptions(
-            contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift, fallback
+            contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift, fallback, learn
         ),
         unix_time_s=source.unix_time_s,
     )

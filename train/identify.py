@@ -1,11 +1,10 @@
-"""Identify a sensor from its own recordings: the gains of its channels, and constants of its pad.
+"""Identify a sensor from its own recordings: the gains of its channels, and what contacts tell of its pad.
 
     python -m train.identify recordings --out sensor.toml
 
 RECORDINGS is a folder of TRIAL/xela_SENSOR.csv; one trial has to end with a free pad, from which all are zeroed.
 Constants that contacts determine are written into the sensor file's [pad] section with their 90 % intervals; constants
-that remain as open as the range of simulated pads are left out. The mixture of simulated readings is fitted once, and
-kept with the presses.
+that remain as open as the range of simulated pads are left out.
 """
 
 import argparse
@@ -18,33 +17,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.errors import EdgeError
+from edge.inference.bundled import CONTACTS
+from edge.perception.gain_learning import load_contact_model
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.pad_geometry import AXES, USPA44
-from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from train.data.presses import load_presses
 from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
-from train.learning.contact_mixture import ContactMixture, fit_mixture, load_mixture, normalise
-from train.learning.gain_estimate import Estimate, estimate
-from train.physics.pad_draws import RANGES, input_scale
+from train.learning.contact_mixture import CONSTANTS, normalise
+from train.learning.gain_estimate import learned
+from train.physics.pad_draws import RANGES
 
 _APART: Final = 0.1
 """Least difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
 _PREFIX: Final = "xela_"
-
-
-def mixture_beside(presses: Path) -> ContactMixture:
-    """Return the mixture of contacts fitted to a file of presses, loaded if it exists, else fitted and kept.
-
-    Raises:
-        DatasetError: there are no presses, or one of the files is damaged.
-    """
-    path = presses.with_suffix(".mixture.npz")
-    if not path.exists():
-        fit_mixture(load_presses(presses)).save(path)
-    return load_mixture(path)
 
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
@@ -73,20 +62,6 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     return counts[kept]
 
 
-def found_pad(found: Estimate) -> Pad:
-    """Return the estimated pad as the sensor file holds it; undetermined constants are left out."""
-    constants: dict[str, float] = {}
-    intervals: dict[str, tuple[float, float]] = {}
-    for number, (name, centre, spread) in enumerate(input_scale()):
-        if found.determined[number]:
-            constants[name] = float(f"{centre + spread * found.constants[number]:.4g}")
-            ends = np.clip(
-                found.constants[number] + np.array([-1, 1]) * found.half_width[number - len(found.determined)], -1, 1
-            )
-            intervals[name] = (float(f"{centre + spread * ends[0]:.4g}"), float(f"{centre + spread * ends[1]:.4g}"))
-    return Pad(**constants, intervals=intervals, gains=tuple(np.exp(found.log_gains).round(4).tolist()))
-
-
 def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
     """Return the existing sensor file with these pads, or a new one with these pads alone."""
     before = load_sensor_file(path) if path.exists() else SensorFile()
@@ -97,22 +72,22 @@ def extended(path: Path, pads: Mapping[str, Pad]) -> SensorFile:
     return replace(before, sensors=sensors)
 
 
-def table(sensor: str, found: Estimate) -> str:
-    """Return the estimate of a sensor as lines of text."""
-    pad = found_pad(found)
+def table(sensor: str, contacts: int, pad: Pad) -> str:
+    """Return the pad of a sensor as lines of text."""
     lines = [
-        f"{sensor}: {found.contacts} distinct contacts",
+        f"{sensor}: {contacts} distinct contacts",
         f"{'constant':18} {'prior':>18} {'estimate':>10}  90 % interval",
     ]
-    for name, (low, high) in ((name, RANGES[name]) for name, *_ in input_scale()):
+    for name, (low, high) in ((name, RANGES[name]) for name in CONSTANTS if name in PAD_RANGES):
         known = (
             f"{pad.constants[name]:10.4g}  {pad.intervals[name][0]:.4g} .. {pad.intervals[name][1]:.4g}"
             if (name in pad.constants)
             else f"{'-':>10}  not determined by these contacts"
         )
         lines.append(f"{name:18} {f'{low:.4g} .. {high:.4g}':>18} {known}")
-    gains = np.asarray(pad.gains).reshape(len(AXES), USPA44.rows, USPA44.cols)
-    width = found.half_width[: gains.size].reshape(gains.shape)
+    gains, width = (
+        np.asarray(values).reshape(len(AXES), USPA44.rows, USPA44.cols) for values in (pad.gains, pad.gain_half_widths)
+    )
     for axis, plane, half in zip(AXES, gains, width, strict=True):
         lines.append(f"gains of {axis}, each within {100 * half.min():.0f} to {100 * half.max():.0f} % of:")
         lines += ["  " + "  ".join(f"{gain:.3f}" for gain in row) for row in plane]
@@ -124,16 +99,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         contacts = recorded_contacts(options.recordings)
-        mixture = mixture_beside(options.presses)
+        model = load_contact_model(CONTACTS)
         pads = {}
         for sensor, counts in contacts.items():
-            found = estimate(counts, mixture)
-            pads[sensor.removeprefix(_PREFIX)] = found_pad(found)
-            sys.stdout.write(table(sensor.removeprefix(_PREFIX), found) + "\n")
+            learner = learned(counts, model)
+            name = sensor.removeprefix(_PREFIX)
+            pads[name] = learner.pad()
+            sys.stdout.write(table(name, learner.contacts, pads[name]) + "\n")
         if options.out is not None:
             save_sensor_file(options.out, extended(options.out, pads))
             sys.stdout.write(f"{options.out}: pads of {', '.join(pads)}\n")
-    except (TrainError, BridgeError) as error:
+    except (TrainError, BridgeError, EdgeError) as error:
         sys.stderr.write(f"train.identify: {error}\n")
         return 1
     return 0
@@ -141,14 +117,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="folder of TRIAL/xela_SENSOR.csv")
-    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="sensor file to extend or to write")
-    parser.add_argument(
-        "--presses",
-        type=Path,
-        default=Path("data/gripped.npz"),
-        help="simulated presses of many pads; the mixture fitted to them is stored next to them (data/gripped.npz)",
-    )
+    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
+    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
     return parser
 
 

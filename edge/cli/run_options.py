@@ -258,6 +258,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         action="store_false",
         help="keep an untrusted pattern, instead of the smooth one",
     )
+    add("--no-learn", dest="learn", action="store_false", help="do not learn the gains of the sensor from contacts")
 
 
 def _add_view(parser: argparse.ArgumentParser) -> None:

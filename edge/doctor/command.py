@@ -11,6 +11,8 @@ from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.session import Visit
 from edge.doctor.watch import Watch
 from edge.doctor.write_sensor_file import check_writable, keep
+from edge.errors import UsageError
+from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped
@@ -45,9 +47,21 @@ def run(
         SensorFileError: the sensor file cannot be used, or cannot be written; a failure at the end is raised after the
             findings were printed.
     """
+    if options.forget_gains is not None:
+        if options.sensor is None:
+            raise UsageError("--forget-gains is of a sensor file, which was not named: add --sensor FILE")
+        forget_learned(options.sensor, options.forget_gains)
+        print(f"{options.sensor}: learned gains of sensor {options.forget_gains} removed", file=out)
+        return 0
     known = settled(options.sensor, options.id_map)
     if options.out is not None:
-        check_writable(options.out, known, presses=not options.no_press, weighs=options.weight_g is not None)
+        check_writable(
+            options.out,
+            known,
+            presses=not options.no_press,
+            weighs=options.weight_g is not None,
+            grips=not (options.no_press or options.no_grip),
+        )
     before = references(options.baseline, known)
     with stop_on_signals() as stop:
         watch = Watch(options.source, known, references=before, rate_hz=options.rate_hz, stop=stop, clock_s=clock_s)
@@ -80,6 +94,7 @@ def run(
                     examined.baselines,
                     mountings,
                     visit.newtons,
+                    visit.gains,
                     emulated="emulated" in (watch.link.kind, watch.link.origin),
                 )
             except SensorFileError as error:

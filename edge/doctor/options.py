@@ -8,9 +8,10 @@ from edge.terminal.argument_types import Parser, add_source, positive
 
 DOCTOR_HELP: Final = """\
 Keep the pad free and still until you
-are asked to press its corners. Hold it
-in the orientation in which patterns are
-to be drawn: it defines top and left.
+are asked to press its corners, and to
+grip something flat. Hold it in the
+orientation in which patterns are to be
+drawn: it defines top and left.
 
 examples:
   edge-sr doctor
@@ -42,7 +43,13 @@ def doctor_parser() -> argparse.ArgumentParser:
     add("--drift-s", metavar="T", type=positive, default=DOCTOR_DRIFT_S, help=drift_help)
     add("--baseline", metavar="FILE", type=Path, help="stored baseline, to detect a load on the pad")
     add("--no-press", action="store_true", help="skip the presses on the corners")
+    add("--no-grip", action="store_true", help="skip the grips of something flat")
     add("--weight-g", metavar="G", type=positive, help="weight to lay on the pad, to measure counts per newton")
+    add(
+        "--forget-gains",
+        metavar="SENSOR",
+        help="remove its learned gains from the file of --sensor, and end",
+    )
     add("--out", metavar="FILE", type=Path, help="write the results into a sensor file")
     add("--json", action="store_true", help="write one JSON document to stdout")
     return parser

@@ -3,6 +3,7 @@
 Written as a dialogue: each step makes a request, then waits for readings that fulfil it. Time is that of the scans.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeVar
@@ -57,22 +58,22 @@ T = TypeVar("T")
 Dialogue = Generator[str | None, Reading, T]
 
 
-class GuidedPress:
-    """Dialogue that asks for four corners, one after the other, then for a weight.
+class Guide(ABC):
+    """Dialogue with a person who presses a pad.
 
     Attributes:
-        answer: results so far; complete when `done`.
         done: True when there are no more requests.
     """
 
-    def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
-        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
-        self._corners = geometry.corners
-        self.answer = Answer()
+    def __init__(self, geometry: SensorGeometry) -> None:
         self.done = False
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all(weight_g)
+        self._dialogue = self._all()
         self.first: Final = next(self._dialogue) or ""
+
+    @abstractmethod
+    def _all(self) -> Dialogue[None]:
+        """Return the whole dialogue."""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
         """Take one more reading; returns the next request, or None.
@@ -90,27 +91,42 @@ class GuidedPress:
             self.done = True
             return None
 
-    def _all(self, weight_g: float | None) -> Dialogue[None]:
+
+class GuidedPress(Guide):
+    """Dialogue that asks for four corners, one after the other, then for a weight.
+
+    Attributes:
+        answer: results so far; complete when `done`.
+    """
+
+    def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
+        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
+        self._corners = geometry.corners
+        self._weight_g = weight_g
+        self.answer = Answer()
+        super().__init__(geometry)
+
+    def _all(self) -> Dialogue[None]:
         for place, name in zip(self._corners, CORNERS, strict=True):
             press = yield from _corner(place, name)
             if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
                 break
             self.answer.presses.append(press)
-        if weight_g is not None:
-            self.answer.counts_per_newton = yield from _weigh(weight_g)
+        if self._weight_g is not None:
+            self.answer.counts_per_newton = yield from _weigh(self._weight_g)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
     ask = f"Press the {name} corner with a finger and hold it."
     for _ in range(TRIES):
-        held = yield from _wait(ask, _touched, HOLD_SCANS)
+        held = yield from wait(ask, _touched, HOLD_SCANS)
         if held is None:
             return None
         mean = np.mean([reading.zeroed for reading in held], axis=0)
         taxel = corner_taxel(mean[2])
         if taxel is not None:
             break
-        yield from _wait("That was not a corner. Let go.", _free, FREE_SCANS)
+        yield from wait("That was not a corner. Let go.", free, FREE_SCANS)
         ask = f"Press the {name} corner itself and hold it."
     else:
         return None
@@ -119,14 +135,14 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
     def pushed(reading: Reading) -> bool:
         return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= PUSH_COUNTS)
 
-    felt = yield from _wait(
-        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), PUSH_SCANS
+    felt = yield from wait(
+        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or free(one), PUSH_SCANS
     )
     push = None
     if felt is not None and pushed(felt[-1]):
         x, y = np.mean([reading.shear_counts for reading in felt], axis=0) - before
         push = (float(x), float(y))
-    yield from _wait("Good. Let go." if push else "No push was measured. Let go.", _free, FREE_SCANS)
+    yield from wait("Good. Let go." if push else "No push was measured. Let go.", free, FREE_SCANS)
     return Press(place, taxel, float(mean[2].sum()), push)
 
 
@@ -140,11 +156,11 @@ def _weigh(weight_g: float) -> Dialogue[float | None]:
         low, high = min(np.abs(steady)), max(np.abs(steady))
         return len(steady) == STEADY_SCANS and low > LEAST_WEIGHT_COUNTS and high - low < _leeway(high)
 
-    laid = yield from _wait(f"Lay {weight_g:g} g on the middle of the pad, hands off.", lies_still, 1)
+    laid = yield from wait(f"Lay {weight_g:g} g on the middle of the pad, hands off.", lies_still, 1)
     if laid is None:
         return None
     counts = abs(float(np.mean(steady)))
-    yield from _wait("Good. Take it off.", _free, FREE_SCANS)
+    yield from wait("Good. Take it off.", free, FREE_SCANS)
     return counts / (weight_g / 1000 * GRAVITY_M_S2)
 
 
@@ -152,7 +168,7 @@ def _leeway(counts: float) -> float:
     return max(STEADY_COUNTS, STEADY_SHARE * counts)
 
 
-def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:
+def wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:
     """Make a request, and return as many readings in a row that fulfil it, or None when patience is at its end."""
     reading = yield say
     end_s = reading.time_s + PATIENCE_S
@@ -170,5 +186,6 @@ def _touched(reading: Reading) -> bool:
     return reading.load_counts >= ON_COUNTS
 
 
-def _free(reading: Reading) -> bool:
+def free(reading: Reading) -> bool:
+    """Return whether nothing presses the pad."""
     return reading.load_counts < OFF_COUNTS

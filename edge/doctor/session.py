@@ -8,12 +8,16 @@ from typing import TextIO
 
 from edge.doctor.examine import Examined
 from edge.doctor.findings import Finding
+from edge.doctor.flat_grip_guide import GuidedGrips
+from edge.doctor.grip_findings import judge_grips
 from edge.doctor.press_findings import judge_press
-from edge.doctor.press_guide import GuidedPress
+from edge.doctor.press_guide import Guide, GuidedPress
 from edge.doctor.watch import Watch
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.text_wrap import columns, wrapped
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import deformation
@@ -24,6 +28,7 @@ class Visit:
 
     Attributes:
         newtons: counts per newton of the sensors that were weighed.
+        gains: pads with the gains of the sensors that were gripped.
     """
 
     def __init__(
@@ -44,6 +49,7 @@ class Visit:
             clock_s: the clock of the scans, monotonic, in [s].
         """
         self.newtons: dict[str, float] = {}
+        self.gains: dict[str, Pad] = {}
         self._options = options
         self._err = err
         self._stop = stop
@@ -69,7 +75,7 @@ class Visit:
             self._watch.run(length_s, show)
 
     def press(self, examined: Examined) -> dict[str, Mounting]:
-        """Ask for presses on every pad that may be zeroed; returns the corrections of their mountings.
+        """Ask for presses and grips on every pad that may be zeroed; returns the corrections of their mountings.
 
         Raises:
             LinkLostError: the link is gone.
@@ -82,19 +88,39 @@ class Visit:
                 mounting = self._press_one(name, examined, len(names) > 1)
                 if mounting is not None:
                     found[name] = mounting
+                if not self._options.no_grip and self._watch.known.geometry == USPA44:
+                    self._grip_one(name, examined, mounting, len(names) > 1)
             elif why is not None or name not in examined.baselines:
                 reason = why or "the pad cannot be zeroed: correct what is wrong first"
                 examined.findings.append(Finding("guided press", "not known", "left out", "", reason, name))
         return found
 
     def _press_one(self, name: str, examined: Examined, several: bool) -> Mounting | None:
-        baseline = examined.baselines[name]
-        mounting = self._watch.known.mountings.get(name)
         geometry = self._watch.known.geometry
         guide = GuidedPress(self._options.weight_g, geometry)
         whose = f"Sensor {name}: " if several else ""
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
-        self._say(whose + guide.first)
+        self._lead(guide, name, examined, whose)
+        weighed = self._options.weight_g is not None
+        findings, found = judge_press(guide.answer, self._options.out is not None, weighed, geometry)
+        examined.findings.extend(replace(finding, sensor=name) for finding in findings)
+        if guide.answer.counts_per_newton is not None:
+            self.newtons[name] = guide.answer.counts_per_newton
+        return found
+
+    def _grip_one(self, name: str, examined: Examined, found: Mounting | None, several: bool) -> None:
+        guide = GuidedGrips(self._watch.known.geometry)
+        self._lead(guide, name, examined, f"Sensor {name}: " if several else "")
+        finding, gains = judge_grips(guide, found, self._options.out is not None)
+        examined.findings.append(replace(finding, sensor=name))
+        if gains is not None:
+            self.gains[name] = gains
+
+    def _lead(self, guide: Guide, name: str, examined: Examined, whose: str) -> None:
+        """Lead a person through a dialogue about one sensor."""
+        baseline, mounting = examined.baselines[name], self._watch.known.mountings.get(name)
+        if not (self._stop.is_set() or self._link.ended):
+            self._say(whose + guide.first)
         received_s = self._clock_s()
         while not (guide.done or self._stop.is_set() or self._link.ended):
             if self._clock_s() - received_s > GIVEN_UP_S:
@@ -109,12 +135,6 @@ class Visit:
                 ask = guide.push(zeroed, scan.time_ns / NS_PER_S)
                 if ask is not None:
                     self._say(whose + ask)
-        weighed = self._options.weight_g is not None
-        findings, found = judge_press(guide.answer, self._options.out is not None, weighed, geometry)
-        examined.findings.extend(replace(finding, sensor=name) for finding in findings)
-        if guide.answer.counts_per_newton is not None:
-            self.newtons[name] = guide.answer.counts_per_newton
-        return found
 
     def _why_no_press(self) -> str | None:
         if self._options.no_press:

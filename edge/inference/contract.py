@@ -13,7 +13,7 @@ from edge.errors import ModelError
 from edge.inference.expected_error import is_confidence, is_number
 from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
-from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 6
 ADDED: Final = MappingProxyType({5: ("pad_inputs", "takes_gains", "traction_scale"), 6: ("trust",)})
@@ -36,6 +36,8 @@ MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
+DETERMINED: Final = 0.4
+"""Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
 LEAST_UNIT: Final = 1e-6
 """Least divisor in counts, newtons or millimetres, so that float32 holds the quotient."""
 STAND_IN_KEYS: Final = (
@@ -224,16 +226,18 @@ class Contract:
 
         Returns:
             (pad_width,) float32: for each of `pad_inputs` (value - centre) / spread, 0 if unknown; then 1 for each that
-            is available and 0 for each that is not; last, if the model takes gains, 1 if they are available, else 0.
+            is available and 0 for each that is not; last, if the model takes gains, their certainty, 0 without gains. A
+            constant whose interval is wide counts as unknown.
         """
         row = np.zeros(self.pad_width, dtype=np.float32)
         known = {} if pad is None else pad.constants
         for index, (name, centre, spread) in enumerate(self.pad_inputs):
-            if name in known:
+            low, high = (0.0, 0.0) if pad is None else pad.intervals.get(name, (0.0, 0.0))
+            if name in known and (high - low) / 2 / LEVEL_90 <= DETERMINED * spread:
                 row[index] = (known[name] - centre) / spread
                 row[len(self.pad_inputs) + index] = 1
-        if self.takes_gains and pad is not None and pad.gains is not None:
-            row[-1] = 1
+        if self.takes_gains and pad is not None:
+            row[-1] = pad.gains_certainty
         return row
 
 
@@ -301,7 +305,12 @@ def _check(values: Mapping[str, Any]) -> None:
         refuse("test_error", "a map from taps to metrics")
     _check_pad_and_traction(values, refuse)
     try:
-        trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])))
+        trust = trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])))
+        readings = len(AXES) * values["rows"] * values["cols"]
+        if trust is not None and trust.forward.operator.shape[1] != readings:
+            raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")
+        if trust is not None and not values["takes_gains"]:
+            raise ValueError("for a model that takes gains")
     except ValueError as error:
         raise ModelError(f"contract key 'trust' is damaged ({error}): export the model again") from error
 

@@ -126,7 +126,7 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
     if not isinstance(value, dict) or set(value) != {*_KEYS, "unexplained", "limit"}:
         raise ValueError(f"expected {', '.join(_KEYS)}, unexplained and limit")
     arrays = {name: unpacked(value[name]) for name in _KEYS}
-    readings = arrays["inverse"].shape[-1]
+    *_, readings = arrays["inverse"].shape or (0,)
     expected = {
         "operator": (1 + constants, readings, FEATURES),
         "inverse": (GRID**2, readings),

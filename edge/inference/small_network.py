@@ -87,7 +87,7 @@ def unpacked(value: Any) -> NDArray[np.float32]:
         if not all(0 < length <= 1 << 16 for length in shape):
             raise ValueError(f"shape is {shape}")
         content = base64.b64decode(value["f2"], validate=True)
-    except (TypeError, KeyError, binascii.Error) as error:
+    except (TypeError, KeyError, OverflowError, binascii.Error) as error:
         raise ValueError(f"no packed array ({error})") from error
     if len(content) != 2 * math.prod(shape):
         raise ValueError(f"{len(content)} bytes for an array of {shape}")

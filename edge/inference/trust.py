@@ -11,7 +11,7 @@ _KEYS: Final = ("forward", "contact", "tap")
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Checks of a pattern, as a model's contract holds them under `trust`.
+    """Content of a model's contract under `trust`.
 
     Attributes:
         forward: explains readings by a pattern.

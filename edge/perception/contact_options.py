@@ -24,6 +24,7 @@ class RuntimeOptions:
         every_tap: use all available taps, also those that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
         fallback: replace a pattern that is not to be believed by the smooth one.
+        learn: learn the gains of the channels from contacts.
 
     Raises:
         UsageError: the contact thresholds or the time are out of range.
@@ -36,6 +37,7 @@ class RuntimeOptions:
     every_tap: bool = False
     follow_drift: bool = True
     fallback: bool = True
+    learn: bool = True
 
     def __post_init__(self) -> None:
         on_counts, off_counts = self.contact_on_counts, self.contact_off_counts

@@ -10,7 +10,7 @@ from typing import Final, Literal, NamedTuple, get_args
 from firmware_bridge.links.base import Notice, NoticeKind
 
 ZeroingKind = Literal["zeroing", "zeroed", "in_contact", "given_up", "rest_level"]
-TrustKind = Literal["tap_dropped", "suspected", "cleared"]
+TrustKind = Literal["tap_dropped", "suspected", "cleared", "gains_learned"]
 EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, "sink", "reset", "refused"]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
@@ -36,7 +36,7 @@ class Event:
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
             has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
             its end; "tap_dropped", earlier taps do not belong to the contact; "suspected", contact after contact reads
-            like none, and "cleared", no longer.
+            like none, and "cleared", no longer; "gains_learned", gains learned from contacts are in use.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
         sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
@@ -77,7 +77,7 @@ class Event:
                 return f"sensor {self.sensor}: several contacts in a row read like none; check {causes}"
             case "cleared":
                 return f"sensor {self.sensor}: contacts read as they should again"
-            case "rest_level":
+            case "rest_level" | "gains_learned":
                 return f"sensor {self.sensor}: {self.detail}"
             case _:
                 return self.detail

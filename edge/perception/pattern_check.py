@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.familiarity import contact_features, tap_features
 from edge.inference.trust import Trust
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
 Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
@@ -34,8 +35,6 @@ LEAST_COUNTS: Final = 100.0
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
-GAIN_SPREAD: Final = 0.075
-"""Standard deviation of the gains of a sensor that is not calibrated."""
 SAME_STRENGTH: Final = 0.85
 """Strength of a press, over that of an earlier tap, from which the two are compared for good."""
 _SUSPICION: Final = 1.5
@@ -70,21 +69,24 @@ class PatternCheck:
     Args:
         trust: of the model.
         contract: of the model.
-        pad_row: the sensor's pad as model input.
     """
 
-    def __init__(self, trust: Trust, contract: Contract, pad_row: NDArray[np.float32]) -> None:
-        count = len(contract.pad_inputs)
+    def __init__(self, trust: Trust, contract: Contract) -> None:
         self._trust = trust
+        self._constants = len(contract.pad_inputs)
         self._least = LEAST_COUNTS / contract.counts_per_unit[2]
-        self._pad_row = pad_row
-        self._operator = trust.forward.of_pad(pad_row[:count])
-        certainty = float(pad_row[-1]) if contract.takes_gains else 0.0
-        self._gain_error = GAIN_SPREAD * (1 - certainty)
+        self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
         self._evidence = 0.0
         self._tap: int | None = None
         self._strongest, self._score = -math.inf, 0.0
         self.suspected = False
+
+    def use_pad(self, pad_row: NDArray[np.float32]) -> None:
+        """Check from now on with a pad as model input; what contacts have shown so far stays."""
+        self._pad_row = pad_row
+        self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
+        certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
+        self._gain_error = GAIN_SPREAD * (1 - certainty)
 
     def belonging(self, window: NDArray[np.float32], taps: int) -> list[float]:
         """Return how little each earlier tap belongs to the newest one: 0 to 1, and from .5 it does not.
@@ -125,9 +127,9 @@ class PatternCheck:
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
-        elif score > trust.contact.limit:
+        elif not score <= trust.contact.limit:  # NaN fails here too, as below
             reason = "unfamiliar"
-        elif mismatch is not None and mismatch > trust.forward.limit:
+        elif mismatch is not None and not mismatch <= trust.forward.limit:
             reason = "unexplained"
         elif self.suspected:
             reason = "sensor"
@@ -147,7 +149,7 @@ class PatternCheck:
                 self._evidence = min(max(self._evidence + step, 0.0), _MOST)
                 self.suspected = self._evidence > (_LIMIT / 2 if self.suspected else _LIMIT)
             self._tap, self._strongest = tap, -math.inf
-        if strength > self._strongest:
+        if strength > self._strongest and math.isfinite(score):
             self._strongest, self._score = strength, score
 
 
@@ -163,4 +165,6 @@ def dropped_taps(belonging: Sequence[float]) -> int:
 
 
 def _share(log_odds: float) -> float:
+    if math.isnan(log_odds):
+        return 1.0
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))

@@ -85,6 +85,7 @@ class Result:
     drift: Drift | None = None
     dead: Mapping[int, str] = field(default_factory=dict)
     filled: Filled | None = None
+    gains_certainty: float | None = None
     notes: tuple[Note, ...] = ()
     events: tuple[Event, ...] = ()
 

@@ -13,6 +13,9 @@ from edge.inference.contract import Contract
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import Event, EventKind, Note, Untimed
+from edge.perception.gain_following import GainFollower
+from edge.perception.gain_learning import ContactModel
+from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
@@ -64,6 +67,7 @@ class Runtime:
         model: the loaded model.
         source: kind of source that the scans come from; every result carries it.
         estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
+        contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
         geometry: of the sensors; refused if the model was not trained for it.
         baselines: stored baselines by sensor name; a sensor without one is zeroed from its first
             scans, during which its pad must be still and free.
@@ -89,6 +93,7 @@ class Runtime:
         *,
         source: SourceKind,
         estimator: TaxelEstimator | None = None,
+        contacts: ContactModel | None = None,
         geometry: SensorGeometry = USPA44,
         baselines: Mapping[str, Baseline] | None = None,
         counts_per_newton: float | Mapping[str, float] | None = None,
@@ -111,8 +116,9 @@ class Runtime:
         self._events: list[Untimed] = []
         self._source: SourceKind = source
         self._estimator = estimator
+        self._contacts = contacts if options.learn else None
         self._geometry, self._scan_shape = geometry, geometry.scan_shape
-        self._describe = Describer(model.contract, geometry)
+        self._describe, self._trust = Describer(model.contract, geometry), model.contract.read_trust()
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad = pad
@@ -132,6 +138,11 @@ class Runtime:
         """Names of the sensors with stored baselines or counts per newton."""
         per_newton = self._counts_per_newton
         return frozenset({*self._baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
+
+    def take_learned(self) -> dict[str, Pad]:
+        """Return the pads with gains learned since the last call, by sensor name."""
+        learned = {name: sensor.take_learned() for name, sensor in self._sensors.items()}
+        return {name: pad for name, pad in learned.items() if pad is not None}
 
     def reset(self) -> None:
         """Forget the taps of every sensor, as for a new object, and report it as an event; zeroing stays."""
@@ -226,6 +237,8 @@ class Runtime:
         tap = sensor.taps.push(zeroed if readings is None else readings.counts, scan.time_ns, force_counts)
         if self._follow_drift:
             sensor.follow_drift(scan, tap.contact)
+        if not tap.contact and sensor.follower is not None and sensor.follower.waiting:
+            sensor.learn(self._model.contract)
         taps_used = sensor.taps_that_matter.of(tap)
         if self._every_tap:
             taps_used = tap.taps_used
@@ -246,9 +259,10 @@ class Runtime:
             window=None if window is None else window[:taps_used],
             force_counts=force_counts,
             force_n=force_n,
+            gains_certainty=sensor.gains_certainty,
             **known,
         )
-        made_by = (self._model.name, tap.tap, taps_used, filled)
+        made_by = (self._model.name, tap.tap, taps_used, filled, watch.most_repeats >= REPEATS)
         return result, None if window is None else _Due(sensor, window, tap.tap, made_by)
 
     def _take_events(self, sensor: Sensor, time_ns: int) -> tuple[Event, ...]:
@@ -263,8 +277,10 @@ class Runtime:
         before = due.sensor.last
         if self._every_scan or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
             return None
-        result = replace(result, **{name: getattr(before, name) for name in MADE})
-        return replace(result, reused_from=before.scan.number)
+        made = {name: getattr(before, name) for name in MADE}
+        # The pattern may be of fewer taps than there are, where one did not belong.
+        window = None if result.window is None else result.window[: before.taps_used]
+        return replace(result, **made, taps_used=before.taps_used, window=window, reused_from=before.scan.number)
 
     def _infer(self, due: Mapping[int, "_Due"], results: list[Result]) -> None:
         """Put the patterns that are due into their results."""
@@ -299,6 +315,8 @@ class Runtime:
             sensor.last_reading.keep(touch.window[0], touch.made_by)
             sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
             results[index] = made
+            if sensor.follower is not None and sensor.follower.see(made, touch.window[0]):
+                sensor.learn(contract)
 
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor
@@ -318,7 +336,11 @@ class Runtime:
         per_newton = self._counts_per_newton
         sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton
         sensor.pad = self._pad.get(name) if isinstance(self._pad, Mapping) else self._pad
+        if self._trust is not None:
+            sensor.check = PatternCheck(self._trust, self._model.contract)
         sensor.take_pad(self._model.contract)
+        if self._contacts is not None:
+            sensor.follower = GainFollower(self._contacts, sensor.pad)
         if baseline is not None:
             age_s = baseline.age_s(self._unix_time_s())
             # A baseline from the future means that one of the two clocks was wrong.

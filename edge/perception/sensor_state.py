@@ -11,6 +11,7 @@ from edge.inference.contract import Contract
 from edge.perception.change_gate import LastReading, TapsThatMatter
 from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
 from edge.perception.event import EventKind, Note, Untimed
+from edge.perception.gain_following import GainFollower
 from edge.perception.pattern_check import PatternCheck
 from edge.perception.result import Result, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
@@ -39,6 +40,8 @@ class Sensor:
         pad_row: the same as the model takes it.
         check: decides whether its patterns are to be believed; None where the model has no checks.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
+        gains_certainty: of the gains that are available, see firmware_bridge.scans.pad_constants.Pad; None without.
+        follower: learns the gains from contacts; None where they are not learned.
         wrench_origin: whether the model gets the sensor's counts per newton.
         filler: estimates the dead taxels; None where none is dead, or nothing may be estimated.
         events: what has happened to the zeroing since the last scan; the reader clears them.
@@ -69,6 +72,9 @@ class Sensor:
         self.pad_row: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
         self.gains: NDArray[np.float32] | None = None
         self.check: PatternCheck | None = None
+        self.gains_certainty: float | None = None
+        self.follower: GainFollower | None = None
+        self._learned: Pad | None = None
         self.wrench_origin: WrenchOrigin = "nominal"
         self.watch = TaxelWatch((geometry.rows, geometry.cols), mounting)
         self._mounting = mounting
@@ -92,11 +98,30 @@ class Sensor:
         self.gains = None
         if contract.takes_gains and pad is not None and pad.gains is not None:
             self.gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
-        trust = contract.read_trust()
-        self.check = None if trust is None else PatternCheck(trust, contract, self.pad_row)
+        if self.check is not None:
+            self.check.use_pad(self.pad_row)
         calibrated = pad is not None and pad.counts_per_newton is not None
+        self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
         takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
         self.wrench_origin = "calibrated" if calibrated and takes else "nominal"
+
+    def take_learned(self) -> Pad | None:
+        """Return the pad if its gains were learned since the last call."""
+        learned, self._learned = self._learned, None
+        return learned
+
+    def learn(self, contract: Contract) -> None:
+        """Learn from the contact that waits; if new gains come into use, an event reports it."""
+        pad = None if self.follower is None else self.follower.learn(self.watch.dead)
+        if pad is None or self.follower is None:
+            return
+        self.pad, self._learned = pad, self.follower.learned
+        self.take_pad(contract)
+        self.last = None  # its pattern was made with other gains
+        widths = pad.gain_half_widths or ()
+        percent = 100 * float(np.sqrt(np.square(widths).mean()))
+        detail = f"gains learned from {self.follower.contacts} contacts, each within {percent:.0f} %"
+        self.report("gains_learned", detail)
 
     def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
         """Subtract a baseline from now on.

@@ -11,6 +11,7 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
+from edge.pipeline.gain_keeper import GainKeeper
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.silence import Silence
@@ -78,6 +79,8 @@ class Stream:
         self._deadlines: dict[str, Deadline] = {}
         self._clock_s = clock_s
         self._clock_ns = clock_ns
+        path = None if source.kind == "replay" else source.sensor_file.path
+        self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
         self._running = self._run()
 
     @property
@@ -105,6 +108,16 @@ class Stream:
         return next(self._running)
 
     def _run(self) -> Iterator[Result]:
+        try:
+            yield from self._made()
+        finally:
+            if self._keeper is not None:
+                self._keeper.close()
+                if self._keeper.trouble is not None:
+                    detail = f"learned gains are not kept: {self._keeper.trouble}"
+                    self._tell(Event(self._clock_ns(), "note", None, detail))
+
+    def _made(self) -> Iterator[Result]:
         for taken in self._taken():
             if self._commands is not None:
                 obey(self._commands, self._runtime)
@@ -149,6 +162,9 @@ class Stream:
         newest = {scan.sensor: scan for scan in scans}
         results = self._runtime.push_together([(scan, newest[scan.sensor] is scan) for scan in scans])
         done_ns = self._clock_ns()
+        for name, pad in self._runtime.take_learned().items():
+            if self._keeper is not None:
+                self._keeper.keep(name, pad)
         for result in results:
             yield self._follow(result, done_ns)
 

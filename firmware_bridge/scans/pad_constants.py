@@ -4,6 +4,7 @@ A network may take them as input, since the same reading means another press on 
 axis and correct no recording: the mounting does.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -28,6 +29,12 @@ PAD_RANGES: Final = MappingProxyType(
 GAIN_RANGE: Final = (0.01, 100.0)
 GAINS: Final = len(AXES) * USPA44.taxel_count
 """Number of gains of the default pad."""
+GAIN_SPREAD: Final = 0.075
+"""Standard deviation of a chip's gain on one axis about 1, over new sensors: +-15 % are seen on devices."""
+LEVEL_90: Final = 1.645
+"""Half width of a normal 90 % interval, in standard deviations."""
+UNMEASURED_CERTAINTY: Final = 0.9
+"""Certainty of gains without intervals: entered by a person, who has measured them somehow."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,7 @@ class Pad:
         intervals: lowest and highest value of a constant by its measurement; nothing is computed from them.
         gains: relative gain of each place on each axis, 1 where it reads as the others: x of all places row by row,
             then y, then z, along the pad's axes. Networks that use gains get readings divided by them.
+        gain_half_widths: half widths of the gains' 90 % intervals, each over its gain, in the same order.
 
     Raises:
         ValueError: one of these is invalid.
@@ -57,6 +65,7 @@ class Pad:
     counts_per_newton: float | None = None
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     gains: tuple[float, ...] | None = None
+    gain_half_widths: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         for name, value in self.constants.items():
@@ -76,6 +85,14 @@ class Pad:
         ):
             expected = f"{len(AXES)} numbers a taxel, {GAINS} of a {USPA44.name}, from {low:g} to {high:g}"
             raise ValueError(f"gains are {list(self.gains)}, expected {expected}")
+        widths = self.gain_half_widths
+        if widths is not None and (
+            self.gains is None or len(widths) != len(self.gains) or not all(0 <= width <= 1 for width in widths)
+        ):
+            count = "no gains" if self.gains is None else f"{len(self.gains)} gains"
+            raise ValueError(
+                f"gain_half_widths are {list(widths)} of {count}, expected one of 0 to 1 for each, as a share of it"
+            )
 
     @property
     def constants(self) -> dict[str, float]:
@@ -83,9 +100,40 @@ class Pad:
         values = {name: getattr(self, name) for name in PAD_RANGES}
         return {name: value for name, value in values.items() if value is not None}
 
+    @property
+    def gains_certainty(self) -> float:
+        """Certainty of the gains: 1 less their deviation over GAIN_SPREAD, 0 without gains or with useless ones."""
+        if self.gains is None:
+            return 0.0
+        if self.gain_half_widths is None:
+            return UNMEASURED_CERTAINTY
+        deviation = math.sqrt(sum(width**2 for width in self.gain_half_widths) / len(self.gains)) / LEVEL_90
+        return min(max(1 - deviation / GAIN_SPREAD, 0.0), 1.0)
+
+    def behind(self, other: "Pad") -> "Pad":
+        """Return another pad, with the constants and gains of this one where the other has none."""
+        constants = self.constants | other.constants
+        intervals = {name: ends for name, ends in self.intervals.items() if name not in other.constants}
+        own = self if other.gains is None else other
+        return Pad(
+            **constants,
+            intervals=intervals | dict(other.intervals),
+            gains=own.gains,
+            gain_half_widths=own.gain_half_widths,
+        )
+
     def turned(self, found: Mounting) -> "Pad":
         """Return the same pad under a mounting that was corrected by `found`: its gains follow the places and axes."""
         if self.gains is None:
             return self
-        gains = np.asarray(self.gains).reshape(len(AXES), -1)[[1, 0, 2] if found.swap_xy else [0, 1, 2]]
-        return replace(self, gains=tuple(gains[:, list(found.order)].ravel().tolist()))
+        widths = self.gain_half_widths
+        return replace(
+            self,
+            gains=_turned(self.gains, found),
+            gain_half_widths=None if widths is None else _turned(widths, found),
+        )
+
+
+def _turned(values: tuple[float, ...], found: Mounting) -> tuple[float, ...]:
+    planes = np.asarray(values).reshape(len(AXES), -1)[[1, 0, 2] if found.swap_xy else [0, 1, 2]]
+    return tuple(planes[:, list(found.order)].ravel().tolist())

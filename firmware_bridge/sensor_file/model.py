@@ -5,7 +5,7 @@ This module holds its content and its reading; `toml_writer` writes it.
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -43,7 +43,7 @@ MOST_BYTES: Final = 1 << 16
 LONGEST_LINE_BYTES: Final = 2048
 """Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
 took 27 s."""
-PARTS: Final = ("mounting", "force", "baseline")
+PARTS: Final = ("mounting", "force", "baseline", "gains")
 """Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
 
 
@@ -55,7 +55,8 @@ class SensorEntry:
         mounting: mounting of the sensor.
         counts_per_newton: its summed z per [N].
         baseline: counts of its free pad.
-        pad: constants of the pad.
+        pad: constants and gains of the pad, measured or entered by hand.
+        learned: its gains as a running sensor has learned them from contacts.
         assumed: those of PARTS that were never measured.
         emulated: those of PARTS that were measured on an emulated sensor.
     """
@@ -64,8 +65,19 @@ class SensorEntry:
     counts_per_newton: float | None = None
     baseline: Baseline | None = None
     pad: Pad | None = None
+    learned: Pad | None = None
     assumed: frozenset[str] = frozenset()
     emulated: frozenset[str] = frozenset()
+
+    @property
+    def used_pad(self) -> Pad | None:
+        """Pad with what was learned where that is not there by hand, and with learned gains that are surer."""
+        learned, pad = self.learned, self.pad
+        if learned is None or pad is None:
+            return learned or pad
+        if pad.gains_certainty < learned.gains_certainty:
+            pad = replace(pad, gains=None, gain_half_widths=None)
+        return learned.behind(pad)
 
 
 @dataclass(frozen=True)
@@ -77,12 +89,14 @@ class SensorFile:
         adapter: serial number of the USB adapter; None if it is not available.
         sensors: entries by sensor name.
         own_map: id map outside ID_MAPS, for a program's own pad; files cannot hold it.
+        path: file that it was read from; None without.
     """
 
     model: str = USPA44_MAP.name
     adapter: str | None = None
     sensors: Mapping[str, SensorEntry] = field(default_factory=dict)
     own_map: ModelMap | None = None
+    path: Path | None = field(default=None, compare=False)
 
     @property
     def mountings(self) -> dict[str, Mounting]:
@@ -118,7 +132,8 @@ class SensorFile:
     @property
     def pads(self) -> dict[str, Pad]:
         """Available pads by sensor name."""
-        return {name: entry.pad for name, entry in self.sensors.items() if entry.pad is not None}
+        used = {name: entry.used_pad for name, entry in self.sensors.items()}
+        return {name: pad for name, pad in used.items() if pad is not None}
 
 
 def load_sensor_file(path: str | Path) -> SensorFile:
@@ -147,9 +162,8 @@ def load_sensor_file(path: str | Path) -> SensorFile:
         if not is_sensor_name(name):
             top.refuse("sensors", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
     top.end()
-    return SensorFile(
-        model, adapter, {name: _entry(path, name, table, ID_MAPS[model].geometry) for name, table in sensors.items()}
-    )
+    entries = {name: _entry(path, name, table, ID_MAPS[model].geometry) for name, table in sensors.items()}
+    return SensorFile(model, adapter, entries, path=path)
 
 
 def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> SensorEntry:
@@ -159,24 +173,27 @@ def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeo
     signs = table.take("signs", _signs, required=False)
     gains = table.take("gains", partial(_gains, geometry), required=False)
     counts_per_newton = table.take("counts_per_newton", positive, required=False)
-    pad = table.take("pad", a_table, required=False)
+    pads = {key: table.take(key, a_table, required=False) for key in ("pad", "learned")}
     baseline = table.take("baseline", a_table, required=False)
     marks = {key: table.take(key, _parts, required=False) or frozenset() for key in ("assumed", "emulated")}
     table.end()
     known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
     known = {key: value for key, value in known.items() if value is not None}
     mounting = Mounting(**known, taxel_count=geometry.taxel_count)
+    pads = {key: None if one is None else _pad(path, f"{name}.{key}", one, geometry) for key, one in pads.items()}
     return SensorEntry(
         mounting,
         counts_per_newton,
         None if baseline is None else _baseline(path, name, baseline, geometry),
-        None if pad is None else _pad(path, name, pad, geometry),
-        **marks,
+        pads["pad"],
+        pads["learned"],
+        marks["assumed"],
+        marks["emulated"],
     )
 
 
 def _pad(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Pad:
-    table = Table(path, f"sensors.{name}.pad.", values)
+    table = Table(path, f"sensors.{name}.", values)
     constants: dict[str, float] = {}
     intervals: dict[str, tuple[float, float]] = {}
     for constant, (low, high) in PAD_RANGES.items():
@@ -186,9 +203,12 @@ def _pad(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeome
             constants[constant] = value
         if interval is not None:
             intervals[constant] = interval
-    gains = table.take("gains", partial(_pad_gains, geometry), required=False)
+    gains = table.take("gains", partial(_of_places, geometry, *GAIN_RANGE), required=False)
+    widths = table.take("gain_half_widths", partial(_of_places, geometry, 0.0, 1.0), required=False)
     table.end()
-    return Pad(**constants, intervals=intervals, gains=gains)
+    if widths is not None and gains is None:
+        table.refuse("gain_half_widths", "without gains", "both, or none")
+    return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=widths)
 
 
 def _baseline(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Baseline:
@@ -246,14 +266,13 @@ def _interval(low: float, high: float, value: Any) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
-def _pad_gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
-    low, high = GAIN_RANGE
+def _of_places(geometry: SensorGeometry, low: float, high: float, value: Any) -> tuple[float, ...]:
     count = len(AXES) * geometry.taxel_count
     expected = f"{count} numbers from {low:g} to {high:g}: x of all places, then y, then z"
-    gains = flat_cells(value, (count,), expected)
-    if not all(is_number(gain) and low <= gain <= high for gain in gains):
+    values = flat_cells(value, (count,), expected)
+    if not all(is_number(one) and low <= one <= high for one in values):
         raise ValueError(expected)
-    return tuple(map(float, gains))
+    return tuple(map(float, values))
 
 
 def _rest_counts(geometry: SensorGeometry, value: Any) -> NDArray[np.float64]:

@@ -26,8 +26,8 @@ from firmware_bridge.sensor_file.model import (
 from firmware_bridge.zeroing.baseline import Baseline
 
 
-def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
-    """Write a sensor file in place; an existing one stays as NAME.bak.
+def save_sensor_file(path: str | Path, sensor_file: SensorFile, *, keep_before: bool = True) -> None:
+    """Write a sensor file in place; an existing one stays as NAME.bak, unless not `keep_before`.
 
     Raises:
         SensorFileError: the file cannot be written, or would hold no sensor, a baseline with a silent taxel, or a
@@ -48,7 +48,9 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile) -> None:
         )
     text = _text(sensor_file)
     try:
-        write_in_place(path, lambda draft: draft.write_text(text, encoding="utf-8"), load_sensor_file)
+        write_in_place(
+            path, lambda draft: draft.write_text(text, encoding="utf-8"), load_sensor_file, keep_before=keep_before
+        )
     except OSError as error:
         raise SensorFileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -69,7 +71,11 @@ def _text(sensor_file: SensorFile) -> str:
             lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
         lines += _mark_lines(entry)
         if entry.pad is not None:
-            lines += ["", f"[sensors.{_quoted(name)}.pad]", *_pad_lines(entry.pad, cols)]
+            about = "# The pad itself, for networks that ask for it."
+            lines += ["", f"[sensors.{_quoted(name)}.pad]", about, *_pad_lines(entry.pad, cols)]
+        if entry.learned is not None:
+            about = "# Learned from contacts while it ran; edge-sr doctor --forget-gains removes it."
+            lines += ["", f"[sensors.{_quoted(name)}.learned]", about, *_pad_lines(entry.learned, cols)]
         if entry.baseline is not None:
             lines += ["", f"[sensors.{_quoted(name)}.baseline]", *_baseline_lines(entry.baseline)]
     return "\n".join([*lines, ""])
@@ -110,7 +116,7 @@ def _mounting_lines(mounting: Mounting, cols: int) -> list[str]:
 
 
 def _pad_lines(pad: Pad, cols: int) -> list[str]:
-    lines = ["# The pad itself, for networks that ask for it."]
+    lines: list[str] = []
     known = pad.constants
     for name in PAD_RANGES:
         if name in known:
@@ -118,14 +124,21 @@ def _pad_lines(pad: Pad, cols: int) -> list[str]:
         if name in pad.intervals:
             lines.append(f"{name}_interval = {list(map(float, pad.intervals[name]))}")
     if pad.gains is not None:
-        rows = (pad.gains[at : at + cols] for at in range(0, len(pad.gains), cols))
         lines += [
             "# How strongly each place reads: x row by row, then y, then z.",
-            "gains = [",
-            *(f"    {', '.join(repr(float(gain)) for gain in row)}," for row in rows),
-            "]",
+            *_place_lines("gains", pad.gains, cols),
+        ]
+    if pad.gain_half_widths is not None:
+        lines += [
+            "# Half of each one's 90 % interval, as a share of it.",
+            *_place_lines("gain_half_widths", pad.gain_half_widths, cols),
         ]
     return lines
+
+
+def _place_lines(key: str, values: Sequence[float], cols: int) -> list[str]:
+    rows = (values[at : at + cols] for at in range(0, len(values), cols))
+    return [f"{key} = [", *(f"    {', '.join(repr(float(value)) for value in row)}," for row in rows), "]"]
 
 
 def _baseline_lines(baseline: Baseline) -> list[str]:

@@ -23,10 +23,11 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad
+from firmware_bridge.scans.pad_constants import GAINS, LEVEL_90, PAD_RANGES, Pad
 
 GAINED = tuple(np.linspace(0.5, 2, GAINS).tolist())
 PAD = Pad(thickness_mm=5.0, gains=GAINED)
+MEASURED = replace(PAD, gain_half_widths=(0.02 * LEVEL_90,) * GAINS)
 OTHER = Pad(thickness_mm=4.0, counts_per_newton=2000.0)
 
 
@@ -45,20 +46,25 @@ class TestContract:
             (None, row(0, 0, 0, 0, 0)),
             (Pad(), row(0, 0, 0, 0, 0)),
             (Pad(poisson=0.4), row(0, 0, 0, 0, 0)),
-            (PAD, row(1, 0, 1, 0, 1)),
+            (PAD, row(1, 0, 1, 0, 0.9)),
+            (MEASURED, row(1, 0, 1, 0, 1 - 0.02 / 0.075)),
+            (replace(PAD, gain_half_widths=(0.0,) * GAINS), row(1, 0, 1, 0, 1)),
+            (replace(PAD, gain_half_widths=(0.5,) * GAINS), row(1, 0, 1, 0, 0)),
+            (replace(OTHER, intervals={"thickness_mm": (3.8, 4.2)}), row(-1, 2, 1, 1, 0)),
+            (replace(OTHER, intervals={"thickness_mm": (3.0, 5.0)}), row(0, 2, 0, 1, 0)),
             (OTHER, row(-1, 2, 1, 1, 0)),
             (Pad(counts_per_newton=1000.0), row(0, 0, 0, 1, 0)),
         ],
     )
-    def test_a_pad_is_values_then_flags_then_gains(self, pad, expected):
+    def test_a_pad_is_values_then_flags_then_the_certainty_of_gains(self, pad, expected):
         got = make_pad_contract().pad_row(pad)
         assert got.dtype == np.float32
-        np.testing.assert_array_equal(got, expected)
+        np.testing.assert_allclose(got, expected, atol=1e-6)
 
     @pytest.mark.parametrize("takes_gains", [False, True])
-    def test_without_inputs_there_is_no_more_than_the_flag_of_gains(self, takes_gains):
+    def test_without_inputs_there_is_no_more_than_the_certainty_of_gains(self, takes_gains):
         contract = make_contract(takes_gains=takes_gains)
-        assert contract.pad_row(PAD).tolist() == [1] * takes_gains
+        assert contract.pad_row(PAD) == pytest.approx([0.9] * takes_gains)
         assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
 
     def test_what_is_written_is_read(self):
@@ -219,16 +225,16 @@ class TestRuntime:
         ("settings", "expected", "origin"),
         [
             ({}, [0, 0, 0, 0, 0], "nominal"),
-            ({"pad": PAD}, [1, 0, 1, 0, 1], "nominal"),
+            ({"pad": PAD}, [1, 0, 1, 0, 0.9], "nominal"),
             ({"pad": {"4": OTHER}}, [-1, 2, 1, 1, 0], "calibrated"),
             ({"pad": {"6": OTHER}}, [0, 0, 0, 0, 0], "nominal"),
             ({"counts_per_newton": 1500.0}, [0, 1, 0, 1, 0], "calibrated"),
-            ({"pad": PAD, "counts_per_newton": {"4": 1500.0}}, [1, 1, 1, 1, 1], "calibrated"),
+            ({"pad": PAD, "counts_per_newton": {"4": 1500.0}}, [1, 1, 1, 1, 0.9], "calibrated"),
             ({"pad": OTHER, "counts_per_newton": 1500.0}, [-1, 2, 1, 1, 0], "calibrated"),
         ],
     )
     def test_the_model_is_given_the_pad_of_the_sensor(self, settings, expected, origin):
-        assert self.pads_of(settings) == (expected, origin)
+        assert self.pads_of(settings) == (pytest.approx(expected), origin)
 
     def test_a_model_that_does_not_take_the_sensitivity_gives_nominal_newtons(self):
         contract = make_pad_contract(pad_inputs=(("thickness_mm", 4.5, 0.5),))
@@ -297,6 +303,10 @@ class TestPad:
             {"gains": (1.0,) * 16},
             {"gains": (0.0,) * 48},
             {"gains": (float("nan"),) * 48},
+            {"gain_half_widths": (0.02,) * 48},
+            {"gains": GAINED, "gain_half_widths": (0.02,) * 16},
+            {"gains": GAINED, "gain_half_widths": (1.1,) * 48},
+            {"gains": GAINED, "gain_half_widths": (float("nan"),) * 48},
         ],
     )
     def test_what_no_pad_has_is_refused(self, wrong):
@@ -305,8 +315,10 @@ class TestPad:
 
     def test_gains_go_with_their_places_and_axes_when_the_mounting_is_corrected(self):
         order = tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist())
-        turned = PAD.turned(Mounting(order=order, swap_xy=True, signs=(-1, 1, 1)))
+        widths = tuple((np.asarray(GAINED) / 50).tolist())
+        turned = replace(PAD, gain_half_widths=widths).turned(Mounting(order=order, swap_xy=True, signs=(-1, 1, 1)))
         assert turned.gains is not None and turned.thickness_mm == 5.0
-        before, after = (np.asarray(gains).reshape(3, 16) for gains in (GAINED, turned.gains))
-        np.testing.assert_array_equal(after, before[[1, 0, 2]][:, list(order)])
+        for values, moved in ((GAINED, turned.gains), (widths, turned.gain_half_widths)):
+            before, after = (np.asarray(one).reshape(3, 16) for one in (values, moved))
+            np.testing.assert_array_equal(after, before[[1, 0, 2]][:, list(order)])
         assert Pad().turned(Mounting(order=order)) == Pad()

@@ -34,10 +34,12 @@ def pads(draw):
             constants[name] = draw(st.floats(low, high, allow_subnormal=False))
         if draw(st.booleans()):
             intervals[name] = tuple(sorted(draw(st.tuples(*[st.floats(low, high, allow_subnormal=False)] * 2))))
-    gains = draw(st.none() | st.integers(0, 9))
-    if gains is not None:
-        gains = tuple(np.random.default_rng(gains).uniform(0.01, 100, 48).tolist())
-    return Pad(**constants, intervals=intervals, gains=gains)
+    seed = draw(st.none() | st.integers(0, 9))
+    if seed is None:
+        return Pad(**constants, intervals=intervals)
+    gains = tuple(np.random.default_rng(seed).uniform(0.01, 100, 48).tolist())
+    widths = tuple(np.random.default_rng(seed).uniform(0, 1, 48).tolist()) if draw(st.booleans()) else None
+    return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=widths)
 
 
 @st.composite
@@ -182,12 +184,38 @@ def test_a_pad_by_hand_is_read(tmp_path):
         ("gains = [1, 1, 1]", "48 numbers from 0.01 to 100: x of all places, then y, then z"),
         (f"gains = {[0.0] * 48}", "48 numbers from 0.01 to 100"),
         (f"gains = {[[1.0] * 48]}", "48 numbers"),
+        (f"gain_half_widths = {[0.1] * 48}", "'sensors.4.pad.gain_half_widths': without gains, expected both, or none"),
+        (f"gains = {[1.0] * 48}\ngain_half_widths = {[1.5] * 48}", "48 numbers from 0 to 1"),
+        (f"gains = {[1.0] * 48}\ngain_half_widths = [0.1]", "48 numbers from 0 to 1"),
     ],
 )
 def test_a_pad_that_cannot_be_is_refused_by_its_key(tmp_path, line, words):
     (tmp_path / "s.toml").write_text(pad_text(line))
     with pytest.raises(SensorFileError, match=re.escape(words)):
         load_sensor_file(tmp_path / "s.toml")
+
+
+@pytest.mark.parametrize(
+    ("by_hand", "by_itself", "used"),
+    [(None, 0.04, 0.04), (0.03, None, 0.03), (0.03, 0.04, 0.03), (0.04, 0.03, 0.03), (0.03, 0.03, 0.03)],
+)
+def test_of_gains_by_hand_and_of_gains_by_itself_the_surer_ones_are_used(by_hand, by_itself, used, tmp_path):
+    def with_gains(width, gain):
+        return None if width is None else Pad(gains=(gain,) * 48, gain_half_widths=(width,) * 48)
+
+    one = SensorEntry(pad=with_gains(by_hand, 0.9), learned=with_gains(by_itself, 1.1))
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": one}))
+    read = load_sensor_file(tmp_path / "s.toml")
+    assert read.sensors["4"] == one and read.path == tmp_path / "s.toml"
+    assert read.pads["4"].gain_half_widths == (used,) * 48
+    assert read.pads["4"].gains == ((0.9 if used == by_hand else 1.1),) * 48
+
+
+def test_constants_by_hand_stay_where_gains_by_itself_are_surer():
+    learned = Pad(gains=(1.1,) * 48, gain_half_widths=(0.03,) * 48)
+    entry = SensorEntry(pad=Pad(thickness_mm=4.0), learned=learned)
+    used = SensorFile(sensors={"4": entry}).pads["4"]
+    assert used.thickness_mm == 4.0 and used.gains == learned.gains
 
 
 def test_that_text_is_refused_for_its_id_alone(tmp_path):
@@ -249,3 +277,15 @@ def test_numpys_numbers_are_written_as_numbers_and_a_silent_taxel_not_at_all(tmp
     with pytest.raises(SensorFileError, match="a taxel of sensor 4 was silent while zeroing: zero again"):
         save_sensor_file(tmp_path / "t.toml", SensorFile(sensors={"4": SensorEntry(baseline=silent)}))
     assert not (tmp_path / "t.toml").exists()
+
+
+def test_learned_constants_are_used_where_there_are_none_by_hand():
+    gains = {"gains": (1.0,) * 48, "gain_half_widths": (0.05,) * 48}
+    learned = Pad(
+        poisson=0.42, thickness_mm=5.0, intervals={"poisson": (0.41, 0.43), "thickness_mm": (4.8, 5.2)}, **gains
+    )
+    by_hand = Pad(thickness_mm=4.0, gains=(0.9,) * 48, gain_half_widths=(0.01,) * 48)
+    used = SensorFile(sensors={"4": SensorEntry(pad=by_hand, learned=learned)}).pads["4"]
+    assert used.constants == {"thickness_mm": 4.0, "poisson": 0.42} and used.intervals == {"poisson": (0.41, 0.43)}
+    assert used.gains == by_hand.gains and used.gain_half_widths == by_hand.gain_half_widths
+    assert SensorFile(sensors={"4": SensorEntry(learned=learned)}).pads["4"] == learned

@@ -27,6 +27,7 @@ from edge_samples import BASELINE, ROOT, ListSink
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
+from edge.pipeline.gain_keeper import keep_learned
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
 from firmware_bridge.emulation.xela_server_model import VendorServer
@@ -34,6 +35,7 @@ from firmware_bridge.links import discovery as devices
 from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
@@ -155,6 +157,8 @@ def world(emulated, tmp_path, monkeypatch):
         monkeypatch.setattr(devices, "serial_ports", lambda: ports)
         if "press.mcap" in command and " record " not in command:
             cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
+        if "--forget-gains" in command:
+            keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * GAINS))
         if "npz:press.npz" in command:
             Path("press.npz").unlink()
         for written, real in (

@@ -91,14 +91,15 @@ def test_keys_of_baseline_and_sensor_files(tmp_path):
     assert set(document) == {"format", "version", "baselines"}
     assert set(document["baselines"][0]) == told("Baseline file")
     constants = {name: low or high for name, (low, high) in PAD_RANGES.items()}
-    pad = Pad(**constants, intervals={"thickness_mm": (4, 5)}, gains=(1.0,) * GAINS)
+    pad = Pad(**constants, intervals={"thickness_mm": (4, 5)}, gains=(1.0,) * GAINS, gain_half_widths=(0.1,) * GAINS)
     marks = {"assumed": frozenset({"mounting"}), "emulated": frozenset({"force"})}
-    sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad, **marks)}
+    sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad, pad, **marks)}
     save_sensor_file(tmp_path / "sensor.toml", SensorFile(adapter="D30BL366", sensors=sensors))
     document = tomllib.loads((tmp_path / "sensor.toml").read_text())
     entry = document.pop("sensors")["4"]
     assert set(entry.pop("baseline")) == {"id", "created_unix_s", "scans", "x", "y", "z"}
-    assert set(entry.pop("pad")) | set(document) | set(entry) == told("Sensor file")
+    assert entry["learned"] == entry["pad"]
+    assert set(entry.pop("pad")) | set(document) | set(entry) - {"learned"} == told("Sensor file")
 
 
 def rows(text: str) -> list[list[str]]:

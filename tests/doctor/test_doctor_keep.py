@@ -132,9 +132,9 @@ class TestMarks:
 
     def test_marks_that_cannot_be_are_refused(self, tmp_path):
         path = tmp_path / "s.toml"
-        path.write_text('format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.4]\nassumed = ["gains"]\n')
+        path.write_text('format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.4]\nassumed = ["weight"]\n')
         with pytest.raises(
-            SensorFileError, match=r"'sensors.4.assumed': .*, expected a list of mounting, force, baseline"
+            SensorFileError, match=r"'sensors.4.assumed': .*, expected a list of mounting, force, baseline, gains"
         ):
             load_sensor_file(path)
 

@@ -7,10 +7,11 @@ from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
 from train.experiments.sensor.real import Played, has_hole, play, share_touched, unevenness
+from train.experiments.sensor.trust import real_flags
 
 RECORDINGS = recordings_folder()
 PATHS = recording_paths(RECORDINGS)
-LEAST_SHARE, MOST_UNEVEN = 0.9, 0.3
+LEAST_SHARE, MOST_UNEVEN, MOST_DOUBTED = 0.9, 0.3, 0.02
 DENTED = "data_sample_2022-02-22-08-10-01"
 """The weakest grip, a documented fault: on both fingers the pattern has a dent below half (docs/log.md)."""
 
@@ -43,3 +44,10 @@ def test_over_all_scans_the_pad_is_covered_evenly(played):
     assert np.median(unevenness(patterns)) <= MOST_UNEVEN
     for name, one in played.items():
         assert np.median(unevenness(one.patterns)) <= MOST_UNEVEN, name
+
+
+def test_patterns_of_real_grips_are_believed():
+    model = ModelSession(find_model(DEFAULT_MODEL))
+    assert model.contract.read_trust() is not None, "the default model has no checks"
+    flagged = np.concatenate([real_flags(model, grip) for grip in recorded_grips(RECORDINGS)])
+    assert len(flagged) > 1000 and flagged.mean() <= MOST_DOUBTED

@@ -14,7 +14,7 @@ PAGE = [path for path in (ROOT / "edge" / "view").rglob("*") if path.suffix in (
 
 
 def test_a_kind_that_is_not_in_the_list_is_refused():
-    with pytest.raises(ValueError, match="event kind is 'runtime', expected one of back, cleared, given_up"):
+    with pytest.raises(ValueError, match="'runtime', expected one of back, cleared, gains_learned, given_up"):
         Event(0, "runtime", None, "told")
     with pytest.raises(ValueError, match="note kind is 'old', expected one of all_alike"):
         Note("old", "told")

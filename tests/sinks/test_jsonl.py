@@ -88,6 +88,7 @@ class TestJsonLines:
             "model": "fake",
             "dead": {},
             "filled": None,
+            "gains_certainty": None,
             "note": None,
             "event": None,
             "counters": RUN,

@@ -56,7 +56,8 @@ class FrozenPresses:
         """Return the pad of a sequence as a sensor file holds it, with its sensor's gains if asked for."""
         scaled = self.presses.constants[index].tolist()
         values = {name: c + spread * v for (name, c, spread), v in zip(input_scale(), scaled, strict=True)}
-        return Pad(**values, gains=tuple(self.gains[index].ravel().tolist()) if gains else None)
+        own = tuple(self.gains[index].ravel().tolist())
+        return Pad(**values, gains=own, gain_half_widths=(0.0,) * len(own)) if gains else Pad(**values)
 
     def patterns(self) -> NDArray[np.float32]:
         """Return the truth, (n, H, W) in [mm]."""

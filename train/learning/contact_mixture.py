@@ -1,35 +1,51 @@
-"""Distribution of a contact's readings on any pad: a mixture of Gaussians, each linear in the pad's constants.
+"""Distribution of a contact's readings on any pad: a mixture of normal distributions, linear in the pad's constants.
+
+    python -m train.learning.contact_mixture data/gripped.npz edge/models/contacts.npz
 
 A contact's 48 readings over the root mean square of its z do not depend on its force. Within a component they are
-normal about a mean that is linear in the constants that networks take (`pad_draws.INPUTS`, over their spread).
+normal about a mean that is linear in what differs from pad to pad. Readings are of even sensors: what the seats,
+moments and leans of the magnets do to them is taken out, since a learner estimates it for every place.
 """
 
-from dataclasses import dataclass, fields
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.gain_learning import LARGEST_COUNTS, LEAST_COUNTS, ContactModel, GainLearner
 from firmware_bridge.pad_geometry import AXES, USPA44
-from firmware_bridge.recording.npz_reader import read_npz
-from train.data.presses import PressSet
-from train.errors import DatasetError
-from train.physics.pad_draws import INPUTS
-from train.physics.sensor_noise import LARGEST_COUNTS, Nuisances, read_windows
+from firmware_bridge.scans.pad_constants import LEVEL_90
+from train.data.make_presses import make_presses
+from train.data.presses import PressSet, load_presses
+from train.data.simulated_sensors import CALIBRATION, contacts_of, sensor_of, true_log_gains
+from train.errors import DatasetError, TrainError
+from train.physics.pad_draws import RANGES, Pad, draw_pad
+from train.physics.sensor_noise import Nuisances, neighbours, read_windows
 
-CHANNELS: Final = len(AXES) * USPA44.taxel_count
-Z: Final = slice(AXES.index("z") * USPA44.taxel_count, (AXES.index("z") + 1) * USPA44.taxel_count)
-LEAST_COUNTS: Final = 200.0
-"""Largest z of the weakest contact used: in weaker ones, drift is over a fifth of it."""
-_COMPONENTS: Final = 72
-"""Largest number of components; each needs twice as many presses as there are channels."""
+TAXELS: Final = USPA44.taxel_count
+CHANNELS: Final = len(AXES) * TAXELS
+Z: Final = slice(AXES.index("z") * TAXELS, (AXES.index("z") + 1) * TAXELS)
+CONSTANTS: Final = (
+    *("thickness_mm", "poisson", "in_plane_share", "magnet_height_mm", "pitch_mm", "free_sides"),
+    "cross_talk",
+)
+"""Constants that differ from pad to pad and change a contact's shape; each over half of its range."""
+_SCALES: Final = (
+    *((name, sum(RANGES[name]) / 2, (RANGES[name][1] - RANGES[name][0]) / 2) for name in CONSTANTS[:-1]),
+    (CONSTANTS[-1], Nuisances().cross_talk / 2, Nuisances().cross_talk / 2),
+)
+"""Name, middle and half range of each."""
+_COMPONENTS: Final = 48
 _ROUNDS: Final = 12
-_SEED: Final = 0
-"""Seed of the nuisances and of the components' initial centres."""
 _RIDGE: Final = 1e-4
 """Variance added on each channel: a hundredth of the mean z."""
-_MOST_BYTES: Final = 1 << 26
+_SOFT: Final = 2.0 * CHANNELS
+"""Presses of a middle pad that a component's slopes over each constant are drawn to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +54,7 @@ class ContactMixture:
 
     Attributes:
         share: (k,) of the components.
-        means: (k, 1 + p, channels), the mean on a middle pad, then the change by one spread of each constant.
+        means: (k, 1 + p, channels), the mean on a middle pad, then the change by half the range of each constant.
         covariances: (k, channels, channels).
     """
 
@@ -47,52 +63,23 @@ class ContactMixture:
     covariances: NDArray[np.float64]
 
     def centres(self, constants: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the means (k, channels) on a pad of these constants, (p,) over their spread."""
+        """Return the means (k, channels) on a pad of these constants, (p,) over half of their ranges."""
         return np.append(1.0, constants) @ self.means
 
-    def responsibilities(
-        self, contacts: NDArray[np.floating], constants: NDArray[np.floating], channels: NDArray[np.integer]
-    ) -> NDArray[np.float64]:
-        """Return the probabilities (n, k) of the components for contacts (n, channels), from some of the channels."""
-        found = np.empty((len(contacts), len(self.share)))
-        for number, (centre, covariance) in enumerate(zip(self.centres(constants), self.covariances, strict=True)):
-            away = contacts[:, channels] - centre[channels]
-            found[:, number] = _log_normal(away, covariance[np.ix_(channels, channels)])
-        return _softmax(found + np.log(self.share))
-
-    def hidden_z(
-        self, contacts: NDArray[np.floating], constants: NDArray[np.floating], taxel: int
-    ) -> NDArray[np.float64]:
-        """Return the expected z of one taxel (n,) from the other taxels; its own readings are ignored."""
-        of_taxel = np.arange(taxel, CHANNELS, USPA44.taxel_count)
-        others = np.setdiff1d(np.arange(CHANNELS), of_taxel)
-        weights = self.responsibilities(contacts, constants, others)
-        z = Z.start + taxel
-        expected = np.empty_like(weights)
-        for number, (centre, covariance) in enumerate(zip(self.centres(constants), self.covariances, strict=True)):
-            slope = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, z])
-            expected[:, number] = centre[z] + (contacts[:, others] - centre[others]) @ slope
-        return (weights * expected).sum(axis=1)
-
-    def save(self, path: Path) -> None:
-        """Write the mixture as one npz."""
-        np.savez(path, allow_pickle=False, **{part.name: getattr(self, part.name) for part in fields(self)})
-
-
-def load_mixture(path: Path) -> ContactMixture:
-    """Load a mixture that `ContactMixture.save` has written.
-
-    Raises:
-        DatasetError: absent, damaged, or of other constants.
-    """
-    try:
-        arrays = read_npz(path, [part.name for part in fields(ContactMixture)], _MOST_BYTES)
-        mixture = ContactMixture(**arrays)
-        if mixture.means.shape[1:] != (1 + len(INPUTS), CHANNELS):
-            raise ValueError(f"means are {mixture.means.shape}")
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{path} is not a mixture of contacts ({error}): delete it, it is made again") from error
-    return mixture
+    def model(
+        self, widening: float = 1.0, bias: NDArray[np.floating] | None = None, constant_widening: float = 1.0
+    ) -> ContactModel:
+        """Return the mixture as a running sensor learns by it."""
+        log_size = np.linalg.slogdet(self.covariances)[1]
+        return ContactModel(
+            np.log(self.share) - 0.5 * log_size,
+            self.means,
+            np.linalg.inv(self.covariances).astype(np.float32),
+            widening,
+            np.zeros(CHANNELS) if bias is None else np.asarray(bias, dtype=np.float64),
+            _SCALES,
+            constant_widening,
+        )
 
 
 def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -102,38 +89,129 @@ def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
     """
     flat = counts.reshape(len(counts), -1).astype(np.float64)
     peaks = np.abs(counts).max(axis=(2, 3))
-    usable = (counts[:, AXES.index("z")].max(axis=(1, 2)) > LEAST_COUNTS) & (peaks < LARGEST_COUNTS).all(axis=1)
+    usable = (peaks[:, AXES.index("z")] > LEAST_COUNTS) & (peaks < LARGEST_COUNTS).all(axis=1)
     scale = np.sqrt((flat[:, Z] ** 2).mean(axis=1, keepdims=True))
     return flat / np.maximum(scale, 1.0), usable
 
 
-def fit_mixture(presses: PressSet) -> ContactMixture:
-    """Fit the mixture by expectation-maximisation to presses read by sensors with even gains.
+def scaled_constants(pad: Pad, cross_talk: float = 0.5) -> NDArray[np.float64]:
+    """Return CONSTANTS of a pad over half of their ranges, (p,); `cross_talk` is a share of the largest."""
+    bounds = [RANGES[name] for name in CONSTANTS[:-1]]
+    scaled = [
+        2 * (getattr(pad, name) - low) / (high - low) - 1 for name, (low, high) in zip(CONSTANTS, bounds, strict=False)
+    ]
+    return np.array([*scaled, 2 * cross_talk - 1])
+
+
+def place_effects(pad: Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the gains (taxels,) that seat and moment of each magnet make, and the share (2, taxels) of z in x and y.
+
+    On the axis of a dipole the field's change grows with the inverse fourth power of the distance; a leaning dipole
+    shows half of its slope times the change of z on the other axes.
+    """
+    rest, gap_mm = pad.rest(TAXELS), pad.magnet.gap_mm
+    return (gap_mm / (gap_mm - rest[:, 2])) ** 4 * pad.moments(TAXELS), -rest[:, 3:5].T / 2
+
+
+def even_contacts(presses: PressSet, seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return usable contacts (n, channels) as even sensors read them, and the constants (n, p) of their pads.
 
     Args:
-        presses: of many pads; the newest press of each sequence is used.
+        presses: whole sets of `make_presses`, whose pads can be drawn again; the newest press of each sequence is used.
+        seed: of the nuisances.
+    """
+    rng = np.random.default_rng(seed)
+    cross = rng.random(len(presses))
+    flat = presses.counts[:, 0].reshape(len(presses), len(AXES), TAXELS).astype(np.float64)
+    nuisances = Nuisances().without("gain_spread", "cross_talk")
+    shown = Nuisances().cross_talk * cross[:, None, None]
+    flat = flat + shown * (flat @ neighbours(USPA44.rows, USPA44.cols))
+    clean = flat.reshape(len(flat), 1, 1, *USPA44.scan_shape).astype(np.float32)
+    read = read_windows(clean, 1.0, nuisances, seed).reshape(flat.shape).astype(np.float64)
+    # Joined sets number their pads with gaps, in the order in which they were drawn.
+    numbers, of_pad = np.unique(presses.pad, return_inverse=True)
+    world_seed = presses.config["seed"]
+    pads = [draw_pad(np.random.default_rng([world_seed, number])) for number in range(len(numbers))]
+    effects = [place_effects(pad) for pad in pads]
+    read /= np.array([seat for seat, _ in effects])[of_pad][:, None]
+    read[:, :2] -= np.array([lean for _, lean in effects])[of_pad] * read[:, 2:]
+    contacts, usable = normalise(read.reshape(len(read), *USPA44.scan_shape))
+    constants = np.array([scaled_constants(pad) for pad in pads])[of_pad]
+    constants[:, -1] = 2 * cross - 1
+    return contacts[usable], constants[usable]
+
+
+def fit_mixture(
+    presses: PressSet, seed: int = 0, components: int = _COMPONENTS, rounds: int = _ROUNDS
+) -> ContactMixture:
+    """Fit the mixture by expectation-maximisation to presses read by even sensors.
+
+    Args:
+        presses: as of `even_contacts`.
+        seed: of the nuisances and of the components' initial centres.
+        components: largest number; each needs twice as many presses as there are channels.
+        rounds: number of expectation-maximisation rounds.
 
     Raises:
         DatasetError: too few presses for one component.
     """
-    nuisances = Nuisances().without("gain_spread")
-    contacts, usable = normalise(read_windows(presses.counts[:, :1, None], 1.0, nuisances, _SEED)[:, 0])
-    contacts, design = contacts[usable], np.insert(presses.constants[usable].astype(np.float64), 0, 1.0, axis=1)
-    components = min(_COMPONENTS, len(contacts) // (2 * CHANNELS))
+    contacts, constants = even_contacts(presses, seed)
+    design = np.insert(constants, 0, 1.0, axis=1)
+    components = min(components, len(contacts) // (2 * CHANNELS))
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
-    rng = np.random.default_rng(_SEED)
-    mixture = _fitted(contacts, design, _nearest(contacts, rng, components))
-    for _ in range(_ROUNDS):
+    rng = np.random.default_rng(seed)
+    mixture = _fitted(contacts, design, _nearest(contacts, rng, components, rounds))
+    for _ in range(rounds):
         mixture = _fitted(contacts, design, _given_constants(mixture, contacts, design))
     return mixture
 
 
-def _nearest(contacts: NDArray[np.float64], rng: np.random.Generator, components: int) -> NDArray[np.float64]:
+Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
+"""Contacts (n, 3, rows, cols) of a sensor, its true log-gains (channels,), and the constants (p,) of its pad."""
+
+
+def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
+    """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
+    plain = [_taught(mixture.model(), contacts) for contacts, _, _ in sensors]
+    off = [np.log(one.gains) - true for one, (_, true, _) in zip(plain, sensors, strict=True)]
+    bias = _symmetric(np.mean(off, axis=0))
+    taught = [_taught(mixture.model(1.0, bias), contacts) for contacts, _, _ in sensors]
+    gains = [(np.log(one.gains) - true) / one.deviations for one, (_, true, _) in zip(taught, sensors, strict=True)]
+    constants = [
+        ((one.constants - true) / one.constant_deviations)[:-1][one.determined[:-1]]
+        for one, (_, _, true) in zip(taught, sensors, strict=True)  # the cross-talk of a sensor is not available
+    ]
+    return mixture.model(_widening(gains), bias, _widening(constants))
+
+
+def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:
+    return float(np.quantile(np.abs(np.concatenate(ratios)), 0.9)) / LEVEL_90
+
+
+def _taught(model: ContactModel, contacts: NDArray[np.floating]) -> GainLearner:
+    learner = GainLearner(model)
+    for contact in contacts:
+        learner.learn(contact)
+    learner.solve()
+    return learner
+
+
+def _symmetric(bias: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean over mirrored and turned pads."""
+    planes = bias.reshape(len(AXES), USPA44.rows, USPA44.cols)
+    planes = (planes + planes[..., ::-1]) / 2
+    planes = (planes + planes[:, ::-1]) / 2
+    return ((planes + planes.swapaxes(1, 2)[[1, 0, 2]]) / 2).ravel()
+
+
+def _nearest(
+    contacts: NDArray[np.float64], rng: np.random.Generator, components: int, rounds: int
+) -> NDArray[np.float64]:
     """Return weights (n, k), each 0 or 1, of k means."""
     weights = np.zeros((len(contacts), components))
     centres = contacts[rng.choice(len(contacts), components, replace=False)]
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         nearest = (-2 * contacts @ centres.T + (centres**2).sum(axis=1)).argmin(axis=1)
         weights = (nearest[:, None] == np.arange(components)).astype(np.float64)
         centres = weights.T @ contacts / np.maximum(weights.sum(axis=0), 1.0)[:, None]
@@ -143,14 +221,16 @@ def _nearest(contacts: NDArray[np.float64], rng: np.random.Generator, components
 def _fitted(contacts: NDArray[np.float64], design: NDArray[np.float64], weights: NDArray[np.float64]) -> ContactMixture:
     """Fit components by weighted least squares; those of few presses are regularised by the covariance of all."""
     pooled = np.cov(contacts.T)
+    soft = np.diag([1e-6, *[_SOFT] * len(CONSTANTS)])
     means, covariances = [], []
     for weight in weights.T:
-        normal = design.T @ (weight[:, None] * design) + np.diag([1e-6, *[2.0 * CHANNELS] * len(INPUTS)])
-        mean = np.linalg.solve(normal, design.T @ (weight[:, None] * contacts))
-        away = contacts - design @ mean
-        spread = away.T @ (weight[:, None] * away) + 0.1 * pooled
+        used = np.flatnonzero(weight > 1e-4)
+        share, columns, read = weight[used], design[used], contacts[used]
+        mean = np.linalg.solve(columns.T @ (share[:, None] * columns) + soft, columns.T @ (share[:, None] * read))
+        away = read - columns @ mean
+        spread = away.T @ (share[:, None] * away) + 0.1 * pooled
         means.append(mean)
-        covariances.append(spread / (weight.sum() + 1) + _RIDGE * np.eye(CHANNELS))
+        covariances.append(spread / (share.sum() + 1) + _RIDGE * np.eye(CHANNELS))
     return ContactMixture(
         (weights.sum(axis=0) + 1) / (len(weights) + weights.shape[1]), np.array(means), np.array(covariances)
     )
@@ -176,3 +256,57 @@ def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> N
 def _softmax(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     grown = np.exp(logs - logs.max(axis=1, keepdims=True))
     return grown / grown.sum(axis=1, keepdims=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; 0 when done, 1 on an error of the user."""
+    parser = argparse.ArgumentParser(
+        prog="python -m train.learning.contact_mixture", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
+    parser.add_argument("out", type=Path, metavar="OUT.npz")
+    parser.add_argument(
+        "--sensors",
+        type=Path,
+        help="presses of the sensors by which it is calibrated (default: made next to the presses)",
+    )
+    options = parser.parse_args(arguments)
+    try:
+        mixture = fit_mixture(load_presses(options.presses))
+        presses = make_presses(CALIBRATION, options.sensors or options.presses.with_name("calibration.npz"))
+        sensors = [
+            (
+                contacts_of(presses, CALIBRATION, number),
+                true_log_gains(*sensor_of(CALIBRATION, number)),
+                scaled_constants(sensor_of(CALIBRATION, number)[0]),
+            )
+            for number in range(CALIBRATION.chunks)
+        ]
+        write_model(options.out, mixture, calibrated(mixture, sensors))
+    except TrainError as error:
+        sys.stderr.write(f"train.learning.contact_mixture: {error}\n")
+        return 1
+    sys.stdout.write(f"{options.out}: {len(mixture.share)} components\n")
+    return 0
+
+
+def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> None:
+    """Write the model as edge.perception.gain_learning reads it, in half precision."""
+    factors = np.linalg.inv(np.linalg.cholesky(mixture.covariances))
+    np.savez_compressed(
+        path,
+        allow_pickle=False,
+        share=mixture.share.astype(np.float32),
+        means=mixture.means.astype(np.float16),
+        factors=factors.astype(np.float16),
+        widening=np.float32(model.widening),
+        names=np.array([name for name, _, _ in model.constants]),
+        middles=np.array([middle for _, middle, _ in model.constants]),
+        halves=np.array([half for _, _, half in model.constants]),
+        constant_widening=np.float32(model.constant_widening),
+        bias=model.bias.astype(np.float32),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

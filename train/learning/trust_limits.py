@@ -65,7 +65,9 @@ def _mismatch(model: Model, trust: Trust, readings: NDArray[np.float32], pad: ND
     window[0] = readings
     window = contract.scale_window(window)
     pattern, traction = model.run(window, pad), model.traction
-    mismatch = PatternCheck(trust, contract, pad).judge(0, window[0], pattern, traction, 0).mismatch
+    check = PatternCheck(trust, contract)
+    check.use_pad(pad)
+    mismatch = check.judge(0, window[0], pattern, traction, 0).mismatch
     return 0.0 if mismatch is None else mismatch
 
 

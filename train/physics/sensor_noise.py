@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 from train.physics.hysteresis import NuisanceError, draw_lag, frame_weights
 from train.surfaces.depth_image import Pose
 
@@ -66,7 +67,7 @@ class Nuisances:
     pose_error_deg: float = 1.0
     hysteresis: float = 0.11
     cross_talk: float = 0.05
-    gain_spread: float = 0.075
+    gain_spread: float = GAIN_SPREAD
     thermal_drift_counts: float = 45.0
     earth_field_counts: float = 18.0
     noise_counts: float = 2.0
@@ -238,7 +239,7 @@ def _read(
     if nuisances.cross_talk:
         largest = stream("cross_talk").random((n, 1, 1, 1, 1), dtype=np.float32) * np.float32(nuisances.cross_talk)
         flat = counts.reshape(n, taps, -1, len(AXES), scan[1] * scan[2])
-        counts = (flat + largest * (flat @ _neighbours(scan[1], scan[2]))).reshape(counts.shape)
+        counts = (flat + largest * (flat @ neighbours(scan[1], scan[2]))).reshape(counts.shape)
     if nuisances.gain_spread:
         counts *= 1 + np.float32(nuisances.gain_spread) * _cut_normal(stream("gain_spread"), (n, 1, 1, *scan))
     if nuisances.thermal_drift_counts:
@@ -317,7 +318,7 @@ def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.
     return np.clip(rng.standard_normal(shape, dtype=np.float32), -2, 2)
 
 
-def _neighbours(rows: int, cols: int) -> NDArray[np.float32]:
+def neighbours(rows: int, cols: int) -> NDArray[np.float32]:
     """Return the share of a taxel's outflow that reaches another, (taxels, taxels): a quarter over each edge."""
     row, col = np.divmod(np.arange(rows * cols), cols)
     return ((abs(row[:, None] - row) + abs(col[:, None] - col)) == 1).astype(np.float32) / 4

@@ -10,7 +10,7 @@ const NUMBERS = {
   ],
   Uncertainty: [
     ["to be believed", "trusted"], ["mismatch", "mismatch"], ["tap mismatch", "tap_mismatch"], ["90 % within", "interval_mm"],
-    ["expected RMSE", "expected_rmse_mm"],
+    ["expected RMSE", "expected_rmse_mm"], ["gains", "gains_certainty"],
   ],
   Timing: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["pattern", "reused_from"], ["model", "model"]],
   Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
@@ -56,6 +56,7 @@ function numberTexts(sensor) {
     another_tap: made.another_tap === true ? "would help" : made.another_tap === false ? "would not help" : "\u2013",
     interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
     expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
+    gains_certainty: known(result.gains_certainty) ? `${number(100 * result.gains_certainty, 0)}${THIN}% certain` : "not known",
     reused_from: sensor.live() ? `${known(made.reused_from) ? "unchanged" : "new"}${made.estimate === "smooth" ? ", smooth" : ""}` : "\u2013",
     rate_hz: amount(result.rate_hz, 1, "Hz"),
     run_time_us: amount(made.run_time_us, 0, "\u00b5s"),

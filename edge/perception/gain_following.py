@@ -1,0 +1,81 @@
+"""Contacts that a running sensor learns its gains from: at most one a tap, and one now and then of a long hold.
+
+Nothing is computed while a pattern is made but a comparison: the strongest scan of a tap is kept, and is learned from
+once the pad is free again, or after HELD_SCANS.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.perception.gain_learning import ContactModel, GainLearner
+from edge.perception.result import Result
+from firmware_bridge.scans.pad_constants import Pad
+
+HELD_SCANS: Final = 200
+SURER: Final = 0.05
+"""Least rise of certainty that is worth a change of the gains in use."""
+SHIFTED: Final = 0.01
+"""Least RMS change of the gains in use."""
+_LEAST_CERTAINTY: Final = 0.1
+
+
+class GainFollower:
+    """Follower of one sensor's gains.
+
+    Attributes:
+        waiting: a contact is there to be learned from.
+        contacts: distinct contacts learned from.
+    """
+
+    def __init__(self, model: ContactModel, pad: Pad | None) -> None:
+        """Begin with the gains of a pad, if it has any."""
+        self.waiting = False
+        self._learner = GainLearner(model, pad)
+        self._used = self._by_hand = Pad() if pad is None else replace(pad, gains=None, gain_half_widths=None)
+        if pad is not None:
+            self._used = pad
+        self._strongest = np.zeros(0, dtype=np.float32)
+        self._force_counts = 0.0
+        self._seen = 0
+
+    @property
+    def contacts(self) -> int:
+        """Number of distinct contacts so far."""
+        return self._learner.contacts
+
+    @property
+    def learned(self) -> Pad:
+        """Pad by the contacts alone."""
+        return self._learner.pad()
+
+    def see(self, result: Result, counts: NDArray[np.float32]) -> bool:
+        """Take note of a contact's result and its readings (3, rows, cols); return whether it is time to learn.
+
+        A result that is not to be trusted teaches nothing.
+        """
+        if result.trusted is False:
+            return False
+        self._seen += 1
+        force_counts = result.force_counts or 0.0
+        if force_counts > self._force_counts:
+            self._strongest, self._force_counts = counts, force_counts
+            self.waiting = True
+        return self._seen >= HELD_SCANS
+
+    def learn(self, dead: NDArray[np.bool_]) -> Pad | None:
+        """Learn from the contact that waits; return the pad with its new gains if they have changed noticeably."""
+        self.waiting, self._force_counts, self._seen = False, 0.0, 0
+        if not self._learner.learn(self._strongest, dead):
+            return None
+        new, used = self._learner.pad(), self._used
+        if new.gains is None or new.gains_certainty < max(_LEAST_CERTAINTY, used.gains_certainty):
+            return None
+        shift = np.log(new.gains) - (0.0 if used.gains is None else np.log(used.gains))
+        surer = new.gains_certainty >= used.gains_certainty + SURER or not set(new.constants) <= set(used.constants)
+        if not surer and np.sqrt(np.square(shift).mean()) < SHIFTED:
+            return None
+        self._used = new.behind(self._by_hand)
+        return self._used

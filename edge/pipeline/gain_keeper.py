@@ -1,0 +1,85 @@
+"""Keeping of learned gains in the sensor file, in a thread of its own: a disk may take longer than a scan."""
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from firmware_bridge.errors import SensorFileError
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+
+_AS_WIRED: Final = frozenset({"mounting"})
+
+
+class GainKeeper:
+    """Keeper of the gains that the sensors of one file have learned.
+
+    Attributes:
+        trouble: why the last ones could not be kept; None if they were.
+    """
+
+    def __init__(self, path: Path, *, emulated: bool) -> None:
+        """Prepare.
+
+        Args:
+            path: sensor file.
+            emulated: the sensors are; the file of a real one is then left alone.
+        """
+        self.trouble: str | None = None
+        self._path = path
+        self._emulated = emulated
+        self._lock = threading.Lock()
+        self._threads: list[threading.Thread] = []
+
+    def keep(self, sensor: str, learned: Pad) -> None:
+        """Begin to write the learned gains of a sensor, which must not wait."""
+        self._threads = [one for one in self._threads if one.is_alive()]
+        thread = threading.Thread(target=self._write, args=(sensor, learned), name="gain-keeper")
+        self._threads.append(thread)
+        thread.start()
+
+    def close(self) -> None:
+        """Wait until all is written."""
+        for thread in self._threads:
+            thread.join()
+
+    def _write(self, sensor: str, learned: Pad) -> None:
+        with self._lock:
+            try:
+                self.trouble = None
+                keep_learned(self._path, sensor, learned, emulated=self._emulated)
+            except SensorFileError as error:
+                self.trouble = str(error)
+
+
+def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = False) -> None:
+    """Write learned gains into a sensor file, unless it holds surer ones.
+
+    The file is read again first, since a person or the doctor may have changed it meanwhile.
+
+    Raises:
+        SensorFileError: the file cannot be read or written.
+    """
+    known = load_sensor_file(path)
+    entry = known.sensors.get(sensor, SensorEntry(assumed=_AS_WIRED))
+    before = entry.learned
+    if (emulated and not entry.emulated) or (before is not None and before.gains_certainty > learned.gains_certainty):
+        return
+    entry = replace(entry, learned=learned)
+    save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: entry}), keep_before=False)
+
+
+def forget_learned(path: Path, sensor: str) -> None:
+    """Remove the learned gains of a sensor from a sensor file.
+
+    Raises:
+        SensorFileError: the file has none, or cannot be read or written.
+    """
+    known = load_sensor_file(path)
+    entry = known.sensors.get(sensor)
+    if entry is None or entry.learned is None:
+        there = ", ".join(name for name, one in known.sensors.items() if one.learned is not None) or "of no sensor"
+        raise SensorFileError(f"{path}: no learned gains of sensor {sensor}, expected one that has them: {there}")
+    save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: replace(entry, learned=None)}))

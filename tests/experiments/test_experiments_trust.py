@@ -1,0 +1,169 @@
+"""Report of the checks: faults of sensors, foreign taps, held taxels, and the page in miniature."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import FakeModel, make_pad_contract, write_model
+from experiment_samples import quick_bench
+from trust_samples import FOREIGN_TAXEL, make_trusted_contract
+
+from train.data.frozen_presses import load_frozen_presses
+from train.errors import CheckpointError
+from train.experiments.sensor import trust
+from train.experiments.support import contact_verdicts, held_taxel, stripes, wrong_taps
+from train.experiments.support.pushed import PushedSensor
+from train.experiments.support.sensor_faults import FAULTS, FIELDS, steel_field
+
+
+def press(z=3000.0, x=0.0):
+    counts = np.zeros((3, 4, 4), dtype=np.float32)
+    counts[2].flat[FOREIGN_TAXEL] = z
+    counts[0, 0, 0] = x
+    return counts
+
+
+@pytest.fixture(scope="module")
+def wide():
+    return load_frozen_presses().pick(np.arange(60))
+
+
+class TestFaults:
+    @pytest.mark.parametrize("name", FAULTS)
+    def test_a_fault_is_the_same_in_all_contacts(self, name):
+        counts = np.random.default_rng(0).normal(0, 500, (5, 3, 4, 4)).astype(np.float32)
+        counts[3] = counts[0]
+        kept = counts.copy()
+        wrong = FAULTS[name](np.random.default_rng(1), counts)
+        assert np.array_equal(counts, kept) and wrong.shape == counts.shape
+        assert (wrong != counts).any() and wrong[3] == pytest.approx(wrong[0])
+
+    def test_steel_raises_z_everywhere_and_pulls_x_and_y_to_the_middle(self):
+        fields = np.stack([steel_field(np.random.default_rng(seed)) for seed in range(200)])
+        assert (fields[:, 2] > 0).all()
+        most = np.abs(fields).max(axis=(1, 2, 3))
+        assert most.min() >= 150 and most.max() <= 1500
+        mean = fields.mean(axis=0)
+        assert (mean[0, :, 0] * mean[0, :, -1] < 0).all() and (mean[1, 0] * mean[1, -1] < 0).all()
+        assert set(FIELDS) <= set(FAULTS)
+
+
+class TestVerdicts:
+    def test_suspicion_is_counted_after_contacts_that_have_ended(self):
+        model = FakeModel(make_trusted_contract())
+        odd = np.stack([press(x=9000)] * contact_verdicts.CONTACTS)
+        good = np.stack([press()] * contact_verdicts.CONTACTS)
+        found = contact_verdicts.verdicts_on(model, [odd, good], [None, None])
+        assert len(found.sensor) == 2 * contact_verdicts.CONTACTS and found.checked.all()
+        assert found.flagged[found.sensor == 0].all() and not found.flagged[found.sensor == 1].any()
+        after = {number: sensors.tolist() for number, sensors in found.suspected.items()}
+        assert after == {1: [False, False], 3: [True, False], 5: [True, False], 10: [True, False]}
+        row = found.cells()
+        assert row["contacts"] == 22 and str(row["flagged %"]).startswith("50.0") and row["unexplained %"] == 0
+
+    def test_what_begins_no_contact_counts_nowhere(self):
+        found = contact_verdicts.verdicts_on(FakeModel(make_trusted_contract()), [np.stack([press(z=500)] * 4)], [None])
+        assert found.cells() == {"contacts": 0}
+
+    def test_a_share_of_none_has_an_interval_too(self):
+        assert contact_verdicts.share(np.zeros(100, dtype=bool)) == "0.0 (0.0..3.6)"
+        assert contact_verdicts.share(np.ones(100, dtype=bool)) == "100.0 (96.4..100.0)"
+        assert contact_verdicts.share(np.zeros(100, dtype=bool), np.zeros(100, dtype=int)) == "0.0 (0.0..97.5)"
+
+    def test_presses_of_a_pad_get_the_gains_of_one_sensor(self, wide):
+        one = contact_verdicts.of_one_sensor_each(wide)
+        for pad in np.unique(wide.presses.pad):
+            mine = wide.presses.pad == pad
+            assert np.ptp(one.gains[mine], axis=0).max() == 0
+            even = one.presses.counts[mine] / one.gains[mine][:, None]
+            assert even == pytest.approx(wide.presses.counts[mine] / wide.gains[mine][:, None], rel=1e-4)
+
+    def test_every_sensor_has_as_many_contacts(self, wide):
+        contacts = contact_verdicts.contacts_of(wide)
+        assert {len(one) for one in contacts} == {contact_verdicts.CONTACTS}
+        assert all(len(np.unique(wide.presses.pad[one])) == 1 for one in contacts)
+
+
+class TestTaps:
+    def test_right_windows_are_kept_and_foreign_ones_dropped(self):
+        model = FakeModel(make_trusted_contract(output_full_scale=0.5))
+        elsewhere = np.roll(press(), 2, axis=-1)
+        right, wrong = (np.stack([press(), *[one] * 3])[None] for one in (press(), elsewhere))
+        truth = np.zeros((1, 40, 40), dtype=np.float32)
+        found = [wrong_taps.guarded(model, wrong_taps.Windows(one, truth), 4) for one in (right, wrong)]
+        assert [one.taps_used.tolist() for one in found] == [[4], [1]]
+        assert [one.foreign.tolist() for one in found] == [[[False] * 3], [[True] * 3]]
+        alone = wrong_taps.guarded(model, wrong_taps.Windows(wrong, truth), 1)
+        assert alone.psnr_db == pytest.approx(found[1].psnr_db, abs=0.05) and found[0].psnr_db != found[1].psnr_db
+
+    def test_cases_change_earlier_taps_alone_or_mirror_all(self, wide):
+        firm = wrong_taps.firm(wide)
+        made = wrong_taps.cases(firm)
+        right = made["right"]
+        for name in ("another surface", "order reversed", "not turned"):
+            assert np.array_equal(made[name].counts[:, 0], right.counts[:, 0]), name
+            assert (made[name].counts[:, 1] != right.counts[:, 1]).any(axis=(1, 2, 3)).all(), name
+        mirrored = made["turned the other way"]
+        assert np.array_equal(mirrored.truth[..., ::-1], right.truth)
+        assert np.array_equal(mirrored.counts[:, :, 0, :, ::-1], -right.counts[:, :, 0])
+        assert np.array_equal(mirrored.counts[:, :, 1:, :, ::-1], right.counts[:, :, 1:])
+        longer = wrong_taps.twice_the_angle(firm, 2)
+        assert np.array_equal(longer["twice the angle"].counts[:, 1], right.counts[:, 2])
+
+    def test_the_next_press_is_another_of_the_same_pad(self):
+        pads = np.array([3, 3, 5, 7, 7, 7])
+        following = wrong_taps.next_of_pad(pads)
+        assert following.tolist() == [1, 0, 3, 4, 5, 3]
+
+
+def test_a_held_taxel_is_found_at_its_fifth_repeat(wide):
+    rows = held_taxel.held_rows(FakeModel(make_trusted_contract()), wrong_taps.firm(wide).pick(np.arange(4)))
+    assert [row["contact"] for row in rows] == ["held still", "moved", "held still, every scan"]
+    for row in rows:
+        assert str(row["flagged before %"]).startswith("0.0") and str(row["within 4 scans %"]).startswith("0.0")
+    assert str(rows[0]["within 5 scans %"]).startswith("100.0")
+    assert str(rows[2]["within 5 scans %"]).startswith("100.0")
+
+
+def test_stripes_are_of_their_period():
+    made = stripes.striped_presses(1, 3)
+    assert list(made) == list(stripes.PERIODS_MM)
+    for period_mm, presses in made.items():
+        assert set(presses.presses.family) == {f"{period_mm:g} mm"} and presses.presses.taps == 1
+        assert presses.presses.touching.any(axis=(1, 2)).all()
+    # Half of the face is bars: what does not touch lies between them, and finer stripes have more edges.
+    edges = [np.diff(made[period].presses.touching.astype(int), axis=2).astype(bool).sum() for period in (2.0, 6.0)]
+    assert edges[0] > edges[1]
+
+
+def test_a_pushed_sensor_remembers_suspicion():
+    sensor = PushedSensor(FakeModel(make_trusted_contract()))
+    for _ in range(6):
+        assert sensor.touch(press(x=9000)).untrusted_reason == "unfamiliar"
+    assert sensor.suspected
+    for _ in range(60):
+        sensor.touch(press())
+    assert not sensor.suspected
+
+
+class TestPage:
+    def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory, monkeypatch):
+        monkeypatch.setattr(trust, "TEST_FIGURES", 1)
+        page = trust.run(quick_bench(tmp_path_factory), tmp_path).read_text()
+        assert page.startswith("# trust\n") and "quick run" in page and "Falls short" in page
+        rows = {part: list(csv.DictReader((tmp_path / f"trust{part}.csv").open())) for part in ("", "-taps", "-psnr")}
+        assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows[""]}
+        cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
+        for part in ("-taps", "-psnr"):
+            named = [row["earlier taps"] for row in rows[part]]
+            assert named == [*cases, "right, longer sequences", "twice the angle"]
+        for part in ("-false-alarms", "-fields", "-held", "-stripes", "-times"):
+            assert (tmp_path / f"trust{part}.csv").exists()
+        assert (tmp_path / "trust.png").exists()
+
+    def test_a_model_without_checks_is_refused_in_a_line(self, tmp_path, tmp_path_factory):
+        for name in ("stsr-int8", "mtsr4-int8"):
+            write_model(tmp_path / f"{name}.onnx", make_pad_contract(taps=1))
+        with pytest.raises(CheckpointError, match="stsr-int8 has no checks"):
+            trust.run(replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)

@@ -1,0 +1,65 @@
+"""Checks with closed forms for the fake model: its patterns explain their readings, and what is foreign is plain."""
+
+import numpy as np
+from edge_samples import FakeModel, make_pad_contract
+
+from edge.inference.contract import Contract
+from edge.inference.familiarity import Check
+from edge.inference.forward_model import FEATURES, GRID, KPA, ForwardModel
+from edge.inference.small_network import SmallNetwork
+from edge.inference.trust import Trust
+
+CONSTANTS = 2
+UNFAMILIAR = 0.5
+"""Reading of x on taxel 0, over the amplitude of z, from which the sample's contacts are not familiar."""
+FOREIGN_TAXEL = 5
+
+
+def linear(inputs: int, weights: dict[int, float]) -> SmallNetwork:
+    """Return a network that sums some features."""
+    row = np.zeros((1, inputs))
+    for index, weight in weights.items():
+        row[0, index] = weight
+    return SmallNetwork([(row, np.zeros(1))])
+
+
+def make_forward(limit: float = 0.2) -> ForwardModel:
+    """Return the forward model of the tiny model: z is the mean of a taxel's pixels, x and y that of its traction."""
+    operator = np.zeros((1 + CONSTANTS, 48, FEATURES), dtype=np.float32)
+    cells = np.kron(np.eye(16).reshape(16, 4, 4), np.ones((1, 2, 2))).reshape(16, GRID**2)
+    operator[0, 32:, : GRID**2] = cells / 4
+    operator[0, :32, GRID**2 :] = KPA * np.eye(32)
+    inverse = np.zeros((GRID**2, 48), dtype=np.float32)
+    inverse[:, 32:] = cells.T
+    return ForwardModel(
+        operator=operator,
+        inverse=inverse,
+        spread=np.full(GRID**2, 0.125, dtype=np.float32),
+        noise=np.full(3, 0.03125, dtype=np.float32),
+        model_error=np.full(3, 0.125, dtype=np.float32),
+        unexplained=0.0625,
+        limit=limit,
+    )
+
+
+def make_trust(limit: float = 0.2) -> Trust:
+    """Return checks: x on taxel 0 is unfamiliar, and so is an earlier tap that was less on the newest one's taxel 5."""
+    contact = Check(linear(48 + 1 + 2 * CONSTANTS + 1, {0: 10.0}), 10 * UNFAMILIAR)
+    tap = Check(linear(2 * 48 + 4, {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
+    return Trust(make_forward(limit), contact, tap)
+
+
+def make_trusted_contract(limit: float = 0.2, **changes) -> Contract:
+    """Return the contract of the fake model with these checks."""
+    return make_pad_contract(**({"trust": make_trust(limit).to_json(), "interval_factor": 1.6} | changes))
+
+
+class WrongModel(FakeModel):
+    """Fake model whose patterns are `factor` times those that explain the readings."""
+
+    def __init__(self, contract: Contract, factor: float) -> None:
+        super().__init__(contract)
+        self.factor = factor
+
+    def run(self, window, pad=None):
+        return super().run(window, pad) * np.float32(self.factor)

@@ -1,0 +1,247 @@
+"""Training of checks: faults that are played, the fit of forward model and networks, their file, and their limits."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from edge_samples import FakeModel, make_contract
+from press_samples import make_press_set
+
+from edge.inference.familiarity import Check, contact_features
+from edge.inference.small_network import small_network
+from edge.inference.trust import trust_of
+from edge.perception.pattern_check import LEAST_COUNTS as LEAST_COUNTS_AT_RUN_TIME
+from train import trust
+from train.data.batches import network_input
+from train.errors import CheckpointError, DatasetError
+from train.learning import contact_check, tap_check
+from train.learning.contact_check import LEAST_COUNTS, drawn_readings, features_of, limit_of, moved
+from train.learning.forward_operator import fit_forward_model
+from train.learning.small_classifier import fit_classifier
+from train.learning.trust_limits import FALSE_ALARMS, TrustFit, load_trust
+from train.learning.wrong_readings import SPOILINGS, magnet_field, spoiled
+from train.networks.compact import CompactNet
+from train.networks.symmetric import symmetries
+from train.physics.pad_draws import INPUTS, input_scale
+
+SHORTEN = 1000
+
+
+def readings(count=40, seed=0):
+    counts = np.random.default_rng(seed).normal(0, 300, (count, 3, 4, 4)).astype(np.float32)
+    counts[:, 2] = np.abs(counts[:, 2]) * 5 + 200
+    return counts
+
+
+@pytest.fixture(scope="module")
+def presses():
+    return make_press_set(count=60, taps=4)
+
+
+@pytest.fixture(scope="module")
+def path(presses, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("trust")
+    presses.save(folder / "presses.npz")
+    trust.main([str(folder / "trust.json"), "--data", str(folder / "presses.npz"), "--shorten", str(SHORTEN)])
+    return folder / "trust.json"
+
+
+class TestWrongReadings:
+    @pytest.mark.parametrize("name", SPOILINGS)
+    def test_a_fault_changes_readings_and_leaves_those_it_was_given(self, name):
+        counts = readings()
+        kept = counts.copy()
+        wrong = SPOILINGS[name](np.random.default_rng(1), counts)
+        assert np.array_equal(counts, kept) and wrong is not counts and not np.shares_memory(wrong, counts)
+        assert wrong.shape == counts.shape and np.isfinite(wrong).all()
+        changed = (wrong != counts).any(axis=(1, 2, 3))
+        assert changed.mean() > 0.5
+        again = SPOILINGS[name](np.random.default_rng(1), counts)
+        assert np.array_equal(again, wrong)
+
+    def test_faults_of_places_and_axes_keep_the_numbers(self):
+        counts = readings()
+        for name in ("taxels shuffled", "two taxels exchanged", "places turned or mirrored"):
+            wrong = SPOILINGS[name](np.random.default_rng(1), counts)
+            assert np.array_equal(np.sort(wrong.reshape(40, 3, 16)), np.sort(counts.reshape(40, 3, 16))), name
+        assert np.array_equal(np.abs(SPOILINGS["axes turned"](np.random.default_rng(1), counts)), np.abs(counts))
+
+    def test_all_faults_occur_each_with_its_name(self):
+        counts = readings(90)
+        kept = counts.copy()
+        wrong, names = spoiled(np.random.default_rng(0), counts)
+        assert np.array_equal(counts, kept) and not np.shares_memory(wrong, counts)
+        assert {name: int((names == name).sum()) for name in SPOILINGS} == dict.fromkeys(SPOILINGS, 10)
+        turned = names == "axes turned"
+        assert np.array_equal(np.abs(wrong[turned]), np.abs(counts[turned]))
+        assert not np.array_equal(np.abs(wrong[~turned]), np.abs(counts[~turned]))
+
+    def test_a_far_magnet_has_the_counts_of_its_bounds_and_a_gradient(self):
+        field = magnet_field(np.random.default_rng(0), 500)
+        most = np.abs(field).max(axis=(1, 2, 3))
+        assert 150 <= most.min() < 200 and 1400 < most.max() <= 1500
+        spread = np.ptp(field, axis=(2, 3)).max(axis=1) / most
+        assert (spread > 0.01).all() and np.median(spread) < 1  # far, so that it is nearly even
+        assert (np.abs(field.mean(axis=0)) < 150).all()  # from everywhere
+
+    def test_a_far_magnet_has_no_curl_on_the_pad(self):
+        """Of a field without currents, the change of x along y is that of y along x."""
+        field = magnet_field(np.random.default_rng(0), 200).astype(np.float64)
+        x_down = np.gradient(field[:, 0], axis=1)[:, 1:-1, 1:-1]
+        y_right = np.gradient(field[:, 1], axis=2)[:, 1:-1, 1:-1]
+        assert np.median(np.abs(x_down - y_right)) < 0.06 * np.median(np.abs(x_down))
+
+
+class TestMoved:
+    def test_it_agrees_with_a_network_that_has_these_symmetries(self):
+        """A pattern of moved readings is the moved pattern, or else places and axes were not moved alike."""
+        torch.manual_seed(0)
+        net = CompactNet(1, 4, channels=16, blocks=1, group="p4m").eval()
+        counts = readings(64)
+        found = moved(np.random.default_rng(2), counts)
+        with torch.no_grad():
+            plain, after = (net(network_input(one[:, None]))[0].numpy() for one in (counts, found))
+        moves = symmetries("p4m")
+        agrees = np.array(
+            [[np.allclose(a, move(p), atol=1e-4) for move in moves] for a, p in zip(after, plain, strict=True)]
+        )
+        assert agrees.any(axis=1).all() and agrees.any(axis=0).all()
+        assert np.abs(plain[0] - plain[0].T).max() > 0.01  # moves can be told apart
+
+    def test_a_sequence_moves_as_a_whole_and_turns_alone_do_not_mirror(self):
+        windows = np.repeat(readings(64)[:, None], 3, axis=1)
+        kept = windows.copy()
+        found = moved(np.random.default_rng(3), windows, mirror=False)
+        assert np.array_equal(windows, kept)
+        assert np.array_equal(found[:, 0], found[:, 1]) and np.array_equal(found[:, 0], found[:, 2])
+        z = windows[:, 0, 2]
+        turns = [
+            np.array([np.array_equal(a, np.rot90(b, k)) for a, b in zip(found[:, 0, 2], z, strict=True)])
+            for k in range(4)
+        ]
+        assert np.logical_or.reduce(turns).all() and all(one.any() for one in turns)
+
+
+class TestClassifier:
+    def test_it_learns_what_is_not_linear(self):
+        rng = np.random.default_rng(0)
+        points = rng.uniform(-2, 2, (4000, 3)).astype(np.float32) * (1, 10, 100) + (0, 5, -300)
+        inside = ((points - (0, 5, -300)) / (1, 10, 100))[:, :2] ** 2 @ (1, 1) < 1.5
+        points = points.astype(np.float32)
+        network = fit_classifier(points[inside], points[~inside], (24,), 1500, seed=0)
+        found = np.array([network(row) for row in points]) > 0
+        assert (found == ~inside).mean() > 0.95 and network.inputs == 3
+
+    def test_it_follows_from_its_seed(self):
+        rng = np.random.default_rng(0)
+        right, wrong = rng.normal(0, 1, (2, 50, 4)).astype(np.float32)
+        one, same, other = (fit_classifier(right, wrong, (8,), 20, seed).to_json() for seed in (1, 1, 2))
+        assert one == same != other
+
+
+class TestForward:
+    def test_a_linear_world_is_found_again(self, presses):
+        """Readings that are a linear map of pattern and drag leave nothing."""
+        rng = np.random.default_rng(0)
+        many = make_press_set(count=600, taps=1)
+        patterns = rng.uniform(0, 0.5, (600, 8, 8)).repeat(5, axis=1).repeat(5, axis=2)
+        drag = rng.normal(0, 20, (600, 3, 4, 4)).repeat(2, axis=2).repeat(2, axis=3)
+        many = replace(many, patterns=patterns.astype(np.float16), traction_kpa=drag.astype(np.float16))
+        cells = np.concatenate(
+            [many.patterns[:, ::5, ::5].reshape(600, -1), many.traction_kpa[:, :2, ::2, ::2].reshape(600, -1) / 30],
+            axis=1,
+        )
+        counts = (cells.astype(np.float32) @ rng.normal(0, 200, (cells.shape[1], 48))).reshape(600, 1, 3, 4, 4)
+        found = fit_forward_model(replace(many, counts=counts.astype(np.float32)))
+        assert found.unexplained < 1e-3 and found.model_error.max() < 0.05
+        assert found.operator.shape == (1 + len(INPUTS), 48, 96) and found.limit == np.inf
+
+    def test_what_a_linear_world_does_not_explain_is_told(self, presses):
+        assert fit_forward_model(presses).unexplained > 0.05
+
+
+class TestFile:
+    def test_it_comes_back(self, path, presses):
+        fitted = json.loads(path.read_text())
+        assert set(fitted) == {"forward", "contact", "tap", "data_sha256"} and fitted["data_sha256"] == presses.sha256()
+        loaded = load_trust(path, presses)
+        assert loaded.fitted == fitted and loaded.validation is presses
+        again = trust.fit_trust(presses, seed=1, shorten=SHORTEN)
+        assert again == fitted
+
+    @pytest.mark.parametrize(
+        "damage",
+        [lambda one: one.pop("tap"), lambda one: one.update(contact=[]), lambda one: one["forward"].update(limit=-1.0)],
+    )
+    def test_a_damaged_one_is_named(self, path, presses, tmp_path, damage):
+        fitted = json.loads(path.read_text())
+        damage(fitted)
+        (tmp_path / "bad.json").write_text(json.dumps(fitted))
+        with pytest.raises(CheckpointError, match=r"bad\.json: .*make it with 'python -m train.trust"):
+            load_trust(tmp_path / "bad.json", presses)
+
+    @pytest.mark.parametrize("content", [None, "", "[]", "{"])
+    def test_no_file_and_no_json_are_named(self, presses, tmp_path, content):
+        if content is not None:
+            (tmp_path / "bad.json").write_text(content)
+        with pytest.raises(CheckpointError, match=r"bad\.json"):
+            load_trust(tmp_path / "bad.json", presses)
+
+    def test_presses_of_one_tap_cannot_tell_taps_apart(self):
+        with pytest.raises(DatasetError, match="no sequences of several taps"):
+            trust.fit_trust(make_press_set(taps=1), seed=1, shorten=SHORTEN)
+
+    def test_the_command_ends_in_a_line_without_its_data(self, tmp_path):
+        with pytest.raises(SystemExit, match=r"trust: .*none\.npz"):
+            trust.main([str(tmp_path / "trust.json"), "--data", str(tmp_path / "none.npz")])
+        assert not (tmp_path / "trust.json").exists()
+
+
+class TestLimits:
+    @pytest.mark.parametrize("share", [0.01, 0.1, 0.5])
+    def test_a_limit_is_exceeded_by_the_share_asked_for(self, share):
+        scores = np.random.default_rng(0).permutation(1000).astype(float)
+        assert (scores > limit_of(scores, share)).mean() == pytest.approx(share, abs=0.0015)
+
+    @pytest.mark.parametrize("share", [0.02, 0.2])
+    def test_contacts_exceed_theirs_by_the_share(self, path, presses, share):
+        network = small_network(json.loads(path.read_text())["contact"])
+        check = contact_check.contact_check(network, presses, share, seed=5)
+        counts, pads = drawn_readings(presses, 5)
+        strong = counts[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
+        scores = np.array([network(row) for row in features_of(counts[strong], pads[strong])])
+        assert share - 0.03 <= (scores > check.limit).mean() <= share
+
+    @pytest.mark.parametrize("share", [0.02, 0.2])
+    def test_taps_exceed_theirs_by_the_share(self, path, presses, share):
+        network = small_network(json.loads(path.read_text())["tap"])
+        check = tap_check.tap_check(network, presses, share, seed=5)
+        windows = tap_check.read_twice(presses, 5)
+        pairs = [tap_check.pair_features(windows[:, 0], windows[:, step], step) for step in range(1, presses.taps)]
+        scores = np.array([network(row) for row in np.concatenate(pairs)])
+        assert len(scores) and share - 0.03 <= (scores > check.limit).mean() <= share
+
+    def test_a_models_own_mismatch_sets_its_limit(self, path, presses):
+        fit = TrustFit(json.loads(path.read_text()), presses)
+        contract = make_contract(
+            taps=2, pad_inputs=tuple(input_scale()), takes_gains=True, traction_scale=2, output_full_scale=0.5
+        )
+        model = FakeModel(contract)
+        made = fit.of(model)
+        assert 0 < made.forward.limit < np.inf and isinstance(made.contact, Check)
+        assert len(model.windows) and all((window[1] == 0).all() for window in model.windows)  # one tap each
+        assert (fit._mismatches(model, made) > made.forward.limit).mean() <= FALSE_ALARMS / 2
+        twice = trust_of(json.loads(json.dumps(made.to_json())), len(INPUTS))
+        assert twice is not None and twice.forward.limit == made.forward.limit
+
+    def test_training_and_runtime_leave_the_same_contacts_unchecked(self):
+        assert LEAST_COUNTS == LEAST_COUNTS_AT_RUN_TIME
+
+    def test_features_are_those_of_the_runtime(self):
+        counts, pads = readings(3), np.random.default_rng(0).normal(0, 1, (3, 13)).astype(np.float32)
+        unit = np.array([500, 500, 1000], dtype=np.float32)[:, None, None]
+        expected = [contact_features(tap / unit, pad) for tap, pad in zip(counts, pads, strict=True)]
+        assert np.array_equal(features_of(counts, pads), np.stack(expected))
