@@ -14,6 +14,7 @@ import numpy as np
 
 USAGE = "usage: python shm_read.py NAME SENSOR [--pretend]; --pretend acts also on a sensor that is none"
 DEVICE = 1
+UNTRUSTED = 0
 
 
 def attach(name: str) -> memoryview:
@@ -47,17 +48,21 @@ def latest(memory: memoryview, sensor: str, oldest_s: float = 0.05, pretend: boo
     return None
 
 
+def described(memory: memoryview, half: bytes) -> str:
+    """Return the force of a result in words, and the depth unless its pattern is not to be believed."""
+    height, width, _, _, pattern_at = unpack_from("<5I", memory, 40)
+    pattern = np.frombuffer(half, "<f4", height * width, pattern_at).reshape(height, width)  # NaN without one
+    believed = unpack_from("<i", half, 592) != (UNTRUSTED,)
+    depth = f"{pattern.max():.3f} mm at most" if believed else "pattern not to be believed"
+    return f"{unpack_from('<d', half, 104)[0]:.0f} counts, {depth}"
+
+
 def main(name: str, sensor: str, pretend: bool) -> None:
     """Print ten lines a second while the memory exists, attaching each time, because a writer may restart."""
     while True:
         memory = attach(name)
         half = latest(memory, sensor, pretend=pretend)
-        shown = "nothing to act on"
-        if half is not None:
-            height, width, _, _, pattern_at = unpack_from("<5I", memory, 40)
-            pattern = np.frombuffer(half, "<f4", height * width, pattern_at).reshape(height, width)  # NaN without one
-            shown = f"{unpack_from('<d', half, 104)[0]:.0f} counts, {pattern.max():.3f} mm at most"
-        print(shown, flush=True)
+        print("nothing to act on" if half is None else described(memory, half), flush=True)
         time.sleep(0.1)
 
 

@@ -118,6 +118,16 @@ class TestReading:
             assert shm_read.latest(memory, "4", **young) is None
             assert shm_read.latest(memory, "4", **young, pretend=True) is not None
 
+    def test_a_depth_that_is_not_to_be_believed_is_not_shown(self, sink, name):
+        memory, result = attach(name), make_result(7, press_counts=3000)
+        untrusted = replace(result, trusted=False, untrusted_reason="unfamiliar")
+        for shown, line in (
+            (result, r"\d+ counts, [\d.]+ mm at most"),
+            (untrusted, r"\d+ counts, pattern not to be .*"),
+        ):
+            sink.write(shown, {})
+            assert re.fullmatch(line, shm_read.described(memory, latest(memory, "4")))
+
     @pytest.mark.parametrize(
         ("words", "line"), [(["--pretend"], r"\d+ counts, [\d.]+ mm at most"), ([], "nothing to .*")]
     )
