@@ -30,8 +30,8 @@ TAPS := data/gripped.npz data/gripped4.npz
 
 models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: under two hours on two cores
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --int8 $(TAPS)
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS)
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --int8 $(TAPS)
 	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.expected_error import is_confidence, is_number
+from edge.inference.intervals import is_interval_levels
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 
@@ -19,6 +20,8 @@ EARLIER_VERSION: Final = 4
 """Version that is still loaded; its files lack the keys of ADDED."""
 ADDED: Final = ("pad_inputs", "takes_gains", "traction_scale")
 """Keys that version 5 added; without them a model takes no pad and gives no traction."""
+OPTIONAL: Final = ("interval_levels",)
+"""Keys that a file may lack in any version."""
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 PAD_NAME: Final = "pad"
@@ -78,6 +81,8 @@ class Contract:
         takes_gains: True if it takes windows with the taxels' gains divided out, and an input that states whether they
             are.
         traction_scale: traction pixels per taxel pitch; None if the model gives no traction.
+        interval_levels: percentage -> deviations that make half of the interval that holds so many of the pixels in
+            each of edge.inference.intervals.REGIONS; empty if they were not measured.
     """
 
     version: int
@@ -103,6 +108,7 @@ class Contract:
     pad_inputs: tuple[tuple[str, float, float], ...] = ()
     takes_gains: bool = False
     traction_scale: int | None = None
+    interval_levels: dict[str, list[float]] = field(default_factory=dict)
 
     @property
     def window_shape(self) -> tuple[int | str, int, int, int]:
@@ -158,7 +164,8 @@ class Contract:
         if version not in (CONTRACT_VERSION, EARLIER_VERSION):
             expected = f"expected {CONTRACT_VERSION} or {EARLIER_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {key: _value(metadata, key) for key in _keys(version)}
+        lacking = {key for key in OPTIONAL if KEY_PREFIX + key not in metadata}
+        values = {key: _value(metadata, key) for key in _keys(version) if key not in lacking}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
         values["pad_inputs"] = tuple(map(tuple, values.get("pad_inputs", ())))
@@ -231,7 +238,7 @@ class Contract:
 
 def _keys(version: int) -> list[str]:
     """Return the keys of a contract of this version."""
-    names = [field.name for field in fields(Contract)]
+    names = [one.name for one in fields(Contract)]
     return [name for name in names if name not in ADDED] if version == EARLIER_VERSION else names
 
 
@@ -279,6 +286,8 @@ def _check(values: Mapping[str, Any]) -> None:
         refuse("interval_factor", "a positive number, or null for a model without deviations")
     if not is_confidence(values["confidence"], values["taps"]):
         refuse("confidence", "for each number of taps doubt, error and gain, lists of equal length, doubt rising")
+    if not is_interval_levels(values.get("interval_levels", {})):
+        refuse("interval_levels", "for each percentage a positive number for every region")
     scaling = values["counts_per_unit"]
     if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
         refuse("counts_per_unit", f"three positive numbers from {LEAST_UNIT:g}, for x, y, z")
