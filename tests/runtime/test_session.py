@@ -198,7 +198,7 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
 @pytest.mark.parametrize("levels", [{"90": [1, 1, 1, 0]}, {"100": [1] * 4}, {"most": [1] * 4}, {"90": [1, 1, 1, "1"]}])
 def test_interval_levels_are_positive_factors_of_percentages(levels):
     metadata = make_contract(interval_levels=levels).to_metadata()
-    with pytest.raises(ModelError, match="'interval_levels' is .* for each percentage a positive number"):
+    with pytest.raises(ModelError, match=r"'interval_levels' is .* for each percentage a positive number"):
         Contract.from_metadata(metadata)
 
 

@@ -35,6 +35,7 @@ EXPERIMENTS: Final = {
     "identify": "gains and constants of a sensor from its own contacts",
     "zeroing": "drift followed, holds not eaten",
     "calibration": "how true the deviations are",
+    "intervals": "intervals by region and family, and the error of what is trusted most",
     "confidence": "expected error and early stop against what came out",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",

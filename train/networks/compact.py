@@ -28,8 +28,8 @@ _LEAST_DEVIATION: Final = 1e-4
 _FIRST_UNCERTAINTY: Final = log(expm1(0.02))
 """Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
 
-_MOST_LOGIT: Final = 30.0
-"""Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 30 mm."""
+_MOST_LOGIT: Final = 8.0
+"""Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
 
 _LEAST_SHARE: Final = 1e-3
 """Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
