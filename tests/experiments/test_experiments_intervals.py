@@ -12,8 +12,8 @@ from interval_samples import export_with_intervals
 from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
 from train.errors import TrainError
-from train.experiments.sensor import intervals
-from train.experiments.sensor.intervals import Held
+from train.experiments.sensor import interval_coverage
+from train.experiments.sensor.interval_coverage import Held
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def page(tmp_path_factory):
     export_with_intervals(models)
     (models / "one-int8.onnx").rename(models / f"{DEFAULT_MODEL}.onnx")
     bench = replace(quick_bench(tmp_path_factory), models=models)
-    return intervals.run(bench, tmp_path_factory.mktemp("reports"))
+    return interval_coverage.run(bench, tmp_path_factory.mktemp("reports"))
 
 
 def rows_of(page, part=""):
@@ -44,7 +44,7 @@ def test_a_model_without_levels_is_refused(tmp_path):
     model = ModelSession(write_model(tmp_path / "sure.onnx", make_contract(interval_factor=1.6)))
     windows, truth = np.zeros((1, 4, 3, 4, 4), np.float32), np.zeros((1, 40, 40), np.float32)
     with pytest.raises(TrainError, match="'sure' has no levels of intervals: export it"):
-        intervals.hold(model, windows, [None], truth, np.zeros(1, int), 1)
+        interval_coverage.hold(model, windows, [None], truth, np.zeros(1, int), 1)
 
 
 def held_of(error_mm, deviation_mm=0.1, region=None):
@@ -73,6 +73,6 @@ def test_coverage_is_of_the_pixels_of_a_region():
 
 def test_the_trusted_half_is_that_of_the_least_expected_error():
     errors = np.array([1.0, 2.0, 3.0, 4.0])
-    assert intervals._half(errors, np.array([4.0, 3.0, 2.0, 1.0])) == pytest.approx(np.sqrt((9 + 16) / 2))
-    assert intervals._half(errors, errors) == pytest.approx(np.sqrt((1 + 4) / 2))
-    assert intervals._risk(errors, errors)[-1] == pytest.approx(np.sqrt(30 / 4))
+    assert interval_coverage._half(errors, np.array([4.0, 3.0, 2.0, 1.0])) == pytest.approx(np.sqrt((9 + 16) / 2))
+    assert interval_coverage._half(errors, errors) == pytest.approx(np.sqrt((1 + 4) / 2))
+    assert interval_coverage._risk(errors, errors)[-1] == pytest.approx(np.sqrt(30 / 4))

@@ -48,8 +48,8 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
-_FILES: Final = {"identify": "gains_from_contacts"}
-"""File names that differ from the experiment's: train.identify is the command of a user's own sensor."""
+_FILES: Final = {"identify": "gains_from_contacts", "intervals": "interval_coverage"}
+"""File names that differ from the experiment's: another file of the package has that name."""
 
 
 def module_of(name: str) -> str:
