@@ -31,8 +31,8 @@ TAPS := data/gripped.npz data/gripped4.npz
 models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: under two hours on two cores
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
 	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --trust checkpoints/trust.json
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --trust checkpoints/trust.json --int8 $(TAPS)
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
 	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 

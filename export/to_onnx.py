@@ -2,7 +2,9 @@
 
 python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr4.pt --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --int8 data/seen.npz data/figures.npz --out edge/models
+python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
 
+With validation presses, deviations are corrected by region, so that their intervals hold; with --intervals, by window.
 If int8 costs more than the limit on the validation set, the network is fine-tuned for it, on the same taps.
 """
 
@@ -22,6 +24,7 @@ from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Cont
 from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.graphs.graph import known_width, outputs, to_model
+from export.graphs.intervals import IntervalData
 from export.graphs.parity import check_parity
 from export.graphs.writing import Writer
 from export.quantisation.fine_tune import FineTuning, quantised_well
@@ -33,7 +36,7 @@ from train.data.dataset import Sequences
 from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
-from train.data.presses import PressSet, load_presses
+from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
 from train.freeze import held_out
 from train.learning.checkpoint import load_network
@@ -108,6 +111,7 @@ def export(
     tuning: FineTuning | None = None,
     validation: Sequence[FrozenSet] = (),
     trust: TrustFit | None = None,
+    intervals: IntervalData | None = None,
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
@@ -126,6 +130,7 @@ def export(
         validation: sets apart from test and training, on which confidence is fitted; without them, the contract's
             confidence stays empty.
         trust: forward model and checks for the contract; None for none.
+        intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
@@ -136,8 +141,14 @@ def export(
     net, report = load_network(checkpoint)
     net = folded(net)
     contract = contract_of(net, report, frozen, geometry, batch)
+    level = contract.contact_level
+    if intervals is not None and contract.interval_factor is not None:
+        report = {**report, "options": {**report["options"], "intervals": True}}
     writer = Writer(folder, frozen, validation, report, trust)
     if calibration is None:
+        if intervals is not None:
+            found = intervals.corrected(net, level)
+            net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
         model = to_model(net, geometry, batch)
         single = model if batch in (1, ANY_BATCH) else to_model(net, geometry)
         parity = check_parity(net, model, frozen, contract)
@@ -147,25 +158,33 @@ def export(
     check_parity(net, single, frozen, contract)
     seen = calibration_batch(calibration, contract)
     well = quantised_well(net, geometry, seen, calibration, tuning, MOST_LOSS_DB, every=every)
+    net, in_float, integers = well.net, well.model, well.integers
+    integer_net, levels = net, {}
+    if intervals is not None:
+        found = intervals.corrected(net, level)
+        net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
+        in_float = to_model(net, geometry)
+        found = intervals.conformed(net, quantised(in_float, seen, every=every))
+        integer_net, levels = found.net, found.interval_levels
+        integers = quantised(to_model(integer_net, geometry), seen, every=every)
     lines: list[str] = []
     if tuning is not None and well.trained_on:
         mixed_sha256 = tuning.sha256(contract.training_sha256, calibration.sha256(), every=every)
         contract = replace(contract, training_sha256=mixed_sha256)
-        model = well.model if batch == 1 else to_model(well.net, geometry, batch)
-        parity = check_parity(well.net, model, frozen, contract)
+        model = in_float if batch == 1 else to_model(net, geometry, batch)
+        parity = check_parity(net, model, frozen, contract)
         facts = [f"parity {parity:.1e}", "float32 after fine-tuning for int8"]
-        lines.append(writer.write(checkpoint.stem, model, well.model, contract, facts))
-    in_float = writer.error(well.model, contract)
-    model = well.integers if batch == 1 else quantised(to_model(well.net, geometry, batch), seen, every=every)
+        lines.append(writer.write(checkpoint.stem, model, in_float, contract, facts))
+    float_error = writer.error(in_float, contract)
+    model = integers if batch == 1 else quantised(to_model(integer_net, geometry, batch), seen, every=every)
     integer, convs = convolutions(model)
-    contract = replace(contract, arithmetic="int8", test_error={}, confidence={})
-    in_integers = writer.error(well.integers, contract)
+    contract = replace(contract, arithmetic="int8", test_error={}, confidence={}, interval_levels=levels)
     facts = [
         f"{integer} of {convs} convolutions in int8",
-        *_cost(in_float, in_integers),
+        *_cost(float_error, writer.error(integers, contract)),
         *[well.said] * bool(well.said),
     ]
-    lines.append(writer.write(checkpoint.stem + INT8_SUFFIX, model, well.integers, contract, facts))
+    lines.append(writer.write(checkpoint.stem + INT8_SUFFIX, model, integers, contract, facts))
     return "\n".join(lines)
 
 
@@ -193,6 +212,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
     parser.add_argument(
         "--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them"
+    )
+    parser.add_argument(
+        "--intervals", type=Path, nargs="+", metavar="DATA", help="training presses on which intervals are fitted"
     )
     parser.add_argument(
         "--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust"
@@ -223,17 +245,21 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error("--all-integers needs --int8")
     if options.int8 is None and steps is not None:
         parser.error("--fine-tune-steps needs --int8")
+    if options.intervals is not None and options.validation is None:
+        parser.error("--intervals needs --validation")
     lines: list[str] = []
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
         taps = None if options.int8 is None else load_taps(options.int8)
-        trust = None
+        trust = intervals = None
         if options.validation is None:
             validation = confidence_sets(held_out("validation"), frozen.scale)
         else:
             presses = load_presses(options.validation)
             validation = [freeze_presses(presses, SEED).as_frozen_set()]
+            training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
+            intervals = IntervalData(presses, training)
             if options.trust is not None:
                 trust = load_trust(options.trust, presses)
         tuning = FineTuning(FINE_TUNE_STEPS if steps is None else steps, validation[0], always=steps is not None)
@@ -248,6 +274,7 @@ def main(arguments: list[str] | None = None) -> None:
                 tuning=tuning if steps != 0 else None,
                 validation=validation,
                 trust=trust,
+                intervals=intervals,
             )
             sys.stdout.write(line + "\n")
             lines += line.splitlines()

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.expected_error import is_confidence, is_number
+from edge.inference.intervals import is_interval_levels
 from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 6
-ADDED: Final = MappingProxyType({5: ("pad_inputs", "takes_gains", "traction_scale"), 6: ("trust",)})
+ADDED: Final = MappingProxyType(
+    {5: ("pad_inputs", "takes_gains", "traction_scale"), 6: ("trust", "interval_levels")},
+)
 """Keys that each version added; without them a model takes no pad, gives no traction, and checks nothing."""
 EARLIER_VERSIONS: Final = (4, 5)
 """Versions that are still loaded."""
@@ -82,6 +85,8 @@ class Contract:
             are.
         traction_scale: traction pixels per taxel pitch; None if the model gives no traction.
         trust: forward model and checks as JSON, see edge.inference.trust; empty if the model has none.
+        interval_levels: percentage -> deviations that make half of the interval that holds so many of the pixels in
+            each of edge.inference.intervals.REGIONS; empty if they were not measured.
     """
 
     version: int
@@ -108,6 +113,7 @@ class Contract:
     takes_gains: bool = False
     traction_scale: int | None = None
     trust: dict[str, Any] = field(default_factory=dict)
+    interval_levels: dict[str, list[float]] = field(default_factory=dict)
 
     @property
     def window_shape(self) -> tuple[int | str, int, int, int]:
@@ -293,6 +299,8 @@ def _check(values: Mapping[str, Any]) -> None:
         refuse(
             "confidence", "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
         )
+    if not is_interval_levels(values.get("interval_levels", {})):
+        refuse("interval_levels", "for each percentage a positive number for every region")
     scaling = values["counts_per_unit"]
     if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
         refuse("counts_per_unit", f"three positive numbers from {LEAST_UNIT:g}, for x, y, z")

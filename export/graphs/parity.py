@@ -146,11 +146,15 @@ def _largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def example_pads(count: int, width: int) -> NDArray[np.float32]:
-    """Draw pad inputs, (count, width), within their ranges; every third pad is without constants."""
-    rng = np.random.default_rng(0)
-    constants = (width - 1) // 2
-    flags = rng.integers(2, size=(count, constants))
-    pads = np.concatenate([rng.uniform(-1, 1, flags.shape) * flags, flags, rng.random((count, width % 2))], axis=1)
+    """Draw pad inputs as in `Contract.pad_row`, (count, width); every third pad is without constants.
+
+    Constants lie within their range, and flags are 0 or 1: far outside, outputs are nonsense to the last bit, and a
+    difference between two ways to add would say nothing.
+    """
+    rng, constants = np.random.default_rng(0), width // 2
+    flags = rng.integers(0, 2, (count, constants))
+    values = rng.uniform(-1, 1, (count, constants)) * flags
+    pads = np.concatenate([values, flags, rng.uniform(0, 1, (count, width % 2))], axis=1).astype(np.float32)
     pads[::3] = 0
     return pads.astype(np.float32)
 

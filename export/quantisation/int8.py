@@ -143,7 +143,7 @@ def _never(_: Iterable[bool]) -> bool:
 
 
 def _last_convolutions(model: onnx.ModelProto, made_by: dict[str, NodeProto]) -> set[str]:
-    """Return the convolutions from which an output is computed without another convolution in between."""
+    """Return the convolutions from which an output is computed without another convolution or a Gemm in between."""
     found, behind = set(), [value.name for value in model.graph.output]
     while behind:
         node = made_by.get(behind.pop())
@@ -151,7 +151,7 @@ def _last_convolutions(model: onnx.ModelProto, made_by: dict[str, NodeProto]) ->
             continue
         if node.op_type == "Conv":
             found.add(node.name)
-        else:
+        elif node.op_type != "Gemm":  # a layer of its own, which sees what convolutions made
             behind += node.input
     return found
 

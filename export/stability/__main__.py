@@ -22,7 +22,7 @@ from train.report import Report, Row
 
 PARTS: Final = (
     *("layer_contact", "curved_contact", "finite_elements", "magnets", "psf"),
-    *("networks", "inputs", "metrics", "counts"),
+    *("networks", "chain", "inputs", "metrics", "counts"),
 )
 """Modules of this package with `cases(quick)`; each is imported when needed, since one requires an extra."""
 _LEAST, _WORST = 1e-9, 1e2

@@ -173,6 +173,7 @@ BROKEN_VALUES = {
     "takes_gains": 1,
     "traction_scale": 2.0,
     "trust": {"forward": {}},
+    "interval_levels": {"90": [1.6, 1.6, 1.6]},
 }
 
 
@@ -191,6 +192,21 @@ def test_a_broken_contract_is_refused_naming_key_and_file(tmp_path, key, how):
     path = write_model(tmp_path / "broken.onnx", metadata=metadata)
     with pytest.raises(ModelError, match=f"broken.onnx: .*'{key}'"):
         ModelSession(path)
+
+
+@pytest.mark.parametrize("levels", [{"90": [1, 1, 1, 0]}, {"100": [1] * 4}, {"most": [1] * 4}, {"90": [1, 1, 1, "1"]}])
+def test_interval_levels_are_positive_factors_of_percentages(levels):
+    metadata = make_contract(interval_levels=levels).to_metadata()
+    with pytest.raises(ModelError, match=r"'interval_levels' is .* for each percentage a positive number"):
+        Contract.from_metadata(metadata)
+
+
+def test_interval_levels_are_kept_and_may_be_absent():
+    levels = {"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6, 1.6, 1.6, 1.6]}
+    metadata = make_contract(interval_levels=levels).to_metadata()
+    assert Contract.from_metadata(metadata).interval_levels == levels
+    del metadata[KEY_PREFIX + "interval_levels"]
+    assert Contract.from_metadata(metadata).interval_levels == {}
 
 
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):

@@ -36,6 +36,7 @@ EXPERIMENTS: Final = {
     "gains-from-contacts": "gains and constants of a sensor from its own contacts",
     "zeroing": "drift followed, holds not absorbed",
     "calibration": "coverage of the deviations",
+    "intervals": "intervals by region and family, and the error of what is trusted most",
     "confidence": "expected error and early stop against true error",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
@@ -48,6 +49,8 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
+_FILES: Final = {"intervals": "interval_coverage"}
+"""File names that differ from the experiment's: another file of the package has that name."""
 
 
 def module_of(name: str) -> str:

@@ -7,7 +7,7 @@ input; and it is exactly symmetric under quarter turns.
 """
 
 from math import expm1, log, sqrt
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from train.data.batch import Batch
 from train.networks.blocks import PatternNet
+from train.networks.interval_correction import IntervalCorrection
 from train.networks.losses import relative_rms_error, truth_size
 from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
 
@@ -26,6 +27,9 @@ _LEAST_DEVIATION: Final = 1e-4
 
 _FIRST_UNCERTAINTY: Final = log(expm1(0.02))
 """Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
+
+_MOST_LOGIT: Final = 8.0
+"""Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
 
 _LEAST_SHARE: Final = 1e-3
 """Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
@@ -62,10 +66,12 @@ class CompactNet(PatternNet):
         known: numbers that say constants of the pad, see train.physics.pad_draws.
         group: symmetries. Mirror images are those of one tap alone: a mirrored pad is turned the other way from tap to
             tap. At the same work quarter turns leave twice the free numbers, and training mirrors windows instead.
+        intervals: correct the deviations by region, see `add_intervals`.
 
     Attributes:
         deviation_scale: factor on the deviation, computed after training by
             `train.learning.interval_calibration.calibrate`.
+        intervals: correction of the deviations by region; None until `add_intervals`.
 
     Raises:
         ValueError: no taps, an odd scale, or channels that do not divide.
@@ -74,7 +80,14 @@ class CompactNet(PatternNet):
     deviation_scale: Tensor
 
     def __init__(
-        self, taps: int, scale: int, channels: int = 64, blocks: int = 6, known: int = 0, group: Group = "p4"
+        self,
+        taps: int,
+        scale: int,
+        channels: int = 64,
+        blocks: int = 6,
+        known: int = 0,
+        group: Group = "p4",
+        intervals: bool = False,
     ) -> None:
         super().__init__()
         if taps < 1:
@@ -129,6 +142,18 @@ class CompactNet(PatternNet):
         )
         self.traction = SymmetricConv2d(wide + narrow, vectors(self.group), 3)
         self.register_buffer("deviation_scale", torch.tensor(1.0))
+        self.intervals: IntervalCorrection | None = None
+        if intervals:
+            self.add_intervals()
+
+    def add_intervals(self) -> IntervalCorrection:
+        """Add a correction of the deviations that changes nothing yet, and return it; an earlier one is replaced."""
+        channels = self._width[0]
+        symmetries = fields(self.group, channels).index.shape[0]
+        self.intervals = IntervalCorrection(
+            self.scale, channels + channels // 2, symmetries, self.known + 1, self.taps
+        ).to(self.deviation_scale.device)
+        return self.intervals
 
     def forward(self, window: Tensor, pad: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
@@ -140,6 +165,16 @@ class CompactNet(PatternNet):
             window: (n, 3K, rows, cols) in network units.
             pad: (n, known), constants of the pads; None for no constants.
         """
+        seen = self.see(window, pad)
+        if self.training:
+            return seen.pattern * seen.newest, seen.deviation * seen.newest, seen.traction
+        pattern, deviation = torch.relu(seen.pattern), seen.deviation
+        if self.intervals is not None:
+            deviation = deviation * self.intervals(seen.features, pattern, deviation, seen.about, seen.later)
+        return pattern * seen.newest, deviation * seen.newest, seen.traction
+
+    def see(self, window: Tensor, pad: Tensor | None = None) -> "Seen":
+        """Return the outputs before any correction, and what they were made of; arguments as `forward`."""
         count, _, rows, cols = window.shape
         taps = window.view(count, self.taps, 3, rows, cols)
         amplitude = taps.square().mean(dim=(2, 3, 4), keepdim=True).sqrt() + _QUIET_UNITS
@@ -156,12 +191,14 @@ class CompactNet(PatternNet):
         scale, shift = self.context(everywhere).chunk(2, dim=1)
         merged = torch.relu(self.merge(entered) * (1 + scale) + shift)
         features = torch.cat([self.trunk(merged), felt], dim=1)
-        pattern = self.leave(features)[:, 0] * newest
+        pattern = self.leave(features)[:, 0]
         traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
         # Not an exponential, which would be unbounded on a window unlike all others.
-        uncertainty = F.softplus(self.uncertainty(features.detach())[:, 0] + _FIRST_UNCERTAINTY)
-        deviation = (uncertainty + _LEAST_DEVIATION) * newest * self.deviation_scale
-        return (pattern if self.training else torch.relu(pattern)), deviation, traction
+        logits = self.uncertainty(features.detach())[:, 0].to(window.dtype) + _FIRST_UNCERTAINTY
+        uncertainty = F.softplus(logits) if self.training else _softplus(logits)
+        deviation = (uncertainty + _LEAST_DEVIATION) * self.deviation_scale
+        later = (amplitude[:, 1:, 0, 0, 0] > _QUIET_UNITS).to(window.dtype)
+        return Seen(features, newest, about, later, pattern, deviation, traction)
 
     def take_over(self, start: "CompactNet") -> None:
         """Copy another network's function of the newest taps; further taps are ignored until trained.
@@ -191,6 +228,33 @@ class CompactNet(PatternNet):
             if weight.shape == ours.weight.shape:
                 ours.assign(weight, source.bias.detach())
         self.deviation_scale.copy_(start.deviation_scale)
+
+
+def _softplus(values: Tensor) -> Tensor:
+    """Return the softplus of values up to _MOST_LOGIT in steps for which onnxruntime takes a third of the time."""
+    return torch.log(1 + torch.exp(values.clamp_max(_MOST_LOGIT)))
+
+
+class Seen(NamedTuple):
+    """Outputs of a compact network for n windows, and what they were made of.
+
+    Attributes:
+        features: (n, channels, h, w).
+        newest: amplitude of the newest tap, (n, 1, 1).
+        about: (n, known + 1), the pad's inputs and the bounded amplitude.
+        later: (n, K - 1), 1 for each earlier tap that is there, else 0.
+        pattern: (n, H, W), not cut at zero, over the amplitude, in [mm].
+        deviation: (n, H, W), not corrected, over the amplitude, in [mm].
+        traction: (n, 3, h, w) in [kPa].
+    """
+
+    features: Tensor
+    newest: Tensor
+    about: Tensor
+    later: Tensor
+    pattern: Tensor
+    deviation: Tensor
+    traction: Tensor
 
 
 class HeteroscedasticError:

@@ -1,0 +1,71 @@
+"""Step of export that makes a network's intervals hold: see train.learning.interval_fit."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import onnx
+import torch
+from numpy.typing import NDArray
+
+from export.graphs.graph import outputs
+from export.graphs.parity import GraphRun
+from train.data.presses import PressSet
+from train.learning.interval_fit import Run, conform, fit_correction, readings_of_presses
+from train.networks.blocks import PatternNet
+from train.networks.compact import CompactNet
+
+_AT_ONCE: Final = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Corrected:
+    """Network whose intervals hold, and its factors at several levels; as it was if it gives no deviations.
+
+    Attributes:
+        net: with a correction.
+        interval_levels: key of the contract.
+    """
+
+    net: PatternNet
+    interval_levels: dict[str, list[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalData:
+    """Presses that intervals are made of.
+
+    Attributes:
+        validation: that nothing was trained on.
+        training: on which the correction by window is fitted; None for one by region and number of taps alone.
+    """
+
+    validation: PressSet
+    training: PressSet | None = None
+
+    def corrected(self, net: PatternNet, contact_level: float) -> Corrected:
+        """Return a copy of a network with a correction that holds for the network itself."""
+        if not isinstance(net, CompactNet):
+            return Corrected(net, {})
+        other = copy.deepcopy(net)
+        if self.training is None:
+            other.add_intervals().contact_level.fill_(contact_level)
+        else:
+            fit_correction(other, self.training, contact_level)
+        return self._conformed(other, lambda windows, pads: _run(other, windows, pads))
+
+    def conformed(self, net: PatternNet, graph: onnx.ModelProto) -> Corrected:
+        """Return a copy of a corrected network whose correction holds for its graph, which is in integers."""
+        if not isinstance(net, CompactNet):
+            return Corrected(net, {})
+        return self._conformed(copy.deepcopy(net), GraphRun(graph))
+
+    def _conformed(self, net: CompactNet, run: Run) -> Corrected:
+        return Corrected(net, conform(net, run, readings_of_presses(self.validation, net.taps)))
+
+
+def _run(net: CompactNet, windows: NDArray, pads: NDArray | None) -> Sequence[NDArray]:
+    pads_of = [None] if pads is None else torch.from_numpy(pads).split(_AT_ONCE)
+    parts = zip(torch.from_numpy(windows).split(_AT_ONCE), pads_of, strict=True)
+    return [torch.cat(maps).numpy() for maps in zip(*(outputs(net, *part) for part in parts), strict=True)]

@@ -1,0 +1,165 @@
+"""Correction of deviations by region: nothing before it is fitted, symmetric, and conformal after."""
+
+import numpy as np
+import pytest
+import torch
+from press_samples import make_press_set
+
+from edge.inference.intervals import REGIONS, regions
+from train.learning import interval_fit
+from train.learning.interval_calibration import half_width_mm
+from train.learning.interval_fit import Readings, conform, fit_correction, readings_of_presses
+from train.networks.compact import CompactNet
+from train.networks.interval_correction import LOG_RANGE
+from train.physics.pad_draws import KNOWN
+
+LEVEL = 0.3
+
+
+def make_net(taps=2, seed=0) -> CompactNet:
+    """Return first weights whose patterns are not all zeros."""
+    torch.manual_seed(seed)
+    net = CompactNet(taps, 10, channels=16, blocks=1, known=KNOWN).eval()
+    with torch.no_grad():
+        net.leave[2].bias_free += 0.02
+    return net
+
+
+def windows(taps=2, count=4):
+    return torch.randn(count, 3 * taps, 4, 4, generator=torch.Generator().manual_seed(0))
+
+
+def corrected(net, weights=0.3):
+    correction = net.add_intervals()
+    correction.contact_level.fill_(LEVEL)
+    torch.nn.init.normal_(correction.leave.weight, 0, weights)
+    correction.requires_grad_(requires_grad=False)
+    return correction
+
+
+def run(net):
+    return lambda given, pads: [one.numpy() for one in net(torch.from_numpy(given), torch.from_numpy(pads))]
+
+
+@pytest.fixture(autouse=True)
+def _no_gradients():
+    with torch.no_grad():
+        yield
+
+
+def test_a_new_correction_changes_nothing():
+    net = make_net()
+    before = net(windows())
+    net.add_intervals()
+    for one, other in zip(before, net(windows()), strict=True):
+        assert torch.allclose(one, other, rtol=1e-6)
+
+
+def test_weights_of_a_correction_load_into_a_network_built_with_one():
+    net = make_net()
+    corrected(net)
+    again = CompactNet(2, 10, channels=16, blocks=1, known=KNOWN, intervals=True).eval()
+    again.load_state_dict(net.state_dict())
+    assert torch.equal(net(windows())[1], again(windows())[1])
+    assert "intervals.centre" not in make_net().state_dict()
+
+
+def test_the_correction_changes_deviations_alone_and_only_in_use():
+    net = make_net()
+    before = net(windows())
+    corrected(net)
+    after = net(windows())
+    assert torch.equal(before[0], after[0]) and torch.equal(before[2], after[2])
+    assert not torch.allclose(before[1], after[1])
+    learning, plain = net.train()(windows())[1], make_net().train()(windows())[1]
+    assert torch.equal(learning, plain)
+
+
+def test_its_masks_are_the_regions_of_the_runtime():
+    correction = corrected(make_net())
+    across = np.arange(40)
+    away = np.hypot(across[:, None] - [[[15]], [[2]], [[20]]], across - [[[15]], [[30]], [[20]]])
+    patterns = np.maximum(0.3 - away / [[[30]], [[80]], [[8]]], 0).astype(np.float32)
+    patterns[2] = 0
+    given = torch.from_numpy(patterns)
+    masks = correction.masks(given, given.amax(dim=(1, 2), keepdim=True)).numpy().astype(bool)
+    region = np.select([~masks[:, 2], masks[:, 1], masks[:, 0]], [0, 1, 2], 3)
+    np.testing.assert_array_equal(region, regions(patterns, LEVEL, correction.near))
+    assert len(np.unique(region[0])) == len(REGIONS)
+
+
+def test_a_turned_pad_has_turned_deviations():
+    net = make_net(taps=1)
+    corrected(net)
+    window = windows(taps=1)
+    turned = torch.rot90(window, 1, dims=(-2, -1)).clone()
+    turned[:, 0], turned[:, 1] = turned[:, 1].clone(), -turned[:, 0].clone()
+    expected = torch.rot90(net(window)[1], 1, dims=(-2, -1))
+    assert torch.allclose(net(turned)[1], expected, rtol=1e-4)
+
+
+def test_a_shift_is_of_one_region_and_one_number_of_taps():
+    correction = corrected(make_net(taps=3))
+    summary, later = torch.randn(3, len(correction.centre)), torch.tensor([[0.0, 0], [1, 0], [1, 1]])
+    before = correction.log_factors(summary, later)
+    shift = torch.tensor([0.0, 0.5, 0.0, -0.25])
+    correction.shift(2, shift)
+    moved = correction.log_factors(summary, later) - before
+    assert torch.allclose(moved, torch.stack([0 * shift, shift, 0 * shift]), atol=1e-5)
+
+
+def test_factors_are_bounded_whatever_the_weights():
+    net = make_net()
+    corrected(net, weights=1e3)
+    low, high = (np.exp(bound) for bound in LOG_RANGE)
+    for scale in (1e-6, 1.0, 1e6):
+        factor = net(scale * windows())[1] / make_net()(scale * windows())[1]
+        assert torch.isfinite(factor).all() and low * 0.999 < factor.min() and factor.max() < high * 1.001
+
+
+def test_conformal_intervals_hold_in_every_region_for_every_number_of_taps():
+    """Errors are ten times as large at the edge, and twice as large of one tap."""
+    net = make_net()
+    correction = corrected(net)
+    readings = readings_of_presses(make_press_set(count=40), net.taps, times=1)
+    # Patterns are those of the presses, so that every region is there; the truth is apart by as much everywhere.
+    patterns = readings[0].truth
+    apart = [Readings(one.windows, one.pads, patterns + np.float32(0.01)) for one in readings]
+    region = regions(patterns, LEVEL, correction.near)
+    spread = np.random.default_rng(0).uniform(0.1, 1, patterns.shape) * np.where(region == 1, 0.1, 1)
+
+    def run(given, _pads):
+        later = torch.from_numpy(given[:, 3:].any(axis=(1, 2, 3))).float()[:, None]
+        factors = correction.log_factors(torch.zeros(len(given), len(correction.centre)), later).exp().numpy()
+        factor = np.take_along_axis(factors, region.reshape(len(given), -1).astype(int), axis=1)
+        return patterns, factor.reshape(patterns.shape) * spread * (1 + later[:, :, None].numpy())
+
+    levels = conform(net, run, apart)
+    assert list(levels) == ["50", "80", "90", "95"]
+    assert levels["90"] == pytest.approx([float(half_width_mm(1.0))] * 4, rel=0.02)
+    for given in (1, 2):
+        deviation = run(apart[0].with_taps(given), None)[1]
+        held = np.abs(patterns - apart[0].truth) <= half_width_mm(deviation)
+        assert [held[region == number].mean() for number in range(4)] == pytest.approx([0.9] * 4, abs=0.01)
+
+
+def test_a_fitted_correction_tells_windows_apart(monkeypatch):
+    monkeypatch.setattr(interval_fit, "_STEPS", 300)
+    presses = make_press_set(count=120, taps=1)
+    net = make_net(taps=1)
+    with torch.enable_grad():
+        fit_correction(net, presses, LEVEL)
+    again = make_net(taps=1)
+    with torch.enable_grad():
+        fit_correction(again, presses, LEVEL)
+    assert torch.equal(net.intervals.leave.weight, again.intervals.leave.weight), "the same seed, the same weights"
+    readings = readings_of_presses(presses, 1, times=1)[0]
+    pattern, deviation = run(net)(readings.with_taps(1), readings.pads)[:2]
+    plain = run(make_net(taps=1))(readings.with_taps(1), readings.pads)[1]
+    held = [np.mean(np.abs(pattern - readings.truth) <= half_width_mm(of)).item() for of in (plain, deviation)]
+    assert abs(held[1] - 0.9) < 0.07 < abs(held[0] - 0.9)
+
+
+def test_a_network_without_a_correction_is_refused():
+    with pytest.raises(ValueError, match="no correction of intervals"):
+        conform(make_net(), run(make_net()), readings_of_presses(make_press_set(), 2, times=1))

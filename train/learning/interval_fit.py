@@ -1,0 +1,206 @@
+"""Fit of a network's interval correction: its weights on training presses, its level on validation presses.
+
+The network is trained and stays as it is. Errors over half widths are sampled in each region of each window; the
+factors that cover a share LEVEL of them minimise the pinball loss of their logarithm, whose slope is the coverage
+itself, so every pixel counts the same whatever its size. Training presses leave errors slightly too small: the
+conformal step shifts the factors of each region and each number of taps until validation presses, which nothing was
+trained on, are covered.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge.inference.intervals import REGIONS, regions
+from edge.terminal.progress_bar import tracked
+from train.data.batches import network_input
+from train.data.frozen_presses import freeze_presses
+from train.data.generation_config import SEED
+from train.data.press_batches import PressBatches
+from train.data.presses import PressSet
+from train.learning.interval_calibration import LEVEL, half_width_mm
+from train.networks.compact import CompactNet
+from train.networks.interval_correction import IntervalCorrection
+
+LEVELS: Final = (0.5, 0.8, 0.9, 0.95)
+_PER_FAMILY: Final = 1000
+"""Training presses of each family: rare families weigh as much as frequent ones."""
+_SAMPLES: Final = 24
+"""Pixels of each region of a window."""
+_PRESSES_AT_ONCE: Final = 512
+_ROUNDS: Final = 2
+"""Times that each press is read, each time by another sensor."""
+_STEPS: Final = 2000
+_BATCH: Final = 512
+_RATE: Final = 5e-3
+_DECAY: Final = 0.1
+_LEAST_ERROR_MM: Final = 1e-6
+_LEAST_RATIO: Final = 1e-3
+_READINGS: Final = 3
+"""Sensors that read each validation press."""
+
+Run = Callable[[NDArray[np.float32], NDArray[np.float32] | None], Sequence[NDArray[np.float32]]]
+"""Function from windows in network units, and pads, to patterns and deviations, in [mm]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Windows of all taps of a network, with what is known of their pads and the truth.
+
+    Attributes:
+        windows: (n, K, 3, rows, cols) in zeroed counts.
+        pads: (n, width), inputs of the pads; None if nothing is known.
+        truth: (n, H, W) in [mm].
+    """
+
+    windows: NDArray[np.float32]
+    pads: NDArray[np.float32] | None
+    truth: NDArray[np.float32]
+
+    def with_taps(self, given: int) -> NDArray[np.float32]:
+        """Return the windows in network units with the newest `given` taps, the others zero: (n, 3K, rows, cols)."""
+        windows = self.windows.copy()
+        windows[:, given:] = 0
+        return network_input(windows).numpy()
+
+
+def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS) -> list[Readings]:
+    """Return presses as sensors of their own read them, with nothing and with everything known of each sensor."""
+    found = []
+    for number in range(times):
+        frozen = freeze_presses(presses, SEED + number)
+        for known in (False, True):
+            windows = frozen.windows(taps, gains_known=known)
+            found.append(Readings(windows, frozen.pads(known=known), frozen.patterns()))
+    return found
+
+
+def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0) -> None:
+    """Add a correction to a network, fitted on training presses.
+
+    Args:
+        net: trained, in evaluation mode.
+        presses: some of them with all taps of the network.
+        contact_level: share of a pattern's maximum from which a pixel counts as touched.
+        seed: of all draws.
+
+    Raises:
+        DatasetError: no press has as many taps.
+    """
+    torch.manual_seed(seed)
+    correction = net.add_intervals()
+    correction.contact_level.fill_(contact_level)
+    summary, later, ratios = _samples(net, correction, presses, seed)
+    spread = summary.std(dim=0)
+    correction.centre.copy_(summary.mean(dim=0))
+    correction.spread.copy_(torch.where(spread > 1e-3, spread, torch.ones_like(spread)))
+    there = ~ratios.isnan()
+    ratios = ratios.nan_to_num()
+    optimiser = torch.optim.AdamW(correction.parameters(), _RATE, weight_decay=_DECAY)
+    course = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=_STEPS)
+    for _ in range(_STEPS):
+        picked = torch.randint(len(summary), (min(_BATCH, len(summary)),))
+        beyond = ratios[picked] - correction.log_factors(summary[picked], later[picked])[:, :, None]
+        loss = (torch.maximum(LEVEL * beyond, (LEVEL - 1) * beyond) * there[picked]).sum() / there[picked].sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        course.step()
+    correction.requires_grad_(requires_grad=False)
+
+
+def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str, list[float]]:
+    """Shift a network's correction, per region and number of taps, until it covers LEVEL of the readings' pixels.
+
+    Args:
+        net: with a correction.
+        run: the network, or the graph in integers made from it.
+        readings: that nothing was trained on.
+
+    Returns:
+        For each of LEVELS, in percent, the deviations that make half of its interval in each region.
+    """
+    correction, unit = _correction(net), float(half_width_mm(1.0))
+    pooled: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
+    for given in tracked(range(1, net.taps + 1), "intervals", "taps"):
+        ratios = _ratios(correction, run, given, readings)
+        wanted = [float(np.quantile(one, LEVEL, method="higher")) if one.size else 1.0 for one in ratios]
+        shift = torch.tensor(wanted).clamp_min(_LEAST_RATIO).log()
+        correction.shift(given, shift)
+        for parts, one, by in zip(pooled, ratios, shift.exp().tolist(), strict=True):
+            parts.append(one / by)
+    found = [np.concatenate(parts) for parts in pooled]
+    return {
+        f"{100 * level:g}": [float(f"{unit * np.quantile(one, level):.4g}") if one.size else unit for one in found]
+        for level in LEVELS
+    }
+
+
+def _ratios(
+    correction: IntervalCorrection, run: Run, given: int, readings: Sequence[Readings]
+) -> list[NDArray[np.floating]]:
+    """Return errors over half widths in each region, with the newest `given` taps."""
+    parts: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
+    for one in readings:
+        pattern, deviation = run(one.with_taps(given), one.pads)[:2]
+        ratio = np.abs(pattern - one.truth) / half_width_mm(deviation)
+        region = regions(pattern, float(correction.contact_level), correction.near)
+        for number, part in enumerate(parts):
+            part.append(ratio[region == number])
+    return [np.concatenate(part) for part in parts]
+
+
+def _correction(net: CompactNet) -> IntervalCorrection:
+    if net.intervals is None:
+        raise ValueError("the network has no correction of intervals: fit one first")
+    return net.intervals
+
+
+def _samples(
+    net: CompactNet, correction: IntervalCorrection, presses: PressSet, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return inputs of the factors (n, ...), taps (n, K - 1), and logarithms of errors over half widths (n, 4, m)."""
+    rng = np.random.default_rng(seed)
+    whole = presses.with_taps(net.taps)
+    usable = np.flatnonzero(whole.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= net.taps))
+    names = whole.family[usable]
+    kept = [rng.permutation(usable[names == name])[:_PER_FAMILY] for name in np.unique(names)]
+    chosen = whole.pick(rng.permutation(np.concatenate(kept))) if kept else whole
+    at_once = min(_PRESSES_AT_ONCE, len(chosen))
+    draw = PressBatches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
+    found: list[tuple[Any, ...]] = []
+    for number in tracked(range(max(_ROUNDS * len(chosen) // at_once, 1)), "intervals", "batch"):
+        batch = draw(number)
+        with torch.inference_mode():
+            seen = net.see(batch.window, batch.pad)
+            pattern = torch.relu(seen.pattern)
+            peak = pattern.amax(dim=(1, 2), keepdim=True)
+            masks = correction.masks(pattern, peak)
+            summary = correction.summary(seen.features, masks, peak, seen.deviation, seen.about, seen.later)
+            error = (pattern - batch.pattern / seen.newest).abs() + _LEAST_ERROR_MM
+            region = regions(pattern.numpy(), float(correction.contact_level), correction.near)
+            found.append((summary, seen.later, _drawn(torch.log(error / _half(seen.deviation)), region)))
+    # A copy, because tensors of inference take no gradient.
+    inputs, later, ratios = (torch.cat(parts).clone() for parts in zip(*found, strict=True))
+    return inputs, later, ratios
+
+
+def _half(deviation: Tensor) -> Tensor:
+    return deviation * float(half_width_mm(1.0))
+
+
+def _drawn(values: Tensor, region: NDArray[np.integer]) -> Tensor:
+    """Return values of _SAMPLES pixels of each region, (n, 4, m); not a number where a region has fewer."""
+    order = torch.rand(values.shape).flatten(1)
+    drawn = []
+    for number in range(len(REGIONS)):
+        rank, place = torch.where(torch.from_numpy(region == number).flatten(1), order, 2.0).topk(
+            _SAMPLES, largest=False
+        )
+        drawn.append(torch.where(rank < 1.5, values.flatten(1).gather(1, place), torch.nan))
+    return torch.stack(drawn, dim=1)
