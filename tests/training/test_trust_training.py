@@ -25,7 +25,9 @@ from train.learning.trust_limits import FALSE_ALARMS, TrustFit, load_trust
 from train.learning.wrong_readings import SPOILINGS, magnet_field, spoiled
 from train.networks.compact import CompactNet
 from train.networks.symmetric import symmetries
-from train.physics.pad_draws import INPUTS, input_scale
+from train.physics.covers import BARE
+from train.physics.gripped import GrippedPad
+from train.physics.pad_draws import INPUTS, Pad, input_scale
 
 SHORTEN = 1000
 
@@ -123,6 +125,31 @@ class TestMoved:
             for k in range(4)
         ]
         assert np.logical_or.reduce(turns).all() and all(one.any() for one in turns)
+
+
+class TestMirror:
+    def test_a_mirror_image_turns_as_the_schedule_does(self, presses):
+        mirrored = tap_check.seen_in_a_mirror(presses)
+        assert np.diff(mirrored.angle_deg, axis=1) == pytest.approx(np.diff(presses.angle_deg, axis=1))
+        last, first = presses.counts[:, -1], mirrored.counts[:, 0]
+        assert np.array_equal(first[:, 1:, :, ::-1], last[:, 1:]) and np.array_equal(first[:, 0, :, ::-1], -last[:, 0])
+        again = tap_check.seen_in_a_mirror(mirrored)
+        assert np.array_equal(again.counts, presses.counts) and np.array_equal(again.angle_deg, presses.angle_deg)
+
+    def test_a_mirror_image_is_a_press_of_the_mirrored_shape(self):
+        """A bar that leans to the right, on a pad turned one way, is one that leans to the left on one turned back."""
+        gripped = GrippedPad(Pad())
+        x_mm, y_mm = np.broadcast_arrays(*gripped.places_mm)
+        taps = []
+        for lean in (1, -1):
+            bar = np.where(np.abs(x_mm - lean * 0.4 * y_mm - lean * 2) < 2, np.float32(0), np.float32(-2))
+            drag = np.array([[0.2 * lean, 0.1]])
+            pressed = gripped.press(bar[None], np.array([0.3]), drag, np.zeros(1), np.array([0.5]), [BARE])
+            taps.append(pressed.counts[0])
+        one, other = (replace(make_press_set(count=1, taps=1), counts=tap[None, None]) for tap in taps)
+        largest = float(np.abs(taps[0]).max())
+        assert tap_check.seen_in_a_mirror(one).counts == pytest.approx(other.counts, abs=0.02 * largest)
+        assert np.abs(one.counts - other.counts).max() > 0.1 * largest
 
 
 class TestClassifier:
