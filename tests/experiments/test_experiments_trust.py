@@ -62,6 +62,12 @@ class TestVerdicts:
         row = found.cells()
         assert row["contacts"] == 22 and str(row["flagged %"]).startswith("50.0") and row["unexplained %"] == 0
 
+    def test_a_sensor_that_was_suspected_once_stays_so_in_the_count(self):
+        model = FakeModel(make_trusted_contract())
+        odd, good = (np.stack([press(x=x)] * 3) for x in (9000, 0))
+        assert contact_verdicts.ever_suspected(model, [odd, good], 8).tolist() == [True, False]
+        assert contact_verdicts.ever_suspected(model, [odd], 3).tolist() == [False]
+
     def test_what_begins_no_contact_counts_nowhere(self):
         found = contact_verdicts.verdicts_on(FakeModel(make_trusted_contract()), [np.stack([press(z=500)] * 4)], [None])
         assert found.cells() == {"contacts": 0}

@@ -81,6 +81,11 @@ class TestReasons:
                 assert make_check().judge(0, tap, pattern, traction, 0).trusted is not True
             place.flat[-1] = kept
 
+    def test_readings_that_are_not_finite_are_of_no_contact(self):
+        tap = make_tap()
+        tap[0, 0, 0] = np.nan
+        assert make_check().judge(0, tap, np.ones((40, 40), dtype=np.float32), None, 0).reason == "unfamiliar"
+
     @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
     def test_readings_of_any_size_give_a_verdict(self, scale):
         verdict = judge(make_check(), make_tap(2 * scale))
@@ -153,6 +158,29 @@ class TestSensor:
             return None
 
         assert contacts_until_cleared(3600) == contacts_until_cleared(20) is not None
+        assert contacts_until_cleared(20) >= 9  # it does not flicker about one level
+
+    def test_an_hour_of_good_contacts_does_not_hide_a_fault(self):
+        def contacts_until_suspected(good):
+            check = make_check()
+            for number in range(good):
+                judge(check, make_tap(), number)
+            for number in range(_CONTACTS):
+                if check.suspected:
+                    return number
+                judge(check, make_tap(x=2), good + number)
+            return None
+
+        assert contacts_until_suspected(3600) == contacts_until_suspected(1) is not None
+
+    def test_what_is_not_finite_leaves_the_evidence_as_it_was(self):
+        check, bad = make_check(), make_tap()
+        bad[0, 0, 0] = np.nan
+        for number in range(3):
+            judge(check, bad, number)
+        for number in range(3, 9):
+            judge(check, make_tap(x=2), number)
+        assert check.suspected
 
     def test_light_touches_show_nothing(self):
         check = make_check()

@@ -97,6 +97,10 @@ class TestPacked:
         with pytest.raises(ValueError, match=r"\w"):
             unpacked(good | change)
 
+    def test_a_length_that_does_not_fit_is_told(self):
+        with pytest.raises(ValueError, match="8 bytes for an array of"):
+            unpacked(packed(np.ones((2, 2))) | {"shape": [2, 3]})
+
     @pytest.mark.parametrize("value", [None, [], "text", 3, {}, {"shape": [1]}, {"f2": ""}])
     def test_what_is_no_array_is_refused(self, value):
         with pytest.raises(ValueError, match=r"\w"):

@@ -18,14 +18,16 @@ from train import trust
 from train.data.batches import network_input
 from train.errors import CheckpointError, DatasetError
 from train.learning import contact_check, tap_check
-from train.learning.contact_check import LEAST_COUNTS, drawn_readings, features_of, limit_of, moved
+from train.learning.contact_check import LEAST_COUNTS, drawn_readings, features_of, in_contact, limit_of, moved
 from train.learning.forward_operator import fit_forward_model
 from train.learning.small_classifier import fit_classifier
 from train.learning.trust_limits import FALSE_ALARMS, TrustFit, load_trust
 from train.learning.wrong_readings import SPOILINGS, magnet_field, spoiled
 from train.networks.compact import CompactNet
 from train.networks.symmetric import symmetries
-from train.physics.pad_draws import INPUTS, input_scale
+from train.physics.covers import BARE
+from train.physics.gripped import GrippedPad
+from train.physics.pad_draws import INPUTS, Pad, input_scale
 
 SHORTEN = 1000
 
@@ -125,6 +127,31 @@ class TestMoved:
         assert np.logical_or.reduce(turns).all() and all(one.any() for one in turns)
 
 
+class TestMirror:
+    def test_a_mirror_image_turns_as_the_schedule_does(self, presses):
+        mirrored = tap_check.seen_in_a_mirror(presses)
+        assert np.diff(mirrored.angle_deg, axis=1) == pytest.approx(np.diff(presses.angle_deg, axis=1))
+        last, first = presses.counts[:, -1], mirrored.counts[:, 0]
+        assert np.array_equal(first[:, 1:, :, ::-1], last[:, 1:]) and np.array_equal(first[:, 0, :, ::-1], -last[:, 0])
+        again = tap_check.seen_in_a_mirror(mirrored)
+        assert np.array_equal(again.counts, presses.counts) and np.array_equal(again.angle_deg, presses.angle_deg)
+
+    def test_a_mirror_image_is_a_press_of_the_mirrored_shape(self):
+        """A bar that leans to the right, on a pad turned one way, is one that leans to the left on one turned back."""
+        gripped = GrippedPad(Pad())
+        x_mm, y_mm = np.broadcast_arrays(*gripped.places_mm)
+        taps = []
+        for lean in (1, -1):
+            bar = np.where(np.abs(x_mm - lean * 0.4 * y_mm - lean * 2) < 2, np.float32(0), np.float32(-2))
+            drag = np.array([[0.2 * lean, 0.1]])
+            pressed = gripped.press(bar[None], np.array([0.3]), drag, np.zeros(1), np.array([0.5]), [BARE])
+            taps.append(pressed.counts[0])
+        one, other = (replace(make_press_set(count=1, taps=1), counts=tap[None, None]) for tap in taps)
+        largest = float(np.abs(taps[0]).max())
+        assert tap_check.seen_in_a_mirror(one).counts == pytest.approx(other.counts, abs=0.02 * largest)
+        assert np.abs(one.counts - other.counts).max() > 0.1 * largest
+
+
 class TestClassifier:
     def test_it_learns_what_is_not_linear(self):
         rng = np.random.default_rng(0)
@@ -211,9 +238,9 @@ class TestLimits:
         network = small_network(json.loads(path.read_text())["contact"])
         check = contact_check.contact_check(network, presses, share, seed=5)
         counts, pads = drawn_readings(presses, 5)
-        strong = counts[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
-        scores = np.array([network(row) for row in features_of(counts[strong], pads[strong])])
-        assert share - 0.03 <= (scores > check.limit).mean() <= share
+        met = in_contact(counts)
+        scores = np.array([network(row) for row in features_of(counts[met], pads[met])])
+        assert len(scores) > 10 and share - 2 / len(scores) <= (scores > check.limit).mean() <= share
 
     @pytest.mark.parametrize("share", [0.02, 0.2])
     def test_taps_exceed_theirs_by_the_share(self, path, presses, share):
@@ -236,6 +263,14 @@ class TestLimits:
         assert (fit._mismatches(model, made) > made.forward.limit).mean() <= FALSE_ALARMS / 2
         twice = trust_of(json.loads(json.dumps(made.to_json())), len(INPUTS))
         assert twice is not None and twice.forward.limit == made.forward.limit
+
+    def test_limits_are_set_by_contacts_alone(self):
+        counts = np.zeros((4, 3, 4, 4), dtype=np.float32)
+        counts[:2, 2] = np.array([46, 48])[:, None, None]  # even: 736 and 768 in sum, of which none is above the least
+        counts[2:, 2, 0, 0] = 740, 760
+        assert in_contact(counts).tolist() == [False, False, False, True]
+        counts[1, 2, 0, 0] += 60
+        assert in_contact(counts).tolist() == [False, True, False, True]
 
     def test_training_and_runtime_leave_the_same_contacts_unchecked(self):
         assert LEAST_COUNTS == LEAST_COUNTS_AT_RUN_TIME

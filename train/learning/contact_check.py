@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from edge.inference.familiarity import Check, contact_features
 from edge.inference.small_network import SmallNetwork
+from edge.perception.contact_options import OFF_COUNTS
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
@@ -88,6 +89,12 @@ def _as_vectors(maps: NDArray[np.float32], turns: int, *, mirrored: bool) -> NDA
     return maps
 
 
+def in_contact(counts: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which readings (n, 3, rows, cols) in counts the runtime checks: lighter ones would set limits by noise."""
+    z = counts[:, 2]
+    return (z.max(axis=(1, 2)) > LEAST_COUNTS) & (z.sum(axis=(1, 2)) >= OFF_COUNTS)
+
+
 def limit_of(scores: NDArray[np.floating], false_alarms: float) -> float:
     """Return the score that a share of right rows exceeds."""
     return float(np.quantile(scores, 1 - false_alarms, method="higher"))
@@ -96,6 +103,6 @@ def limit_of(scores: NDArray[np.floating], false_alarms: float) -> float:
 def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
     """Return the check whose limit a share of these presses exceeds, read by sensors of several certainties."""
     readings, pads = drawn_readings(presses, seed)
-    strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
-    scores = network(features_of(readings[strong], pads[strong]))
+    met = in_contact(readings)
+    scores = network(features_of(readings[met], pads[met]))
     return Check(network, limit_of(np.array(scores), false_alarms))

@@ -13,7 +13,6 @@ from edge.inference.small_network import SmallNetwork, small_network
 
 _BATCH: Final = 512
 _LEARNING_RATE: Final = 4e-3
-_WEIGHT_DECAY: Final = 3e-3
 _LEAST_SPREAD: Final = 1e-3
 
 
@@ -23,6 +22,7 @@ def fit_classifier(
     widths: tuple[int, ...],
     steps: int,
     seed: int,
+    weight_decay: float = 3e-3,
 ) -> SmallNetwork:
     """Fit a network whose output is the log odds of a wrong row, right and wrong ones being equally frequent.
 
@@ -32,6 +32,7 @@ def fit_classifier(
         widths: units of the layers in between.
         steps: of the optimizer.
         seed: of weights and order.
+        weight_decay: of the optimizer; the fewer the rows, the more.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -41,7 +42,7 @@ def fit_classifier(
     sizes = [right.shape[1], *widths, 1]
     layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
     network = nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())))[:-1]
-    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=_WEIGHT_DECAY)
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
     truth = torch.cat([torch.zeros(_BATCH), torch.ones(_BATCH)])
     for _ in range(steps):

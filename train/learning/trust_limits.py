@@ -18,7 +18,7 @@ from edge.perception.pattern_check import PatternCheck
 from edge.perception.runtime import Model
 from train.data.presses import PressSet
 from train.errors import CheckpointError
-from train.learning.contact_check import LEAST_COUNTS, contact_check, drawn_readings, limit_of
+from train.learning.contact_check import contact_check, drawn_readings, in_contact, limit_of
 from train.learning.tap_check import tap_check
 from train.physics.pad_draws import INPUTS
 
@@ -55,8 +55,8 @@ class TrustFit:
     def _mismatches(self, model: Model, trust: Trust) -> NDArray[np.float64]:
         """Return the mismatches of a model's patterns of one tap, on sensors of several certainties."""
         readings, pads = drawn_readings(self.validation, seed=1)
-        strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
-        return np.array([_mismatch(model, trust, *one) for one in zip(readings[strong], pads[strong], strict=True)])
+        met = in_contact(readings)
+        return np.array([_mismatch(model, trust, *one) for one in zip(readings[met], pads[met], strict=True)])
 
 
 def _mismatch(model: Model, trust: Trust, readings: NDArray[np.float32], pad: NDArray[np.float32]) -> float:

@@ -33,6 +33,7 @@ from train.experiments.support.contact_verdicts import (
     CONTACTS,
     Verdicts,
     contacts_of,
+    ever_suspected,
     of_one_sensor_each,
     share,
     verdicts_on,
@@ -61,6 +62,7 @@ _STRENGTHS: Final = (150.0, 400.0, 800.0, 1500.0)
 _FIELDS_OF_A_STRENGTH: Final = 300
 _STRIPES: Final = (60, 12)
 _TICKS: Final = 300
+_LONG: Final = 200
 _QUICK: Final = 12
 
 
@@ -85,6 +87,12 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(false, "False alarms: contacts that make their readings, wanted at most 1 %.", "false-alarms")
     found = _detected(model, sensors)
     report.table(found, _DETECTED)
+    readings = [sensors.presses.counts[mine, 0] for mine in contacts_of(sensors)]
+    ever = ever_suspected(model, readings, 2 if bench.quick else _LONG)
+    report.say(
+        f"Of {len(ever)} sensors without a fault, {share(ever)} % are suspected at some time of {_LONG} contacts, "
+        "drawn from the same few presses of theirs, so that a shape that reads oddly comes again and again."
+    )
     report.table(_by_strength(model, sensors, 2 if bench.quick else _FIELDS_OF_A_STRENGTH), _BY_STRENGTH, "fields")
     report.table(held_rows(model, firm(sensors)), _HELD, "held")
     report.table(_stripes(bench, model), _STRIPED, "stripes")

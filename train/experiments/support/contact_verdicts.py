@@ -84,6 +84,18 @@ def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
     return [np.resize(presses, CONTACTS) for presses in mine if len(presses)]
 
 
+def ever_suspected(model: Model, sensors: Sequence[NDArray[np.floating]], count: int) -> NDArray[np.bool_]:
+    """Return whether each sensor is suspected at any time of `count` contacts, drawn from its own."""
+    found: list[bool] = []
+    for number, contacts in enumerate(sensors):
+        sensor = PushedSensor(model, seed=number)
+        found.append(False)
+        for at in np.random.default_rng([number, 13]).integers(len(contacts), size=count):
+            sensor.touch(contacts[at])
+            found[-1] |= sensor.suspected
+    return np.array(found)
+
+
 def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Verdicts:
     """Return the verdicts on the contacts of each sensor, one scan each, in their order.
 
