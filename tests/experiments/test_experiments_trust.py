@@ -11,7 +11,7 @@ from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
-from train.experiments.sensor import trust
+from train.experiments.sensor import trust_checks
 from train.experiments.support import contact_verdicts, held_taxel, stripes, wrong_taps
 from train.experiments.support.pushed import PushedSensor
 from train.experiments.support.sensor_faults import FAULTS, FIELDS, steel_field
@@ -155,8 +155,8 @@ def test_a_pushed_sensor_remembers_suspicion():
 
 class TestPage:
     def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory, monkeypatch):
-        monkeypatch.setattr(trust, "TEST_FIGURES", 1)
-        page = trust.run(quick_bench(tmp_path_factory), tmp_path).read_text()
+        monkeypatch.setattr(trust_checks, "TEST_FIGURES", 1)
+        page = trust_checks.run(quick_bench(tmp_path_factory), tmp_path).read_text()
         assert page.startswith("# trust\n") and "quick run" in page and "Falls short" in page
         rows = {part: list(csv.DictReader((tmp_path / f"trust{part}.csv").open())) for part in ("", "-taps", "-psnr")}
         assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows[""]}
@@ -166,10 +166,10 @@ class TestPage:
             assert named == [*cases, "right, longer sequences", "twice the angle"]
         for part in ("-false-alarms", "-fields", "-held", "-stripes", "-times"):
             assert (tmp_path / f"trust{part}.csv").exists()
-        assert (tmp_path / "trust.png").exists()
+        assert (tmp_path / "trust-checks.png").exists()
 
     def test_a_model_without_checks_is_refused_in_a_line(self, tmp_path, tmp_path_factory):
         for name in ("stsr-int8", "mtsr4-int8"):
             write_model(tmp_path / f"{name}.onnx", make_pad_contract(taps=1))
         with pytest.raises(CheckpointError, match="stsr-int8 has no checks"):
-            trust.run(replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)
+            trust_checks.run(replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)

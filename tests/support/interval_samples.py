@@ -36,7 +36,7 @@ def export_with_intervals(folder: Path) -> None:
         net.get_buffer("deviation_scale").fill_(1.5)
         for weight in net.get_submodule("context").parameters():
             torch.nn.init.normal_(weight, 0, 0.05)
-        net.get_submodule("leave.2").bias_free += 0.02
+        net.get_parameter("leave.2.bias_free").add_(0.02)
     torch.save(net.state_dict(), folder / "one.pt")
     report = {"network": "compact-mtsr2", "scale": 10, "options": options, "contact_level": LEVEL}
     (folder / "one.json").write_text(json.dumps(report | {"training_sha256": "ab" * 32}))

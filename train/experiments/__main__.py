@@ -19,7 +19,7 @@ from train.experiments.support.workbench import Workbench
 EXPERIMENTS: Final = {
     "families": "the shipped model on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
-    "trust": "patterns that are doubted, rightly and wrongly, and foreign taps that are dropped",
+    "trust-checks": "patterns that are doubted, rightly and wrongly, and foreign taps that are dropped",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
     "trained_out": "the paper's and compact networks, trained for many epochs",
@@ -36,7 +36,7 @@ EXPERIMENTS: Final = {
     "gains-from-contacts": "gains and constants of a sensor from its own contacts",
     "zeroing": "drift followed, holds not absorbed",
     "calibration": "coverage of the deviations",
-    "intervals": "intervals by region and family, and the error of what is trusted most",
+    "interval-coverage": "intervals by region and family, and the error of what is trusted most",
     "confidence": "expected error and early stop against true error",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
@@ -49,8 +49,6 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
-_FILES: Final = {"intervals": "interval_coverage"}
-"""File names that differ from the experiment's: another file of the package has that name."""
 
 
 def module_of(name: str) -> str:

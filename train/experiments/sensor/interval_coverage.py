@@ -105,7 +105,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         for known in (NOTHING, ALL)
         for given in range(1, model.contract.taps + 1)
     }
-    report = Report("intervals", folder, __file__, bench.used, quick=bench.quick)
+    report = Report("interval-coverage", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"Share of the pixels whose truth the interval holds, on the wide test set: {len(wide)} presses of "
         f"{len(np.unique(wide.presses.family))} families on {len(np.unique(wide.presses.pad))} pads; 95 % intervals by "

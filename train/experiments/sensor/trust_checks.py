@@ -81,7 +81,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     wide = bench.wide_test()
     wide = wide.pick(np.arange(_QUICK)) if bench.quick else wide
     sensors = of_one_sensor_each(wide)
-    report = Report("trust", folder, __file__, bench.used, quick=bench.quick)
+    report = Report("trust-checks", folder, __file__, bench.used, quick=bench.quick)
     report.say(_METHOD.format(model=model.name, several=several.name, on=round(ON_COUNTS)))
     false = _false_alarms(bench, model, wide)
     report.table(false, "False alarms: contacts that make their readings, wanted at most 1 %.", "false-alarms")
