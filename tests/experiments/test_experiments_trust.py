@@ -157,15 +157,15 @@ class TestPage:
     def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory, monkeypatch):
         monkeypatch.setattr(trust_checks, "TEST_FIGURES", 1)
         page = trust_checks.run(quick_bench(tmp_path_factory), tmp_path).read_text()
-        assert page.startswith("# trust\n") and "quick run" in page and "Falls short" in page
-        rows = {part: list(csv.DictReader((tmp_path / f"trust{part}.csv").open())) for part in ("", "-taps", "-psnr")}
+        assert page.startswith("# trust-checks\n") and "quick run" in page and "Falls short" in page
+        rows = {part: list(csv.DictReader((tmp_path / f"trust-checks{part}.csv").open())) for part in ("", "-taps", "-psnr")}
         assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows[""]}
         cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
         for part in ("-taps", "-psnr"):
             named = [row["earlier taps"] for row in rows[part]]
             assert named == [*cases, "right, longer sequences", "twice the angle"]
         for part in ("-false-alarms", "-fields", "-held", "-stripes", "-times"):
-            assert (tmp_path / f"trust{part}.csv").exists()
+            assert (tmp_path / f"trust-checks{part}.csv").exists()
         assert (tmp_path / "trust-checks.png").exists()
 
     def test_a_model_without_checks_is_refused_in_a_line(self, tmp_path, tmp_path_factory):

@@ -134,7 +134,7 @@ _HELD: Final = (
 )
 _STRIPED: Final = (
     "Stripes of one period, bars half a period wide, each press on a sensor of its own. What their layer does not let "
-    "through no check of readings can miss: a smooth pattern explains them as well. The deviation has to tell: pixels "
+    "through no check of readings can miss: a smooth pattern explains them as well. Only the deviation shows it: pixels "
     "within the 90 % interval, and the error that the record states over the true one, are therefore shown as well."
 )
 _TIMES: Final = (
