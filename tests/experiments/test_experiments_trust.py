@@ -11,7 +11,7 @@ from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
-from train.experiments.sensor import trust
+from train.experiments.sensor import trusted_patterns
 from train.experiments.support import contact_verdicts, held_taxel, stripes, wrong_taps
 from train.experiments.support.pushed import PushedSensor
 from train.experiments.support.sensor_faults import FAULTS, FIELDS, steel_field
@@ -155,8 +155,8 @@ def test_a_pushed_sensor_remembers_suspicion():
 
 class TestPage:
     def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory, monkeypatch):
-        monkeypatch.setattr(trust, "TEST_FIGURES", 1)
-        page = trust.run(quick_bench(tmp_path_factory), tmp_path).read_text()
+        monkeypatch.setattr(trusted_patterns, "TEST_FIGURES", 1)
+        page = trusted_patterns.run(quick_bench(tmp_path_factory), tmp_path).read_text()
         assert page.startswith("# trust\n") and "quick run" in page and "Falls short" in page
         rows = {part: list(csv.DictReader((tmp_path / f"trust{part}.csv").open())) for part in ("", "-taps", "-psnr")}
         assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows[""]}
@@ -172,4 +172,4 @@ class TestPage:
         for name in ("stsr-int8", "mtsr4-int8"):
             write_model(tmp_path / f"{name}.onnx", make_pad_contract(taps=1))
         with pytest.raises(CheckpointError, match="stsr-int8 has no checks"):
-            trust.run(replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)
+            trusted_patterns.run(replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)

@@ -7,7 +7,7 @@ from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
 from train.experiments.sensor.real import Played, has_hole, play, share_touched, unevenness
-from train.experiments.sensor.trust import real_flags
+from train.experiments.sensor.trusted_patterns import real_flags
 
 RECORDINGS = recordings_folder()
 PATHS = recording_paths(RECORDINGS)

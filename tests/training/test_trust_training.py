@@ -90,7 +90,7 @@ class TestWrongReadings:
         assert (np.abs(field.mean(axis=0)) < 150).all()  # from everywhere
 
     def test_a_far_magnet_has_no_curl_on_the_pad(self):
-        """Of a field without currents, the change of x along y is that of y along x."""
+        """Without currents, the change of x along y is that of y along x."""
         field = magnet_field(np.random.default_rng(0), 200).astype(np.float64)
         x_down = np.gradient(field[:, 0], axis=1)[:, 1:-1, 1:-1]
         y_right = np.gradient(field[:, 1], axis=2)[:, 1:-1, 1:-1]

@@ -48,11 +48,14 @@ _PAPER: Final = {
     *("force", "force-recovery", "unseen", "curved", "psf_speed"),
 }
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
+_MODULES: Final = {"trust": "trusted_patterns"}
+"""Modules that are not named as their experiment, since the name is taken."""
 
 
 def module_of(name: str) -> str:
     """Return the module of an experiment."""
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
+    module = _MODULES.get(name, name.replace("-", "_"))
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{module}"
 
 
 def main(arguments: list[str] | None = None) -> None:
