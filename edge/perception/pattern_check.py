@@ -96,6 +96,8 @@ class PatternCheck:
             taps: taps in it; the rest is empty.
         """
         check = self._trust.tap
+        if taps < 2:
+            return []
         return [_share(score - check.limit) for score in check.network(tap_features(window[:taps]))]
 
     def judge(

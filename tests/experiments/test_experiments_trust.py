@@ -158,7 +158,9 @@ class TestPage:
         monkeypatch.setattr(trust_checks, "TEST_FIGURES", 1)
         page = trust_checks.run(quick_bench(tmp_path_factory), tmp_path).read_text()
         assert page.startswith("# trust-checks\n") and "quick run" in page and "Falls short" in page
-        rows = {part: list(csv.DictReader((tmp_path / f"trust-checks{part}.csv").open())) for part in ("", "-taps", "-psnr")}
+        rows = {
+            part: list(csv.DictReader((tmp_path / f"trust-checks{part}.csv").open())) for part in ("", "-taps", "-psnr")
+        }
         assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows[""]}
         cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
         for part in ("-taps", "-psnr"):

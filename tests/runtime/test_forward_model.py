@@ -1,11 +1,13 @@
 """Forward model of a contract: what explains readings, what does not, and the smooth way back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trust_samples import CONSTANTS, make_forward
 
 from edge.inference.familiarity import contact_features, tap_features
-from edge.inference.forward_model import FEATURES, GRID, KPA, features, forward_model
+from edge.inference.forward_model import GRID, KPA, condensed, features, forward_model
 
 GAIN_ERROR = 0.075
 
@@ -79,28 +81,29 @@ class TestMismatch:
         tap = readings_of(operator, pattern, traction)
         tap[0] += 1.0
         sure = forward.mismatch(operator, tap, pattern, traction, 0)
-        forward.model_error[0] = 10
-        assert forward.mismatch(operator, tap, pattern, traction, 0) < 0.1 * sure
+        unsure = replace(forward, model_error=forward.model_error * np.float32([80, 1, 1]))
+        assert unsure.mismatch(operator, tap, pattern, traction, 0) < 0.1 * sure
 
 
 class TestFeatures:
     def test_they_are_means_of_cells(self):
         pattern, traction = make_maps()
         found = features(pattern, traction)
-        assert found.shape == (FEATURES,) and found.dtype == np.float32
+        assert found.shape == (GRID**2 * 3,) and found.dtype == np.float32
         assert found[: GRID**2] == pytest.approx(pattern[::5, ::5].ravel(), rel=1e-5)
-        assert found[GRID**2 :] == pytest.approx(traction[:2, ::2, ::2].ravel() / KPA, rel=1e-5)
+        assert found[GRID**2 :] == pytest.approx(traction[:2].ravel() / KPA, rel=1e-5)
+        assert condensed(found[None])[0, GRID**2 :] == pytest.approx(traction[:2, ::2, ::2].ravel() / KPA, rel=1e-5)
 
     @pytest.mark.parametrize("size", [12, 20, 36, 40, 64])
     def test_a_pattern_of_any_scale_keeps_its_mean(self, size):
         pattern = np.random.default_rng(0).uniform(0, 1, (size, size)).astype(np.float32)
-        traction = np.zeros((3, 4, 4), dtype=np.float32)
+        traction = np.zeros((3, GRID, GRID), dtype=np.float32)
         assert features(pattern, traction)[: GRID**2].mean() == pytest.approx(pattern.mean(), rel=1e-4)
 
     def test_those_of_a_contact_do_not_depend_on_its_force_but_for_one(self):
         tap = np.random.default_rng(0).uniform(0.5, 3, (3, 4, 4)).astype(np.float32)
         pad = np.ones(5, dtype=np.float32)
-        light, firm = contact_features(tap, pad), contact_features(20 * tap, pad)
+        (light,), (firm,) = contact_features(tap, pad), contact_features(20 * tap, pad)
         assert light[:48] == pytest.approx(firm[:48], rel=0.03)
         assert firm[48] - light[48] == pytest.approx(np.log(20), abs=0.03)
         assert (light[49:] == pad).all() and (firm[49:] == pad).all()
@@ -108,15 +111,17 @@ class TestFeatures:
     def test_a_large_reading_beside_none_is_bounded(self):
         tap = np.zeros((3, 4, 4), dtype=np.float32)
         tap[0, 0, 0] = 1e6
-        assert np.abs(contact_features(tap, np.zeros(5, dtype=np.float32))[:48]).max() <= 12
+        assert np.abs(contact_features(tap, np.zeros(5, dtype=np.float32))[0, :48]).max() <= 12
 
     def test_those_of_a_pair_are_of_shapes_and_steps(self):
         rng = np.random.default_rng(0)
         one, other = rng.uniform(1, 3, (2, 3, 4, 4)).astype(np.float32)
-        found = tap_features(one, other, 3)
+        (found,) = tap_features(np.stack([one, other]), (3,))
         assert found.shape == (100,) and found[98:].tolist() == [3, 9]
-        assert tap_features(one, one, 1)[48:96] == pytest.approx(0, abs=1e-6)
-        assert tap_features(one, 10 * other, 3)[:96] == pytest.approx(found[:96], abs=0.05)
+        assert tap_features(np.stack([one, one]))[0, 48:96] == pytest.approx(0, abs=1e-6)
+        assert tap_features(np.stack([one, 10 * other]), (3,))[0, :96] == pytest.approx(found[:96], abs=0.05)
+        earlier, one_more = tap_features(np.stack([one, other, one]))
+        assert earlier[98:].tolist() == [1, 1] and one_more[98:].tolist() == [2, 4]
 
 
 class TestSmooth:

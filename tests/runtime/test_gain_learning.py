@@ -211,13 +211,10 @@ class TestRuntime:
             run.tap(np.zeros((3, 4, 4)))
 
     def test_results_that_are_not_trusted_teach_nothing(self):
-        class Doubted(Result):
-            trusted = False
-
         contact = draw_contacts(1)[0]
         scan = ScanSeries("4", USPA44).close(np.rint(BASELINE.counts).astype(np.int32), 1)
         follower = GainFollower(MODEL, None)
-        doubted = Doubted(scan, "device", "m", "contact", force_counts=5000.0)
+        doubted = Result(scan, "device", "m", "contact", force_counts=5000.0, trusted=False)
         for _ in range(2 * HELD_SCANS):
             assert not follower.see(doubted, contact)
         assert not follower.waiting

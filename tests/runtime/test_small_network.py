@@ -31,11 +31,11 @@ class TestSmallNetwork:
         network = SmallNetwork(made)
         rows = np.random.default_rng(1).standard_normal((20, 5)).astype(np.float32)
         by_hand = np.maximum(rows @ first.T + one, 0) @ second[0] + two[0]
-        assert [network(row) for row in rows] == pytest.approx(by_hand, abs=1e-4)
+        assert network(rows) == pytest.approx(by_hand, abs=1e-4)
         assert by_hand.min() < 0 < by_hand.max() and network.inputs == 5
 
     def test_it_leaves_its_features_alone(self):
-        features = np.ones(5, dtype=np.float32)
+        features = np.ones((1, 5), dtype=np.float32)
         SmallNetwork(layers(5, 7, 1))(features)
         assert (features == 1).all()
 

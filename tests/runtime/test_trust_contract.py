@@ -68,8 +68,8 @@ class TestTrust:
         again = trust_of(json.loads(json.dumps(made.to_json())), CONSTANTS)
         assert again is not None
         row = np.linspace(-1, 1, 100, dtype=np.float32)
-        assert again.tap.network(row) == made.tap.network(row) and again.tap.limit == made.tap.limit
-        assert again.contact.network(row[:54]) == made.contact.network(row[:54])
+        assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
+        assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
         assert np.array_equal(again.forward.operator, made.forward.operator)
 
     def test_nothing_is_no_checks(self):

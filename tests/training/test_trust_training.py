@@ -159,7 +159,7 @@ class TestClassifier:
         inside = ((points - (0, 5, -300)) / (1, 10, 100))[:, :2] ** 2 @ (1, 1) < 1.5
         points = points.astype(np.float32)
         network = fit_classifier(points[inside], points[~inside], (24,), 1500, seed=0)
-        found = np.array([network(row) for row in points]) > 0
+        found = np.array(network(points)) > 0
         assert (found == ~inside).mean() > 0.95 and network.inputs == 3
 
     def test_it_follows_from_its_seed(self):
@@ -239,7 +239,7 @@ class TestLimits:
         check = contact_check.contact_check(network, presses, share, seed=5)
         counts, pads = drawn_readings(presses, 5)
         met = in_contact(counts)
-        scores = np.array([network(row) for row in features_of(counts[met], pads[met])])
+        scores = np.array(network(features_of(counts[met], pads[met])))
         assert len(scores) > 10 and share - 2 / len(scores) <= (scores > check.limit).mean() <= share
 
     @pytest.mark.parametrize("share", [0.02, 0.2])
@@ -248,7 +248,7 @@ class TestLimits:
         check = tap_check.tap_check(network, presses, share, seed=5)
         windows = tap_check.read_twice(presses, 5)
         pairs = [tap_check.pair_features(windows[:, 0], windows[:, step], step) for step in range(1, presses.taps)]
-        scores = np.array([network(row) for row in np.concatenate(pairs)])
+        scores = np.array(network(np.concatenate(pairs)))
         assert len(scores) and share - 0.03 <= (scores > check.limit).mean() <= share
 
     def test_a_models_own_mismatch_sets_its_limit(self, path, presses):
@@ -279,4 +279,4 @@ class TestLimits:
         counts, pads = readings(3), np.random.default_rng(0).normal(0, 1, (3, 13)).astype(np.float32)
         unit = np.array([500, 500, 1000], dtype=np.float32)[:, None, None]
         expected = [contact_features(tap / unit, pad) for tap, pad in zip(counts, pads, strict=True)]
-        assert np.array_equal(features_of(counts, pads), np.stack(expected))
+        assert np.array_equal(features_of(counts, pads), np.concatenate(expected))

@@ -134,8 +134,8 @@ _HELD: Final = (
 )
 _STRIPED: Final = (
     "Stripes of one period, bars half a period wide, each press on a sensor of its own. What their layer does not let "
-    "through no check of readings can miss: a smooth pattern explains them as well. Only the deviation shows it: pixels "
-    "within the 90 % interval, and the error that the record states over the true one, are therefore shown as well."
+    "through no check of readings can miss: a smooth pattern explains them as well. The deviation alone shows it: "
+    "pixels within the 90 % interval, and the error that the record states over the true one, are shown as well."
 )
 _TIMES: Final = (
     "Run times on one thread: paced, one part at each tick of 100 Hz in turn, with cold caches, medians with their "
