@@ -34,6 +34,7 @@ EXPERIMENTS: Final = {
     "robust": "error against the severity of nuisances",
     "dead": "dead taxels, detected and undetected",
     "gains-from-contacts": "gains and constants of a sensor from its own contacts",
+    "learned-patterns": "patterns with what was learned of a sensor, and with the truth",
     "zeroing": "drift followed, holds not absorbed",
     "calibration": "coverage of the deviations",
     "interval-coverage": "intervals by region and family, and the error of what is trusted most",

@@ -35,6 +35,8 @@ from train.report import Report, Row, with_interval
 SENSORS: Final = World(count=6000, per_pad=250, seed=9021)
 LEARNED: Final = 200
 _FIGURES: Final = ("glyph", "polygon")
+_SCALE: Final = ("shear_modulus_mpa", "counts_per_newton")
+"""Constants that set the scale of forces and depths alone."""
 _EXACT: Final = (1e-4,) * (3 * USPA44.taxel_count)
 
 
@@ -42,26 +44,29 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `learned-patterns`."""
     world = replace(SENSORS, count=36, per_pad=12) if bench.quick else SENSORS
     presses = make_presses(world, bench.data_folder / ("quick-learned.npz" if bench.quick else "learned.npz"))
-    model, contacts = ModelSession(find_model(DEFAULT_MODEL)), load_contact_model()
-    bench.note_model(find_model(DEFAULT_MODEL))
+    path, contacts = find_model(DEFAULT_MODEL), load_contact_model()
+    model = ModelSession(path)
+    bench.use(path)
     count = min(LEARNED, world.per_pad // 2)
-    rows = [*_evaluated(model, contacts, presses, world, count), *_right_from_the_start(model, contacts, presses, count)]
+    rows = [
+        *_evaluated(model, contacts, presses, world, count),
+        *_right_from_the_start(model, contacts, presses, count),
+    ]
     report = Report("learned-patterns", folder, __file__, bench.used, quick=bench.quick)
     report.say(
-        f"{model.name} on {world.chunks} sensors, each with a pad and gains of its own, N(1, .075); PSNR in dB with a "
-        f"full scale of {MAX_INDENTATION_MM} mm, mean and 95 % interval by sensor, of contacts after the first {count}. "
-        f"What is known: nothing; gains from the doctor's three flat grips; gains and constants learned from {count} "
-        "contacts of every family; the same beginning from the flat grips; the true gains and constants. Gained and "
-        "short: paired differences to nothing known, and to the truth. Wanted: at most .7 dB short; 1 dB gained on "
-        "unseen figures; no more than .1 dB lost where gains were right from the start."
+        f"{model.name} on {world.chunks} sensors, each with a pad and gains of its own, N(1, .075); PSNR in dB with "
+        f"a full scale of {MAX_INDENTATION_MM} mm, mean and 95 % interval by sensor, of contacts after the first "
+        f"{count}. What is known: nothing; gains from the doctor's three flat grips; gains and constants learned from "
+        f"{count} contacts of every family; the same beginning from the flat grips; the true gains and constants. "
+        "Contacts cannot show the scale of forces and depths, so it is also given: the true modulus and counts per "
+        "newton. Gained and short: paired differences to nothing known, and to the truth. Wanted: at most .7 dB short; "
+        "1 dB gained on unseen figures; no more than .1 dB lost where gains were right from the start."
     )
     report.show(rows, "Patterns by what is known of the sensor.")
     return report.write()
 
 
-def _evaluated(
-    model: ModelSession, contacts: ContactModel, presses: PressSet, world: World, count: int
-) -> list[Row]:
+def _evaluated(model: ModelSession, contacts: ContactModel, presses: PressSet, world: World, count: int) -> list[Row]:
     table = load_table(FLAT_GRIPS)
     psnr: dict[str, dict[str, list[float]]] = {}
     pads = np.unique(presses.pad)
@@ -71,20 +76,22 @@ def _evaluated(
         readings = contacts_of(presses, world, number)
         clean, _ = grips_of_pad(world.seed, number)
         by_hand = table.gains(list(read_grips(clean, chips, [world.seed, number])))
+        learned = _learned(contacts, readings[:count], None)
+        scale = {name: getattr(pad, name) for name in _SCALE}
         known = {
             "nothing": None,
             "flat grips": by_hand,
-            "contacts": _learned(contacts, readings[:count], None),
+            "contacts": learned,
             "flat grips, then contacts": _learned(contacts, readings[:count], by_hand),
+            "scale": KnownPad(**scale),
+            "scale and contacts": replace(learned, **scale),
             "the truth": _truth(pad, np.exp(true_log_gains(pad, chips))),
         }
         _add(psnr, model, readings[count:], mine.pick(np.arange(count, len(mine))), known)
     return _rows(psnr, "gains N(1, .075)")
 
 
-def _right_from_the_start(
-    model: ModelSession, contacts: ContactModel, presses: PressSet, count: int
-) -> list[Row]:
+def _right_from_the_start(model: ModelSession, contacts: ContactModel, presses: PressSet, count: int) -> list[Row]:
     """Evaluate sensors whose gains are those of their pad alone, with gains that were learned all the same."""
     psnr: dict[str, dict[str, list[float]]] = {}
     for number in np.unique(presses.pad):
