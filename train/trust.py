@@ -24,6 +24,8 @@ from train.learning.tap_check import fit_tap_network
 NAME: Final = "trust.json"
 """File beside the checkpoints."""
 _NO_LIMIT: Final = 1.0
+_CONTACT_STEPS: Final = 40_000
+_TAP_STEPS: Final = 20_000
 
 
 def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
@@ -35,12 +37,11 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
     several = presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps > 1)
     if not several.any():
         raise DatasetError("no sequences of several taps: add a file of 'python -m train.data.make_presses --taps 4'")
-    steps = max(20_000 // shorten, 1)
     forward = fit_forward_model(presses, seed)
     return {
         "forward": forward.to_json() | {"limit": _NO_LIMIT},
-        "contact": fit_contact_network(presses, seed, steps).to_json(),
-        "tap": fit_tap_network(presses.pick(np.flatnonzero(several)), seed, steps).to_json(),
+        "contact": fit_contact_network(presses, seed, max(_CONTACT_STEPS // shorten, 1)).to_json(),
+        "tap": fit_tap_network(presses.pick(np.flatnonzero(several)), seed, max(_TAP_STEPS // shorten, 1)).to_json(),
         "data_sha256": presses.sha256(),
     }
 

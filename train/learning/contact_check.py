@@ -19,12 +19,13 @@ from train.physics.sensor_noise import Nuisances
 
 LEAST_COUNTS: Final = 100.0
 """Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
-_WIDTHS: Final = (160, 128)
+_WIDTHS: Final = (256, 128, 64)
+_WEIGHT_DECAY: Final = 0.03
 _CERTAINTIES: Final = (0.0, 0.0, 0.5, 0.8)
 _UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
-def fit_contact_network(presses: PressSet, seed: int = 0, steps: int = 20_000, rounds: int = 2) -> SmallNetwork:
+def fit_contact_network(presses: PressSet, seed: int = 0, steps: int = 40_000, rounds: int = 5) -> SmallNetwork:
     """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled.
 
     Args:
@@ -44,7 +45,7 @@ def fit_contact_network(presses: PressSet, seed: int = 0, steps: int = 20_000, r
             faulty, _ = spoiled(rng, readings)
             changed = (faulty != readings).any(axis=(1, 2, 3))
             wrong.append(features_of(faulty[changed], pads[changed]))
-    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed)
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
 
 
 def drawn_readings(presses: PressSet, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
