@@ -11,7 +11,7 @@ from edge.doctor import write_sensor_file as keep
 from edge.doctor.flat_grip_gains import grip_features, load_table
 from edge.doctor.flat_grip_guide import GuidedGrips
 from edge.doctor.grip_findings import judge_grips
-from edge.doctor.pad_orientation import orders
+from edge.doctor.pad_orientation import AS_MAPPED, orders
 from edge.doctor.press_guide import PATIENCE_S
 from edge.errors import EdgeError
 from edge.inference.bundled import FLAT_GRIPS
@@ -163,7 +163,7 @@ class Gripping(Person):
 
 
 @pytest.mark.parametrize(
-    ("turn", "swap", "signs"), [("as the id map says", False, (1, 1, 1)), ("mirrored left to right", True, (-1, 1, -1))]
+    ("turn", "swap", "signs"), [(AS_MAPPED, False, (1, 1, 1)), ("mirrored left to right", True, (-1, 1, -1))]
 )
 def test_the_doctor_finds_simulated_gains_over_a_pseudo_terminal(monkeypatch, tmp_path, gripped, turn, swap, signs):
     readings, true = gripped

@@ -26,7 +26,7 @@ def page(tmp_path_factory):
 
 
 def rows_of(page, part=""):
-    with page.with_name(f"intervals{part}.csv").open() as file:
+    with page.with_name(f"interval-coverage{part}.csv").open() as file:
         return list(csv.DictReader(file))
 
 

@@ -201,12 +201,11 @@ def test_interval_levels_are_positive_factors_of_percentages(levels):
         Contract.from_metadata(metadata)
 
 
-def test_interval_levels_are_kept_and_may_be_absent():
+def test_interval_levels_are_kept_and_none_in_earlier_versions():
     levels = {"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6, 1.6, 1.6, 1.6]}
     metadata = make_contract(interval_levels=levels).to_metadata()
     assert Contract.from_metadata(metadata).interval_levels == levels
-    del metadata[KEY_PREFIX + "interval_levels"]
-    assert Contract.from_metadata(metadata).interval_levels == {}
+    assert Contract.from_metadata(make_contract(version=5).to_metadata()).interval_levels == {}
 
 
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):

@@ -60,7 +60,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert emulation == {"pty_port", "slcan_emulator", "slcan_main", "xela_controller"}, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
-        *("demo.npz", "taxels.npz"),
+        *("contacts.npz", "demo.npz", "grips.npz", "taxels.npz"),
     }
 
 
