@@ -1,4 +1,4 @@
-"""What self-calibration does for patterns: a network's error with what was learned of a sensor, and with the truth.
+"""Patterns with self-calibration: a network's error with what was learned of a sensor, and with the truth.
 
 Sensors have pads, gains and all other nuisances of their own, and learn from their first 200 contacts, of every family;
 the contacts after these are evaluated.
