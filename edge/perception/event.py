@@ -73,8 +73,10 @@ class Event:
             case "tap_dropped":
                 return f"sensor {self.sensor}: {self.detail}"
             case "suspected":
-                causes = "a magnet or steel near it, another --id-map, or its sensor file"
-                return f"sensor {self.sensor}: several contacts in a row read like none; check {causes}"
+                causes = (
+                    "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
+                )
+                return f"sensor {self.sensor} is suspected: {self.detail or causes}"
             case "cleared":
                 return f"sensor {self.sensor}: contacts read as they should again"
             case "rest_level" | "gains_learned":

@@ -20,6 +20,10 @@ SURER: Final = 0.05
 SHIFTED: Final = 0.01
 """Least RMS change of the gains in use."""
 _LEAST_CERTAINTY: Final = 0.1
+CONTRADICTED: Final = 3.0
+"""Disagreement of contacts with the gains of the sensor file from which these are another sensor's."""
+CONTRADICTED_CONTACTS: Final = 25
+"""Fewest distinct contacts by which that is decided."""
 
 
 class GainFollower:
@@ -34,6 +38,7 @@ class GainFollower:
         """Begin with the gains of a pad, if it has any."""
         self.waiting = False
         self._learner = GainLearner(model, pad)
+        self._from_file = pad is not None and pad.gains is not None
         self._used = self._by_hand = Pad() if pad is None else replace(pad, gains=None, gain_half_widths=None)
         if pad is not None:
             self._used = pad
@@ -45,6 +50,12 @@ class GainFollower:
     def contacts(self) -> int:
         """Number of distinct contacts so far."""
         return self._learner.contacts
+
+    @property
+    def contradicts_file(self) -> bool:
+        """True if contacts contradict the gains that it began with: they are those of another sensor."""
+        learner = self._learner
+        return self._from_file and learner.contacts >= CONTRADICTED_CONTACTS and learner.disagreement > CONTRADICTED
 
     @property
     def learned(self) -> Pad:

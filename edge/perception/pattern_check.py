@@ -20,7 +20,7 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
 Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
-its readings; readings of one contact after another are unfamiliar, so the sensor or its file is wrong."""
+its readings; contacts together are unfamiliar, or contradict the gains of the sensor file."""
 REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor")
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
@@ -79,7 +79,11 @@ class PatternCheck:
         self._evidence = 0.0
         self._tap: int | None = None
         self._strongest, self._score = -math.inf, 0.0
-        self.suspected = False
+        self.suspected = self._wrong_file = False
+
+    def suspect_file(self) -> None:
+        """Believe no further pattern: the sensor file holds the gains of another sensor."""
+        self.suspected = self._wrong_file = True
 
     def use_pad(self, pad_row: NDArray[np.float32]) -> None:
         """Check from now on with a pad as model input; what contacts have shown so far stays."""
@@ -149,7 +153,7 @@ class PatternCheck:
             if self._tap is not None:
                 step = min(max(self._score - _SUSPICION, -_STEP), _STEP)
                 self._evidence = min(max(self._evidence + step, 0.0), _MOST)
-                self.suspected = self._evidence > (_LIMIT / 2 if self.suspected else _LIMIT)
+                self.suspected = self._wrong_file or self._evidence > (_LIMIT / 2 if self.suspected else _LIMIT)
             self._tap, self._strongest = tap, -math.inf
         if strength > self._strongest and math.isfinite(score):
             self._strongest, self._score = strength, score

@@ -113,6 +113,12 @@ class Sensor:
     def learn(self, contract: Contract) -> None:
         """Learn from the contact that waits; if new gains come into use, an event reports it."""
         pad = None if self.follower is None else self.follower.learn(self.watch.dead)
+        if self.follower is not None and self.check is not None and self.follower.contradicts_file:
+            if not self.check.suspected:
+                why = "its contacts contradict the gains of its sensor file: is it another sensor's file?"
+                self.report("suspected", why)
+            self.check.suspect_file()
+            return
         if pad is None or self.follower is None:
             return
         self.pad, self._learned = pad, self.follower.learned

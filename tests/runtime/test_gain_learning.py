@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, make_pad_contract
 from runtime_samples import make_runtime
+from trust_samples import make_trust
 
 from edge.cli import main as cli
 from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.gain_following import HELD_SCANS, GainFollower
+from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower
 from edge.perception.gain_learning import BOUND, REMEMBERED, SOLVE_EVERY, ContactModel, GainLearner, load_contact_model
+from edge.perception.pattern_check import PatternCheck
 from edge.perception.result import Result
+from edge.perception.sensor_state import Sensor
+from edge.perception.tap_tracker import TapTracker
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
@@ -25,6 +29,7 @@ from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sens
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 Z = slice(32, 48)
+SCAN = ScanSeries("4", USPA44).close(np.rint(BASELINE.counts).astype(np.int32), 1)
 
 
 def make_model(seed=0, kinds=3):
@@ -69,6 +74,40 @@ def taught(contacts, model=MODEL, start=None, dead=None):
 
 def rms(logs):
     return float(np.sqrt(np.square(logs).mean()))
+
+
+class TestFileOfAnotherSensor:
+    WIDTHS = (0.03,) * GAINS
+
+    def follow(self, gains_in_file, count=60):
+        true = draw_gains()
+        file = Pad(gains=tuple(gains_in_file), gain_half_widths=self.WIDTHS)
+        sensor = Sensor("4", USPA44, TapTracker(1), None)
+        contract = make_pad_contract()
+        sensor.check = PatternCheck(make_trust(), contract)
+        sensor.pad, sensor.follower = file, GainFollower(MODEL, file)
+        for contact in draw_contacts(count, true):
+            result = Result(SCAN, "device", "m", "contact", force_counts=5000.0)
+            while not sensor.follower.see(result, contact):
+                pass
+            sensor.learn(contract)
+        return sensor
+
+    def test_gains_of_another_sensor_are_contradicted_once_and_nothing_is_believed(self):
+        sensor = self.follow(draw_gains(seed=9))
+        assert sensor.check is not None and sensor.check.suspected
+        suspicions = [event for event in sensor.events if event.kind == "suspected"]
+        assert len(suspicions) == 1 and "another sensor's file" in suspicions[0].at(0).text
+        assert sensor.events[-1] == suspicions[0], "nothing is learned after it"
+
+    def test_its_own_gains_are_not(self):
+        sensor = self.follow(draw_gains())
+        assert sensor.check is not None and not sensor.check.suspected
+        assert not [event for event in sensor.events if event.kind == "suspected"]
+
+    def test_it_takes_some_contacts(self):
+        sensor = self.follow(draw_gains(seed=9), CONTRADICTED_CONTACTS - 1)
+        assert sensor.check is not None and not sensor.check.suspected
 
 
 class TestLearner:

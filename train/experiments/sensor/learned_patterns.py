@@ -47,7 +47,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     path, contacts = find_model(DEFAULT_MODEL), load_contact_model()
     model = ModelSession(path)
     bench.use(path)
-    count = min(LEARNED, world.per_pad // 2)
+    count = min(LEARNED, world.per_pad * 4 // 5)
     rows = [
         *_evaluated(model, contacts, presses, world, count),
         *_right_from_the_start(model, contacts, presses, count),
