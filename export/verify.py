@@ -36,6 +36,7 @@ from export.graphs.parity import (
     TOLERANCE,
     Difference,
     GraphRun,
+    accepted,
     differences,
     extreme_windows,
     read_windows,
@@ -173,12 +174,12 @@ def _judge(
     change_db = None
     if truth is not None:
         change_db = float((psnr_db(given[0], truth, full_scale) - psnr_db(expected[0], truth, full_scale)).mean())
-    broken, largest = "", max(found, key=lambda difference: difference.relative)
     bound = TOLERANCE if windows in READINGS else EXTREME_TOLERANCE
     if contract.arithmetic == "int8":
         bound = INT8_READ if windows in READINGS else INT8_EXTREME
-    if not largest.relative <= bound:
-        broken = f"{largest.output} differs by {largest.relative:.1e}, more than {bound:g}"
+    broken, largest = "", max(found, key=lambda one: one.relative / accepted(one.output, bound))
+    if not largest.relative <= (most := accepted(largest.output, bound)):
+        broken = f"{largest.output} differs by {largest.relative:.1e}, more than {most:g}"
     elif change_db is not None and not change_db >= -MOST_LOSS_DB:
         broken = f"{-change_db:.3f} dB lost, more than {MOST_LOSS_DB}"
     if len(given) > 1 and not (given[1] > 0).all():

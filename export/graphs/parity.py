@@ -34,6 +34,9 @@ seed-size ones 2e-6.
 """
 EXTREME_TOLERANCE: Final = 5e-5
 """Largest accepted difference on extreme windows; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""
+DEVIATION_TOLERANCE: Final = 1e-3
+"""Largest accepted difference in a deviation: a pixel at the contact level lies inside or outside by its last bit, which
+moves the regions around it, and with their sizes the factors of the whole window by .0002."""
 FULL_TRACTION_KPA: Final = 100.0
 """Traction of 40 N evenly on the pad, in [kPa]: differences of smaller tractions are relative to it."""
 FULL_RANGE_COUNTS: Final = 32768
@@ -141,15 +144,17 @@ def differences(
     return found
 
 
+def accepted(output: str, tolerance: float) -> float:
+    """Return the largest accepted difference in an output, where it is `tolerance` in a pattern."""
+    return max(tolerance, DEVIATION_TOLERANCE) if output == DEVIATION_NAME else tolerance
+
+
 def _largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.abs(maps).reshape(len(maps), -1).max(axis=1)
 
 
 def _nearly_largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the difference that one pixel in ten exceeds.
-
-    A pixel at the contact level may lie inside or outside by the last bit, and then moves the regions around it.
-    """
+    """Return the difference that one pixel in ten exceeds: those around a pixel that changes regions have another."""
     return np.quantile(np.abs(maps).reshape(len(maps), -1), 0.9, axis=1, method="higher")
 
 
@@ -190,10 +195,11 @@ def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, cont
         known = None if pads is None else torch.from_numpy(pads)
         expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), known)]
         for difference in differences(run.outputs, expected, run(windows, pads), contract.output_full_scale):
-            if not difference.relative <= tolerance:
+            most = accepted(difference.output, tolerance)
+            if not difference.relative <= most:
                 raise ParityError(
                     f"onnxruntime and torch differ by {difference.relative:.2e} in the {difference.output}, expected "
-                    f"at most {tolerance:.0e}"
+                    f"at most {most:.0e}"
                 )
             largest = max(largest, difference.relative)
     return largest
