@@ -35,8 +35,11 @@ seed-size ones 2e-6.
 EXTREME_TOLERANCE: Final = 5e-5
 """Largest accepted difference on extreme windows; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""
 DEVIATION_TOLERANCE: Final = 1e-3
-"""Largest accepted difference in a deviation: a pixel at the contact level lies inside or outside by its last bit, which
-moves the regions around it, and with their sizes the factors of the whole window by .0002."""
+"""Largest accepted difference in a deviation.
+
+A pixel at the contact level lies inside or outside by its last bit; that moves the regions around it, and with their
+sizes the factors of the whole window: measured .0002.
+"""
 FULL_TRACTION_KPA: Final = 100.0
 """Traction of 40 N evenly on the pad, in [kPa]: differences of smaller tractions are relative to it."""
 FULL_RANGE_COUNTS: Final = 32768

@@ -161,7 +161,7 @@ def test_a_seed_size_network_of_another_scale_has_one_output_and_is_not_judged(f
 @pytest.mark.parametrize("head", ["leave", "uncertainty", "traction"])
 def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp_path, monkeypatch, head):
     model = onnx.load(folder / "sure.onnx")
-    factor = 1.01 if head == "uncertainty" else 1.001  # regions move deviations by more than additions do
+    factor = 1.2 if head == "uncertainty" else 1.001  # regions move deviations by more than additions do
     for weight in model.graph.initializer:
         if weight.name.startswith(head) and weight.name.endswith(".bias"):
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * np.float32(factor), weight.name))
