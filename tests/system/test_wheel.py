@@ -58,7 +58,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert not (packages / "edge" / "bench").exists()
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
-        *("demo.npz", "taxels.npz"),
+        *("contacts.npz", "demo.npz", "grips.npz", "taxels.npz"),
     }
 
 
