@@ -54,11 +54,11 @@ def of_graph(name: str, model: onnx.ModelProto, net: PatternNet, contract: Contr
 
 
 def _share(found: Difference, contract: Contract) -> float:
-    """Return an output's relative difference; in int8, a deviation's is relative to full scale at least.
+    """Return an output's relative difference; a deviation's is relative to full scale at least.
 
-    At rest patterns are zero and deviations some .0001 mm: a share of these would be of the quantisation steps.
+    At rest patterns are zero and deviations some .0001 mm: a share of these would be of the last bits.
     """
-    if contract.arithmetic == "float32" or found.output != DEVIATION_NAME:
+    if found.output != DEVIATION_NAME:
         return found.relative
     return min(found.relative, found.largest / contract.output_full_scale)
 
