@@ -284,6 +284,7 @@ def open_runtime(
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,
+        measured=known.measured_pads if pad is None else None,
         options=RuntimeOptions(
             contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift, fallback, learn
         ),

@@ -40,6 +40,9 @@ BOUND: Final = 0.25
 """Largest deviation of a gain from 1."""
 PLACE_SPREAD: Final = 0.06
 """Standard deviation of a place's log-gain from the seat and moment of its magnet, common to its three axes."""
+LEFT_BY_CONTACTS: Final = 0.04
+"""Deviation of a gain that contacts cannot reduce, as what they share does not average out. Contacts make measured gains
+no surer where these are surer than that."""
 _FREEDOM: Final = 5.0
 """Degrees of freedom of Student's t, which weighs down contacts that no component explains well."""
 _UNEXPLAINED: Final = 40.0
@@ -148,6 +151,8 @@ class GainLearner:
         constants = model.means.shape[1] - 1
         size = _LINEAR + constants
         self._prior = _prior(constants)
+        self._unknown = np.diag(np.linalg.inv(self._prior))[:GAINS]
+        self._least_deviations = np.zeros(GAINS)
         self._begin = np.zeros(size)
         self._begin[:GAINS] = 1.0
         if start is not None and start.gains is not None and len(start.gains) == GAINS:
@@ -157,10 +162,12 @@ class GainLearner:
             else:
                 deviation = np.maximum(np.asarray(start.gain_half_widths) / LEVEL_90, _LEAST_DEVIATION)
             self._prior[:GAINS, :GAINS] = np.diag((deviation / model.widening) ** -2.0) + _even_axes()
+            self._least_deviations = np.minimum(deviation, LEFT_BY_CONTACTS)
         self._best = self._begin.copy()
-        spread = np.sqrt(np.diag(np.linalg.inv(self._prior)))
-        self.deviations = model.widening * spread[:GAINS]
-        self.constant_deviations = spread[_LINEAR:]
+        before = np.diag(np.linalg.inv(self._prior))
+        self._before, self._after = before[:GAINS], before[:GAINS]
+        self.deviations = model.widening * np.sqrt(before[:GAINS])
+        self.constant_deviations = np.sqrt(before[_LINEAR:])
         self._square = np.zeros((size, size))
         self._product = np.zeros(size)
         self._weight = self._count = 0.0
@@ -171,7 +178,7 @@ class GainLearner:
     @property
     def gains(self) -> NDArray[np.float64]:
         """Gains (GAINS,) so far, within BOUND of 1."""
-        biased = self._count / (self._count + _BIASED)
+        biased = self._count / (self._count + _BIASED) * self._share_of_contacts
         return (np.exp(-biased * self._model.bias) / self._best[:GAINS]).clip(1 - BOUND, 1 + BOUND)
 
     def pad(self) -> Pad:
@@ -193,15 +200,16 @@ class GainLearner:
 
     @property
     def disagreement(self) -> float:
-        """Mean square of how far contacts move the gains, over what they do where the beginning is right: then about 1.
-
-        With the sensor's own gains from flat grips it stayed below 2.3 on 24 simulated sensors; with another sensor's
-        it was above 3.2 from 50 contacts on.
-        """
-        before = np.diag(np.linalg.inv(self._prior))[:GAINS]
-        after = np.square(self.deviations * self._best[:GAINS] / self._model.widening)
+        """Mean square of how far contacts move the gains, over that of a right beginning; then it is about 1."""
         moved = np.square(self._best[:GAINS] - self._begin[:GAINS])
-        return float(moved.mean() / max(float((before - after).clip(0).mean()), 1e-9))
+        return float(moved.mean() / max(float((self._before - self._after).clip(0).mean()), 1e-9))
+
+    @property
+    def _share_of_contacts(self) -> float:
+        """Weight of the contacts beside the beginning, over what it is where nothing is known at the beginning."""
+        information = (1 / self._after - 1 / self._before).clip(0)
+        weight, of_unknown = (information / (information + 1 / before) for before in (self._before, self._unknown))
+        return float(weight.sum() / max(float(of_unknown.sum()), 1e-9))
 
     @property
     def determined(self) -> NDArray[np.bool_]:
@@ -212,6 +220,7 @@ class GainLearner:
         """Return a learner that has learned nothing yet and begins to look from these results: for a further pass."""
         learner = GainLearner(self._model)
         learner._prior, learner._begin = self._prior, self._begin
+        learner._before = learner._after = self._before
         learner._best = self._best.copy()
         learner._find_centres()
         return learner
@@ -313,8 +322,9 @@ class GainLearner:
         self._best += step * min(1.0, _LONGEST_STEP / max(longest, 1e-9))
         self._best[:GAINS] = self._best[:GAINS].clip(1 / (1 + BOUND), 1 / (1 - BOUND))
         self._best[_LINEAR:] = self._best[_LINEAR:].clip(-1.2, 1.2)
-        spread = np.sqrt(np.diag(covariance).clip(0))
-        self.deviations = self._model.widening * spread[:GAINS] / self._best[:GAINS]
+        spread = np.sqrt(np.diag(covariance).clip(1e-12))
+        self._after = spread[:GAINS] ** 2
+        self.deviations = np.maximum(self._model.widening * spread[:GAINS] / self._best[:GAINS], self._least_deviations)
         self.constant_deviations = np.minimum(self._model.constant_widening * spread[_LINEAR:], _OPEN)
         self._find_centres()
         return longest > 1e-3

@@ -76,6 +76,7 @@ class Runtime:
         mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
         pad: properties of the pad of all sensors, or of each by name, for models that use them. Counts per newton that
             it lacks are those above.
+        measured: pads without what was learned, by name, from which learning begins; None for `pad`.
         options: thresholds of taps, and which computations may be omitted.
         clock_ns: measures run time.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
@@ -99,6 +100,7 @@ class Runtime:
         counts_per_newton: float | Mapping[str, float] | None = None,
         mountings: Mapping[str, Mounting] | None = None,
         pad: Pad | Mapping[str, Pad] | None = None,
+        measured: Mapping[str, Pad] | None = None,
         options: RuntimeOptions = DEFAULTS,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
@@ -111,6 +113,7 @@ class Runtime:
         elif counts_per_newton is not None:
             check_positive("counts_per_newton", counts_per_newton)
         check_pads(pad, geometry)
+        check_pads(measured, geometry)
         check_mountings(mountings or {}, geometry)
         self._model = model
         self._events: list[Untimed] = []
@@ -121,7 +124,7 @@ class Runtime:
         self._describe, self._trust = Describer(model.contract, geometry), model.contract.read_trust()
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
-        self._pad = pad
+        self._pad, self._measured = pad, measured
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._options = options
@@ -340,7 +343,8 @@ class Runtime:
             sensor.check = PatternCheck(self._trust, self._model.contract)
         sensor.take_pad(self._model.contract)
         if self._contacts is not None:
-            sensor.follower = GainFollower(self._contacts, sensor.pad)
+            measured = sensor.pad if self._measured is None else self._measured.get(name)
+            sensor.follower = GainFollower(self._contacts, measured, sensor.pad)
         if baseline is not None:
             age_s = baseline.age_s(self._unix_time_s())
             # A baseline from the future means that one of the two clocks was wrong.

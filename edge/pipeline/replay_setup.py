@@ -48,9 +48,11 @@ def open_recording(
             mountings.get(name, Mounting(taxel_count=file.geometry.taxel_count)),
             known.counts_per_newton.get(name),
             baselines.get(name),
-            known.pads.get(name),
+            entry.pad,
+            entry.learned,
         )
         for name in sorted(sensors)
+        for entry in [known.sensors.get(name, SensorEntry())]
     }
     known = replace(known, sensors=entries)
     return Source(place_recordings(replay, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)

@@ -130,8 +130,13 @@ class SensorFile:
         return {name: counts for name, counts in known.items() if counts is not None}
 
     @property
+    def measured_pads(self) -> dict[str, Pad]:
+        """Pads without what was learned, by sensor name."""
+        return {name: entry.pad for name, entry in self.sensors.items() if entry.pad is not None}
+
+    @property
     def pads(self) -> dict[str, Pad]:
-        """Available pads by sensor name."""
+        """Pads in use by sensor name, with what was learned."""
         used = {name: entry.used_pad for name, entry in self.sensors.items()}
         return {name: pad for name, pad in used.items() if pad is not None}
 

@@ -79,7 +79,7 @@ def rms(logs):
 class TestFileOfAnotherSensor:
     WIDTHS = (0.03,) * GAINS
 
-    def follow(self, gains_in_file, count=60):
+    def follow(self, gains_in_file, count=120):
         true = draw_gains()
         file = Pad(gains=tuple(gains_in_file), gain_half_widths=self.WIDTHS)
         sensor = Sensor("4", USPA44, TapTracker(1), None)
@@ -108,6 +108,35 @@ class TestFileOfAnotherSensor:
     def test_it_takes_some_contacts(self):
         sensor = self.follow(draw_gains(seed=9), CONTRADICTED_CONTACTS - 1)
         assert sensor.check is not None and not sensor.check.suspected
+
+
+class TestRestart:
+    def test_what_was_learned_before_is_used_but_is_no_beginning(self):
+        true = draw_gains()
+        learned = taught(draw_contacts(200, true)).pad()
+        follower = GainFollower(MODEL, None, learned)
+        assert np.array_equal(follower._learner.gains, np.ones(GAINS)) and not follower.contradicts_file
+        result = Result(SCAN, "device", "m", "contact", force_counts=5000.0)
+        pads = []
+        for contact in draw_contacts(100, true, seed=5):
+            while not follower.see(result, contact):
+                pass
+            pads.append(follower.learn(np.zeros((4, 4), dtype=bool)))
+        taken = [pad for pad in pads if pad is not None]
+        assert all(pad.gains_certainty >= learned.gains_certainty for pad in taken)
+
+    def test_contacts_make_measured_gains_no_surer_than_they_are(self):
+        measured = Pad(gains=tuple(draw_gains()), gain_half_widths=(0.03,) * GAINS)
+        learner = taught(draw_contacts(200, draw_gains()), start=measured)
+        assert learner.pad().gains_certainty <= measured.gains_certainty + 1e-4  # half widths are rounded
+
+    def test_an_untrusted_scan_takes_back_what_its_contact_would_teach(self):
+        follower = GainFollower(MODEL, None)
+        result = Result(SCAN, "device", "m", "contact", force_counts=5000.0)
+        follower.see(result, draw_contacts(1)[0])
+        assert follower.waiting
+        follower.see(replace(result, trusted=False), draw_contacts(1)[0])
+        assert not follower.waiting
 
 
 class TestLearner:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from edge.doctor.flat_grip_gains import load_table
 from edge.inference.bundled import CONTACTS, FLAT_GRIPS
+from edge.perception.gain_following import CONTRADICTED, CONTRADICTED_CONTACTS
 from edge.perception.gain_learning import ContactModel, GainLearner, load_contact_model
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import AXES
@@ -45,6 +46,8 @@ SENSORS: Final = World(count=4800, per_pad=200, seed=9015)
 COUNTS: Final = (25, 50, 100, 200)
 _HOUR: Final = 3600
 """Adverse contacts of an hour, one a second."""
+_PASSES: Final = 5
+_STARTS: Final = (1, 4, 16)
 _HARD: Final = (0.3, 1.0)
 _NOISE_COUNTS: Final = 2.0
 _PARTS: Final = (("x", slice(0, 16)), ("y", slice(16, 32)), ("z", Z), ("all", slice(0, CHANNELS)))
@@ -77,6 +80,13 @@ def run(bench: Workbench, folder: Path) -> Path:
         _adverse(presses, contacts, true, model),
         "An hour of adverse contacts, one a second, on a sensor that has learned nothing yet.",
     )
+    by_hand = [_by_hand(world, number) for number in numbers]
+    report.show(
+        _files(contacts, by_hand, model),
+        f"Measured gains in the sensor file, its own and another sensor's, over {_PASSES} passes of its contacts; they "
+        f"are contradicted where the disagreement exceeds {CONTRADICTED:g}.",
+    )
+    report.show(_restarts(contacts, true, by_hand, model), "A sensor that is started again after every 80 contacts.")
     if recording_paths(recordings_folder()):
         _recorded(report, model)
     else:
@@ -127,6 +137,67 @@ def _from_grips(world: World) -> list[Row]:
                 pads.append(pad)
                 off.append(_logs([pad])[0] - log_gains(chips, seats).ravel())
         rows.append({"grips": caption} | _row(np.array(off), pads))
+    return rows
+
+
+def _by_hand(world: World, number: int) -> Pad | None:
+    """Return what the doctor measures of a sensor by three flat grips."""
+    clean, _ = grips_of_pad(world.seed, number)
+    return load_table(FLAT_GRIPS).gains(list(read_grips(clean, sensor_of(world, number)[1], [world.seed, number])))
+
+
+def _files(contacts: Sequence[NDArray[np.floating]], by_hand: Sequence[Pad | None], model: ContactModel) -> list[Row]:
+    rows: list[Row] = []
+    for caption, shift in (("its own", 0), ("another sensor's", len(contacts) // 3)):
+        most, until = [], []
+        for number, mine in enumerate(tracked(contacts, caption, "sensor")):
+            learner, largest, first = GainLearner(model, by_hand[(number + shift) % len(contacts)]), 0.0, np.inf
+            for contact in np.concatenate([mine] * _PASSES):
+                if learner.learn(contact) and learner.contacts >= CONTRADICTED_CONTACTS:
+                    largest = max(largest, learner.disagreement)
+                    first = min(first, learner.contacts if largest > CONTRADICTED else np.inf)
+            most.append(largest)
+            until.append(first)
+        found = np.sort(until)
+        rows.append(
+            {
+                "gains": caption,
+                "sensors": len(contacts),
+                "contradicted": int(np.isfinite(found).sum()),
+                "contacts until then, median": _whole(found[len(found) // 2]),
+                "most": _whole(found[-1]),
+                "disagreement, least of the largest": round(min(most), 2),
+                "largest": round(max(most), 2),
+            }
+        )
+    return rows
+
+
+def _whole(count: float) -> int | None:
+    return int(count) if np.isfinite(count) else None
+
+
+def _restarts(
+    contacts: Sequence[NDArray[np.floating]],
+    true: NDArray[np.floating],
+    by_hand: Sequence[Pad | None],
+    model: ContactModel,
+) -> list[Row]:
+    rows: list[Row] = []
+    for caption, measured in (("nothing", [None] * len(contacts)), ("flat grips", by_hand)):
+        used = list(measured)
+        rng = np.random.default_rng(0)
+        for start in range(1, _STARTS[-1] + 1):
+            for number, mine in enumerate(contacts):
+                learner = GainLearner(model, measured[number])
+                for contact in mine[rng.permutation(len(mine))[:80]]:
+                    learner.learn(contact)
+                before = used[number]
+                if before is None or learner.pad().gains_certainty >= before.gains_certainty:
+                    used[number] = learner.pad()
+            if start in _STARTS:
+                pads = [one for one in used if one is not None]
+                rows.append({"measured": caption, "starts": start} | _row(_logs(pads) - true[: len(pads)], pads))
     return rows
 
 
