@@ -41,7 +41,7 @@ BOUND: Final = 0.25
 PLACE_SPREAD: Final = 0.06
 """Standard deviation of a place's log-gain from the seat and moment of its magnet, common to its three axes."""
 LEFT_BY_CONTACTS: Final = 0.04
-"""Deviation of a gain that contacts cannot reduce, as what they share does not average out. Contacts make measured gains
+"""Deviation of a gain that contacts cannot reduce, what they share not averaging out. Contacts make measured gains
 no surer where these are surer than that."""
 _FREEDOM: Final = 5.0
 """Degrees of freedom of Student's t, which weighs down contacts that no component explains well."""
