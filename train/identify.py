@@ -1,4 +1,4 @@
-"""Identify a sensor from its own recordings: the gains of its channels, and what contacts tell of its pad.
+"""Identify a sensor from its own recordings: the gains of its channels, and constants of its pad.
 
     python -m train.identify recordings --out sensor.toml
 

@@ -1,4 +1,4 @@
-"""Fit what a model needs to say when its pattern is not to be believed: forward model and checks, into one file.
+"""Fit the forward model and the checks by which a model states which patterns are not to be believed, into one file.
 
     python -m train.trust checkpoints/trust.json --data data/gripped.npz data/gripped4.npz
 
@@ -22,8 +22,7 @@ from train.learning.forward_operator import fit_forward_model
 from train.learning.tap_check import fit_tap_network
 
 NAME: Final = "trust.json"
-"""File beside the checkpoints."""
-_NO_LIMIT: Final = 1.0
+"""File in the folder of the checkpoints."""
 _CONTACT_STEPS: Final = 40_000
 _TAP_STEPS: Final = 20_000
 
@@ -37,9 +36,8 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
     several = presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps > 1)
     if not several.any():
         raise DatasetError("no sequences of several taps: add a file of 'python -m train.data.make_presses --taps 4'")
-    forward = fit_forward_model(presses, seed)
     return {
-        "forward": forward.to_json() | {"limit": _NO_LIMIT},
+        "forward": fit_forward_model(presses, seed).to_json(),
         "contact": fit_contact_network(presses, seed, max(_CONTACT_STEPS // shorten, 1)).to_json(),
         "tap": fit_tap_network(presses.pick(np.flatnonzero(several)), seed, max(_TAP_STEPS // shorten, 1)).to_json(),
         "data_sha256": presses.sha256(),

@@ -1,4 +1,4 @@
-"""Scenes of the demo: what goes wrong in each, told before it, and what the runtime made of it, told after it."""
+"""Scenes of the demo: a line before each names its fault, and a line after it the outcome."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ _BEGINS: Final = {
 
 
 class DemoScenes(Sink):
-    """Sink that tells of each scene of the demo, as events of kind "note".
+    """Sink that announces each scene of the demo, and its outcome, as events of kind "note".
 
     A result is matched to its scene by its raw counts, as in `DemoScore`.
     """
@@ -37,7 +37,7 @@ class DemoScenes(Sink):
             self._scenes = {counts.astype(np.int32).tobytes(): scene for counts, scene in pairs}
         self._tell = tell
         self._scene = _FREE
-        self._patterns = self._doubted = self._dropped = 0
+        self._patterns = self._untrusted = self._dropped = 0
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Follow the scenes."""
@@ -50,19 +50,19 @@ class DemoScenes(Sink):
         self._dropped += sum(event.kind == "tap_dropped" for event in result.events)
         if result.pattern is not None:
             self._patterns += 1
-            self._doubted += result.trusted is False
+            self._untrusted += result.trusted is False
 
     def close(self) -> None:
-        """Do nothing: a scene that was cut off is not told of."""
+        """Do nothing: a scene that was cut off has no outcome."""
 
     def _end(self) -> None:
-        """Tell what the runtime made of the scene, and count from 0."""
+        """Announce the outcome of the scene, and count from 0."""
         if self._scene == _FOREIGN:
             none = "no tap was dropped: this model takes one tap, or does not check earlier ones"
             self._say(f"demo: {f'earlier taps were dropped {self._dropped} times' if self._dropped else none}")
         elif self._scene == _MAGNET:
-            self._say(f"demo: {self._doubted} of {self._patterns} patterns with the magnet were not to be believed")
-        self._patterns = self._doubted = self._dropped = 0
+            self._say(f"demo: {self._untrusted} of {self._patterns} patterns with the magnet were not to be believed")
+        self._patterns = self._untrusted = self._dropped = 0
 
     def _say(self, text: str) -> None:
         self._tell(Event(time.monotonic_ns(), "note", None, text))

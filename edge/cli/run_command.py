@@ -178,7 +178,7 @@ def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]"
 
 
 def _open_scenes(watching: Sequence[Sink]) -> Sink:
-    """Return the sink that tells those who watch what happens in the scenes of the demo."""
+    """Return the sink that announces the scenes of the demo to the sinks that show events."""
     from edge.cli.demo_scenes import DemoScenes
 
     def tell(event: Event) -> None:

@@ -17,7 +17,7 @@ from firmware_bridge.zeroing.baseline import Baseline
 _AS_WIRED = frozenset({"mounting"})
 
 
-def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool, grips: bool = True) -> None:
+def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool, grips: bool) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
     Args:

@@ -19,7 +19,7 @@ from train.experiments.support.workbench import Workbench
 EXPERIMENTS: Final = {
     "families": "the shipped model on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
-    "trust-checks": "patterns that are doubted, rightly and wrongly, and foreign taps that are dropped",
+    "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
     "trained_out": "the paper's and compact networks, trained for many epochs",

@@ -1,4 +1,4 @@
-"""Check that tells readings of contacts from readings that no contact makes."""
+"""Check that separates readings of contacts from readings that no contact makes."""
 
 from typing import Final
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from edge.inference.familiarity import Check, contact_features
 from edge.inference.small_network import SmallNetwork
 from edge.perception.contact_options import OFF_COUNTS
+from edge.perception.pattern_check import LEAST_COUNTS
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
@@ -17,26 +18,25 @@ from train.networks.symmetric import symmetries
 from train.physics.pad_draws import known_numbers
 from train.physics.sensor_noise import Nuisances
 
-LEAST_COUNTS: Final = 100.0
-"""Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
+_ROUNDS: Final = 5
+"""Readings of each press."""
 _WIDTHS: Final = (256, 128, 64)
 _WEIGHT_DECAY: Final = 0.03
 _CERTAINTIES: Final = (0.0, 0.0, 0.5, 0.8)
 _UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
-def fit_contact_network(presses: PressSet, seed: int = 0, steps: int = 40_000, rounds: int = 5) -> SmallNetwork:
+def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
     """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled.
 
     Args:
         presses: the newest press of each sequence is used.
         seed: of nuisances, faults and weights.
         steps: of the optimizer.
-        rounds: readings of each press.
     """
     rng = np.random.default_rng([seed, 3])
     right, wrong = [], []
-    for number in range(rounds):
+    for number in range(_ROUNDS):
         readings, pads = drawn_readings(presses, seed + number)
         strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
         readings, pads = moved(rng, readings[strong]), pads[strong]

@@ -1,7 +1,6 @@
 """Fit of the forward model of edge.inference.forward_model to simulated presses."""
 
 import math
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -17,6 +16,8 @@ from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
 _RIDGE: Final = 1e-6
+_NO_LIMIT: Final = 1.0
+"""Limit until a model's own patterns set it, at export."""
 _UNIT: Final = np.array(COUNTS_PER_UNIT)
 
 
@@ -46,10 +47,9 @@ def fit_forward_model(presses: PressSet, seed: int = 0) -> ForwardModel:
         noise=_noise().astype(np.float32),
         model_error=np.sqrt(np.mean(left**2, axis=(0, 2))).astype(np.float32),
         unexplained=float(np.sum(unknown**2) / np.sum((clean / size) ** 2)),
-        limit=1.0,
+        limit=_NO_LIMIT,
     )
-    rounded = forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
-    return replace(rounded, limit=math.inf)
+    return forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
 
 
 def _maps(presses: PressSet) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

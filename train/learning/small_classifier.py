@@ -1,4 +1,4 @@
-"""Training of a small network that tells right rows of features from wrong ones."""
+"""Training of a small network that separates right rows of features from wrong ones."""
 
 from itertools import pairwise
 from typing import Final
@@ -22,7 +22,7 @@ def fit_classifier(
     widths: tuple[int, ...],
     steps: int,
     seed: int,
-    weight_decay: float = 3e-3,
+    weight_decay: float,
 ) -> SmallNetwork:
     """Fit a network whose output is the log odds of a wrong row, right and wrong ones being equally frequent.
 

@@ -1,4 +1,4 @@
-"""Check that tells earlier taps of the same contact from taps of another contact or another pose."""
+"""Check that separates earlier taps of the same contact from taps of another contact or another pose."""
 
 from dataclasses import replace
 from itertools import combinations, permutations
@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 
 from edge.inference.familiarity import Check, tap_features
 from edge.inference.small_network import SmallNetwork
+from edge.perception.pattern_check import LEAST_COUNTS
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
-from train.learning.contact_check import LEAST_COUNTS, limit_of, moved
+from train.learning.contact_check import limit_of, moved
 from train.learning.small_classifier import fit_classifier
 from train.physics.sensor_noise import Nuisances
 
+_ROUNDS: Final = 4
+"""Readings of each sequence, and of its mirror image, each by another sensor."""
 _WIDTHS: Final = (192, 96)
 _WEIGHT_DECAY: Final = 0.3
 """So much, because sequences of several taps are few: with a hundredth of it limits rose to seven and more."""
@@ -23,21 +26,20 @@ _DEPTHS: Final = (0.85, 1.15)
 _UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
-def fit_tap_network(presses: PressSet, seed: int = 0, steps: int = 20_000, rounds: int = 4) -> SmallNetwork:
-    """Fit the network to taps turned as the schedule says, and to others.
+def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
+    """Fit the network to taps turned as the schedule states, and to others.
 
     Args:
         presses: sequences of several taps.
         seed: of nuisances, draws and weights.
         steps: of the optimizer.
-        rounds: readings of each sequence, and of its mirror image, each by another sensor.
     """
     rng = np.random.default_rng([seed, 5])
     both = presses, seen_in_a_mirror(presses)
     right, wrong = [], []
-    for number in range(2 * rounds):
+    for number in range(2 * _ROUNDS):
         # Turns keep the direction of the schedule, mirror images alone would not.
-        windows = turned(rng, read_twice(both[number % 2], seed + number))
+        windows = moved(rng, read_twice(both[number % 2], seed + number), mirror=False)
         taps = presses.taps
         for newest, earlier in combinations(range(taps), 2):
             pair, claimed = (windows[:, newest], windows[:, earlier]), earlier - newest
@@ -69,11 +71,6 @@ def read_twice(presses: PressSet, seed: int) -> NDArray[np.float32]:
     angles = np.concatenate([presses.angle_deg, presses.angle_deg[:, :1]], axis=1)
     windows = read_presses(replace(presses, counts=counts, angle_deg=angles), Nuisances(), seed)
     return windows[(windows[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS).all(axis=1)]
-
-
-def turned(rng: np.random.Generator, windows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Turn each window (K, 3, rows, cols) by a quarter turn or several, axes and all."""
-    return moved(rng, windows, mirror=False)
 
 
 def pair_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:

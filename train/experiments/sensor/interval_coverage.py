@@ -1,4 +1,4 @@
-"""Intervals by region, family, level and number of taps, and what is gained by trusting a model's own doubt.
+"""Intervals by region, family, level and number of taps, and the gain by trusting a model's own uncertainty.
 
 The models' intervals were set on validation presses; here they are evaluated on the wide test set, on other pads, and
 outside the conditions of the fit: unseen figures, gratings, a sensor file that is wrong, dead taxels.

@@ -1,4 +1,4 @@
-"""Is a pattern believed where it should be, and doubted where not? The shipped models' checks through the runtime.
+"""Checks of patterns by the shipped models, through the runtime: false alarms, faults detected, and their run time.
 
 The frozen wide test set has set nothing here: networks, checks and limits were fitted on other pads' presses.
 """
@@ -67,7 +67,7 @@ _QUICK: Final = 12
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `trust`.
+    """Write the report `trust-checks`.
 
     Raises:
         CheckpointError: a shipped model has no checks.
@@ -243,7 +243,7 @@ def _stripes(bench: Workbench, model: ModelSession) -> list[Row]:
 
 
 def _told(model: ModelSession, presses: FrozenPresses) -> Row:
-    """Return what deviations tell of the error of presses' patterns, as cells of a row."""
+    """Return the error of presses' patterns and the error that their deviations state, as cells of a row."""
     pushed = [PushedSensor(model, seed=at).touch(counts) for at, counts in enumerate(presses.presses.counts[:, 0])]
     begun = np.array([one.pattern is not None for one in pushed])
     truth, factor = presses.patterns()[begun], model.contract.interval_factor or np.nan

@@ -1,4 +1,4 @@
-"""A taxel that holds its reading during a contact: how soon the runtime says so."""
+"""Taxel that holds its reading during a contact: number of scans until the runtime detects it."""
 
 from typing import Final
 
@@ -33,7 +33,7 @@ def held_rows(model: Model, presses: FrozenPresses) -> list[Row]:
 def _scans_until_stuck(model: Model, presses: FrozenPresses, at: int, options: RuntimeOptions, growth: float) -> int:
     """Return the number of the first repeat whose pattern is flagged: 0 if before any, and beyond all if never.
 
-    A taxel that is dead gives an estimate; that counts as found too.
+    A taxel that is dead gives an estimate; that counts as detected, too.
     """
     counts = presses.presses.counts[at, 0]
     taxel = np.random.default_rng([_SEED, at]).integers(counts[0].size)
