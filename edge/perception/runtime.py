@@ -23,6 +23,8 @@ from edge.perception.tap_tracker import TapTracker
 from edge.validation import check_baselines, check_mountings, check_pads, check_positive
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.pose_track import PoseTrack
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
@@ -134,6 +136,7 @@ class Runtime:
         self._clock_ns = clock_ns
         self._unix_time_s = unix_time_s
         self._sensors: dict[str, Sensor] = {}
+        self._tracks: dict[str | None, PoseTrack] = {}
         self._new_tracker()
 
     @property
@@ -167,6 +170,17 @@ class Runtime:
             self._report("refused", f"zeroing refused: no sensor {name}, there are {known}")
         for sensor in self._sensors.values() if name is None else filter(None, [self._sensors.get(name)]):
             sensor.zero_again(force=force)
+
+    def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
+        """Take a pose of a pad; False if one at the same time or later was taken before.
+
+        Args:
+            pose: of the pad in the object's plane.
+            time_ns: monotonic time of the pose, in [ns].
+            sensor: name of the sensor; None for every sensor without poses of its own.
+            holds: the pad rests there until the next pose.
+        """
+        return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
 
     def lose_touch(self, sensors: str = "") -> None:
         """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.

@@ -21,6 +21,9 @@ def make_press_set(count=12, taps=2, seed=0, per_pad=4) -> PressSet:
             np.float32
         ),
         angle_deg=np.tile(-5.0 * np.arange(taps), (count, 1)).astype(np.float32),
+        poses=np.stack([np.zeros((count, taps))] * 2 + [np.tile(5.0 * np.arange(taps), (count, 1))], axis=2).astype(
+            np.float32
+        ),
         patterns=(dome * depth_mm[:, None, None]).astype(np.float16),
         touching=np.broadcast_to(dome > 0.5, (count, 40, 40)).copy(),
         traction_kpa=(50 * traction * depth_mm[:, None, None, None]).astype(np.float16),

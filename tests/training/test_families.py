@@ -12,9 +12,7 @@ from train.families.shape import NOWHERE_MM, Lie, log_uniform
 from train.physics.covers import BARE
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.physics.pad_draws import NOMINAL
-
-STILL = (0.0, 0.0)
-"""No error of where a tap lands."""
+from train.surfaces.tap_schedules import turns
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +27,7 @@ def level(monkeypatch):
 
 
 def draw(pad, family, seed=0, taps=1):
-    return draw_shape(np.random.default_rng(seed), family, pad, taps, STILL)
+    return draw_shape(np.random.default_rng(seed), family, pad, turns(np.random.default_rng(), taps))
 
 
 def highest(pad, heights_mm):
@@ -91,6 +89,31 @@ def test_a_shape_turns_from_tap_to_tap_as_a_figure_does(pad, level, tmp_path):
             break
         else:
             pytest.fail(f"no {family} lies where its turn can be told")
+
+
+@pytest.mark.parametrize("family", ["glyph", "polygon", "relief", "block"])
+def test_a_tap_sees_the_shape_from_its_pose(pad, family):
+    """Heights from another pose are those of the newest tap at the places that the pose says."""
+    poses = np.array([[0, 0, 0], [2.0, -1.0, 30.0], [-1.5, 2.5, -20.0]])
+    tapped = draw_shape(np.random.default_rng(4), family, pad, poses)
+    assert np.array_equal(tapped.poses, poses) and np.allclose(np.diff(tapped.angle_deg), np.diff(-poses[:, 2]))
+    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
+    step_mm = x_mm[0, 1] - x_mm[0, 0]
+    for (right, down, turn_deg), heights in zip(poses[1:], tapped.heights_mm[1:], strict=True):
+        cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+        col = np.rint((cosine * x_mm - sine * y_mm + right - x_mm[0, 0]) / step_mm).astype(int)
+        row = np.rint((sine * x_mm + cosine * y_mm + down - y_mm[0, 0]) / step_mm).astype(int)
+        inside = (np.minimum(row, col) >= 0) & (np.maximum(row, col) < len(heights))
+        ours = tapped.heights_mm[0][row.clip(0, len(heights) - 1), col.clip(0, len(heights) - 1)]
+        off = np.abs(np.maximum(ours, -3) - np.maximum(heights, -3))[inside]
+        assert np.median(off) < 0.05 and (off < 0.3).mean() > 0.93
+
+
+def test_a_tap_that_would_miss_the_shape_lands_nearer(pad):
+    poses = np.array([[0, 0, 0], [100.0, 0, 10.0]])
+    tapped = draw_shape(np.random.default_rng(1), "solid", pad, poses)
+    assert 0 < tapped.poses[1, 0] < 100 and tapped.poses[1, 2] == 10
+    assert tapped.heights_mm[1].max() > NOWHERE_MM / 2
 
 
 def test_a_tilt_raises_one_side_by_its_slope(pad):

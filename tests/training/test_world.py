@@ -21,6 +21,7 @@ from train.errors import DatasetError
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import MOST_FORCE_N
 from train.physics.pad_draws import INPUTS, Pad, constants
+from train.surfaces.tap_schedules import REACH_MM
 
 SMALL = World(count=14, taps=2, per_pad=5, seed=5)
 
@@ -49,7 +50,8 @@ def test_what_is_made_is_what_was_asked_for(small):
     assert (made.force_n[:, 2] > LEAST_FORCE_N).all() and (made.force_n[:, 2] <= MOST_FORCE_N).all()
     assert (made.indentation_mm <= INDENTATION_MM[1]).all()
     assert made.touching.any(axis=(1, 2)).all() and np.isfinite(made.counts).all()
-    assert np.allclose(np.diff(made.angle_deg, axis=1), -5, atol=4), "a step of the pad, and where it landed"
+    assert np.allclose(made.angle_deg[:, 1] - made.angle_deg[:, 0], -made.poses[:, 1, 2], atol=1e-3)
+    assert not made.poses[:, 0].any() and np.hypot(*made.poses[:, 1, :2].T).max() <= REACH_MM
     for pad in np.unique(made.pad):
         assert len(np.unique(made.constants[made.pad == pad], axis=0)) == 1
     assert len(np.unique(made.constants, axis=0)) == len(np.unique(made.pad))

@@ -25,6 +25,7 @@ from train.data.workers import start_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
+from train.surfaces.tap_schedules import SCHEDULES
 
 _INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16
@@ -114,6 +115,7 @@ def _world(options: argparse.Namespace) -> World:
     return World(
         count=options.count,
         taps=options.taps,
+        schedule=options.schedule,
         per_pad=options.per_pad,
         families=families,
         spread=options.spread,
@@ -127,7 +129,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("out", type=Path, metavar="OUT.npz")
     parser.add_argument("--count", type=int, default=24_000, help="number of sequences (24000)")
-    parser.add_argument("--taps", type=int, default=1, help="presses in each sequence, turned by 5 degrees (1)")
+    parser.add_argument("--taps", type=int, default=1, help="presses in each sequence (1)")
+    parser.add_argument(
+        "--schedule", default="mixed", help=f"poses of a sequence's presses: {', '.join(SCHEDULES)} (mixed)"
+    )
     parser.add_argument("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     parser.add_argument(
         "--families",

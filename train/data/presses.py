@@ -15,8 +15,10 @@ from train.data.array_file import MOST_FACTS_BYTES, Axes, arrays_sha256, check_a
 from train.errors import DatasetError
 
 SCHEMA: Final = "tactile-edge-sr presses"
-VERSION: Final = 2
-"""Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets."""
+VERSION: Final = 3
+"""Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
+_NO_POSES: Final = 2
+"""Version without poses, which is still loaded: its taps were turned at one place."""
 _MOST_BYTES: Final = 1 << 33
 _AXES: Final[Axes] = {
     "family": ("U", "n"),
@@ -24,6 +26,7 @@ _AXES: Final[Axes] = {
     "constants": ("float32", "np"),
     "counts": ("float32", "nk3rc"),
     "angle_deg": ("float32", "nk"),
+    "poses": ("float32", "nk3"),
     "patterns": ("float16", "nhw"),
     "touching": ("bool", "nhw"),
     "traction_kpa": ("float16", "n3ab"),
@@ -42,7 +45,8 @@ class PressSet:
         pad: (n,), number of the pad within the set.
         constants: (n, p) of the pads, over their spread, see train.physics.pad_draws.
         counts: (n, K, 3, rows, cols), zeroed, without nuisances.
-        angle_deg: (n, K), turn of the pad.
+        angle_deg: (n, K), turn of the pad seen from above, for the earth's field.
+        poses: (n, K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
         patterns: (n, H, W) in [mm].
         touching: (n, H, W).
         traction_kpa: (n, 3, h, w).
@@ -57,6 +61,7 @@ class PressSet:
     constants: NDArray[np.float32]
     counts: NDArray[np.float32]
     angle_deg: NDArray[np.float32]
+    poses: NDArray[np.float32]
     patterns: NDArray[np.float16]
     touching: NDArray[np.bool_]
     traction_kpa: NDArray[np.float16]
@@ -81,11 +86,18 @@ class PressSet:
         """Return the sequences with their newest `taps` taps; absent taps are all zeros."""
         more = max(taps - self.taps, 0)
         counts = np.pad(self.counts[:, :taps], [(0, 0), (0, more), (0, 0), (0, 0), (0, 0)])
-        return replace(self, counts=counts, angle_deg=np.pad(self.angle_deg[:, :taps], [(0, 0), (0, more)]))
+        return replace(
+            self,
+            counts=counts,
+            angle_deg=np.pad(self.angle_deg[:, :taps], [(0, 0), (0, more)]),
+            poses=np.pad(self.poses[:, :taps], [(0, 0), (0, more), (0, 0)]),
+        )
 
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""
-        return arrays_sha256(self.config, {name: getattr(self, name) for name in _AXES})
+        # Taps that were only turned have the hash of version 2, by which reports and contracts name their sets.
+        left_out = () if self.poses[..., :2].any() else ("poses",)
+        return arrays_sha256(self.config, {name: getattr(self, name) for name in _AXES if name not in left_out})
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
         """Write the presses as one npz, atomically.
@@ -115,7 +127,9 @@ def load_presses(path: Path) -> PressSet:
                 f"at most {VERSION}: make it with 'python -m train.data.make_presses'"
             )
         facts: Any = json.loads(str(about["facts"]))
-        arrays = dict(read_npz(path, _AXES, _MOST_BYTES))
+        names = [name for name in _AXES if name != "poses" or int(about["version"]) > _NO_POSES]
+        arrays = dict(read_npz(path, names, _MOST_BYTES))
+        arrays.setdefault("poses", _turned(arrays["angle_deg"]))
         width = arrays["patterns"].shape[-1]
         arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
         check_axes(path, _AXES, arrays)
@@ -130,6 +144,13 @@ def load_presses(path: Path) -> PressSet:
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
     return loaded
+
+
+def _turned(angle_deg: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the poses (n, K, 3) of taps at one place, turned by angles (n, K) as seen from above."""
+    poses = np.zeros((*angle_deg.shape, 3), dtype=np.float32)
+    poses[..., 2] = angle_deg[:, :1] - angle_deg
+    return poses
 
 
 def join_presses(parts: Sequence[PressSet]) -> PressSet:

@@ -14,9 +14,9 @@ from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
-from train.physics.sensor_noise import Nuisances
 from train.surfaces.named_surfaces import surface_mesh
 from train.surfaces.poses import MAX_TAPS
+from train.surfaces.tap_schedules import SCHEDULES
 
 INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
@@ -36,7 +36,8 @@ class World:
 
     Attributes:
         count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out.
-        taps: presses in each sequence, with the pad turned by a step from one to the next.
+        taps: presses in each sequence.
+        schedule: of the taps' poses, one of train.surfaces.tap_schedules.SCHEDULES.
         per_pad: sequences of one pad.
         families: relative frequency of each family.
         spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
@@ -45,6 +46,7 @@ class World:
 
     count: int = 24_000
     taps: int = 1
+    schedule: str = "mixed"
     per_pad: int = 24
     families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))
     spread: float = 1.0
@@ -56,6 +58,8 @@ class World:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected 1 or more")
         if self.taps > MAX_TAPS:
             raise DatasetError(f"taps is {self.taps}, expected 1 to {MAX_TAPS}")
+        if self.schedule not in SCHEDULES:
+            raise DatasetError(f"no schedule {self.schedule!r}: expected one of {', '.join(SCHEDULES)}")
         if not 0 <= self.spread <= 1:
             raise DatasetError(f"spread is {self.spread}, expected 0 to 1")
         if self.seed < 0:
@@ -101,10 +105,8 @@ def solve_pad(world: World, number: int) -> PressSet:
     order = np.random.default_rng([world.seed, 0, 1]).permutation(world.count)[number * world.per_pad :][:count]
     at = (order + 0.5) / world.count
     family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
-    error = Nuisances()
-    tapped = [
-        draw_shape(rng, str(name), gripped, world.taps, (error.pose_error_mm, error.pose_error_deg)) for name in family
-    ]
+    schedule = SCHEDULES[world.schedule]
+    tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
     made = press_shapes(rng, gripped, family, tapped, number)
     return made.pick((made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2)))
 
@@ -136,6 +138,7 @@ def press_shapes(
         constants=np.tile(constants(gripped.pad), (n, 1)),
         counts=done.counts.reshape(n, taps, *done.counts.shape[1:]),
         angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32),
+        poses=np.array([one.poses for one in tapped], dtype=np.float32),
         patterns=done.patterns[newest].astype(np.float16),
         touching=done.touching[newest],
         traction_kpa=done.traction_kpa[newest].astype(np.float16),

@@ -1,7 +1,7 @@
 """All families of shapes by name, their frequencies, and the drawing of one shape under the pad."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from train.errors import SurfaceError
 from train.families import faces, rounds, solids
-from train.families.shape import Height, Lie, log_uniform
+from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.surfaces.depth_image import Relief, footprints
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
-from train.surfaces.poses import ANGLE_STEP_DEG, as_poses, random_targets, turned_back
+from train.surfaces.poses import over_surface, random_targets
 
 SHAPES: Final[Mapping[str, Callable[[np.random.Generator], Height]]] = {
     **{maker.__name__: maker for maker in (faces.flat, faces.block, faces.edge, faces.corner, faces.slot, faces.step)},
@@ -64,54 +64,67 @@ class Tapped:
     Attributes:
         heights_mm: (K, m, m) at the pad's places, newest tap first.
         cover: compliant cover of the shape or the pad.
-        angle_deg: (K,), turn of the pad in each tap.
+        poses: (K, 3) of the pad in the newest tap's axes, see `firmware_bridge.scans.pad_pose`.
+        angle_deg: (K,), turn of the pad seen from above, for the earth's field.
     """
 
     heights_mm: NDArray[np.float32]
     cover: Cover
+    poses: NDArray[np.float64]
     angle_deg: NDArray[np.float64]
 
 
-def draw_shape(
-    rng: np.random.Generator, family: str, pad: GrippedPad, taps: int, pose_error: tuple[float, float]
-) -> Tapped:
-    """Draw one shape of a family, tapped from poses that are one step of the paper's schedule apart.
+def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: NDArray[np.float64]) -> Tapped:
+    """Draw one shape of a family, tapped from poses.
 
     Args:
         rng: draws the shape and where it lies.
         family: a key of SHARES, or `mesh:PATH`, a user's surface.
         pad: the pad that taps.
-        taps: number of taps, K.
-        pose_error: standard deviations of a tap's place, in [mm], and angle, in [deg].
+        poses: (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
 
     Raises:
         SurfaceError: nothing of a user's mesh lies under the pad.
         MeshError: the user's mesh cannot be used.
     """
     if family in FIGURES or family.startswith("mesh:"):
-        return _draw_figure(rng, family, pad, taps, pose_error)
+        return _draw_figure(rng, family, pad, poses)
     if family == "soft":
-        inner = draw_shape(rng, _another(rng), pad, taps, pose_error)
-        return Tapped(inner.heights_mm, Cover(soft_mpa=round(log_uniform(rng, 0.05, 2), 3)), inner.angle_deg)
+        inner = draw_shape(rng, _another(rng), pad, poses)
+        return replace(inner, cover=Cover(soft_mpa=round(log_uniform(rng, 0.05, 2), 3)))
     if family == "glove":
-        inner = draw_shape(rng, _another(rng), pad, taps, pose_error)
-        return Tapped(inner.heights_mm, Cover(0.0, rng.uniform(0.2, 1.0), log_uniform(rng, 0.3, 3)), inner.angle_deg)
+        inner = draw_shape(rng, _another(rng), pad, poses)
+        return replace(inner, cover=Cover(0.0, rng.uniform(0.2, 1.0), log_uniform(rng, 0.3, 3)))
     parts = [SHAPES[family]] if family != "two" else [SHAPES[name] for name in rng.choice(_PAIRED, 2)]
     heights = [maker(rng) for maker in parts]
     places = [_lie(rng, family, index) for index in range(len(parts))]
-    angle = -ANGLE_STEP_DEG * np.arange(taps, dtype=np.float64)
-    off = rng.standard_normal((taps, 3)).clip(-2, 2) * (pose_error[0], pose_error[0], pose_error[1])
     x, y = np.broadcast_arrays(*pad.places_mm)
-    maps = []
-    for turn, (x_mm, y_mm, more) in zip(angle, off, strict=True):
-        seen = [
-            _turned(lie, turn + more, x_mm, y_mm).seen(height, x, y)
-            for height, lie in zip(heights, places, strict=True)
-        ]
-        maps.append(np.maximum.reduce(seen))
-    return Tapped(np.stack(maps), BARE, angle)
+
+    def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:
+        seen = [_under(lie, pose).seen(height, x, y) for height, lie in zip(heights, places, strict=True)]
+        return np.maximum.reduce(seen)
+
+    maps, met = _that_meet(poses, seen_from)
+    return Tapped(np.stack(maps), BARE, met, -met[:, 2])
 
 
+def _that_meet(
+    poses: NDArray[np.float64], seen_from: Callable[[NDArray[np.float64]], NDArray[np.float32]]
+) -> tuple[list[NDArray[np.float32]], NDArray[np.float64]]:
+    """Return the heights from each pose, and the poses: one that misses the shape moves half-way to the newest."""
+    maps, met = [], poses.copy()
+    for pose in met:
+        heights_mm = seen_from(pose)
+        for _ in range(_MOST_TRIES):
+            if heights_mm.max() > NOWHERE_MM / 2:
+                break
+            pose[:2] /= 2
+            heights_mm = seen_from(pose)
+        maps.append(heights_mm)
+    return maps, met
+
+
+_MOST_TRIES: Final = 6
 _PAIRED: Final = ("block", "edge", "dome", "cylinder", "wire", "cone", "solid")
 """Shapes of which two may be under the pad at once."""
 
@@ -136,39 +149,39 @@ def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
     return Lie(float(x_mm), float(y_mm), float(rng.uniform(0, 360)), float(slope[0]), float(slope[1]))
 
 
-def _turned(lie: Lie, turn_deg: float, x_mm: float, y_mm: float) -> Lie:
-    """Return the shape's place as a pad sees it that was turned about its centre and then moved.
-
-    In the pad's axes, x to the right and y down, a shape turns as the pad does seen from above
-    (train.surfaces.depth_image.Pose).
-    """
-    turn = np.radians(turn_deg)
+def _under(lie: Lie, pose: NDArray[np.float64]) -> Lie:
+    """Return a shape's place under a pad at a pose, of its place under the newest tap."""
+    turn = -np.radians(pose[2])
     cosine, sine = np.cos(turn), np.sin(turn)
-    right, down = cosine * lie.x_mm - sine * lie.y_mm, sine * lie.x_mm + cosine * lie.y_mm
+    x_mm, y_mm = lie.x_mm - pose[0], lie.y_mm - pose[1]
+    right, down = cosine * x_mm - sine * y_mm, sine * x_mm + cosine * y_mm
     slope_x, slope_y = cosine * lie.slope_x - sine * lie.slope_y, sine * lie.slope_x + cosine * lie.slope_y
-    return Lie(float(right - x_mm), float(down - y_mm), lie.angle_deg + turn_deg, float(slope_x), float(slope_y))
+    return Lie(float(right), float(down), lie.angle_deg - float(pose[2]), float(slope_x), float(slope_y))
 
 
-def _draw_figure(
-    rng: np.random.Generator, family: str, pad: GrippedPad, taps: int, pose_error: tuple[float, float]
-) -> Tapped:
+def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: NDArray[np.float64]) -> Tapped:
     name = family
     if family == "paper":
         name = str(rng.choice(SURFACES))
     elif family in FIGURES:
         name = f"{family}:{int(rng.integers(_FIGURES_PER_SEED, 2**40))}"
-    poses = turned_back(random_targets(rng, 1, [name]), taps)[0]
-    poses = poses + rng.standard_normal((taps, 3)).clip(-2, 2) * (pose_error[0], pose_error[0], pose_error[1])
-    relief = _relief(name)
-    try:
-        seen = footprints([relief] * taps, as_poses(poses), pad.size * SAMPLES, pad.cell_mm / SAMPLES)
-    except ValueError as error:  # a user's mesh is a ring, or smaller than the poses' reach
-        raise SurfaceError(f"{error}; tap a surface that has no hole as wide as the pad") from error
-    heights = -seen.depth_mm
+    newest, relief = random_targets(rng, 1, [name]).poses[0], _relief(name)
+
+    def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:
+        over = over_surface(newest, *pose.tolist())
+        try:
+            return -footprints([relief], [over], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm[0]
+        except ValueError as error:  # a user's mesh is a ring, or smaller than the poses' reach
+            if pose[:2].any():
+                return np.full((pad.size * SAMPLES,) * 2, NOWHERE_MM, dtype=np.float32)
+            raise SurfaceError(f"{error}; tap a surface that has no hole as wide as the pad") from error
+
+    maps, met = _that_meet(poses, seen_from)
+    heights = np.stack(maps)
     if rng.random() > _LEVEL:
         slope = rng.uniform(-_FIGURE_SLOPE, _FIGURE_SLOPE, 2).astype(np.float32)
         heights = heights + slope[0] * pad.places_mm[0] + slope[1] * pad.places_mm[1]
-    return Tapped(heights, BARE, poses[:, 2])
+    return Tapped(heights, BARE, met, newest.angle_deg - met[:, 2])
 
 
 @lru_cache(maxsize=64)

@@ -108,6 +108,17 @@ def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_
     return newest - back
 
 
+def over_surface(newest: Pose, x_mm: float, y_mm: float, turn_deg: float) -> Pose:
+    """Return the pose over the surface of a pad at a place and a turn in the newest tap's axes.
+
+    The pad faces the surface, so its y points the other way, and it turns the other way as well.
+    """
+    angle = np.radians(newest.angle_deg)
+    cosine, sine = float(np.cos(angle)), float(np.sin(angle))
+    right_mm, up_mm = cosine * x_mm + sine * y_mm, sine * x_mm - cosine * y_mm
+    return Pose(newest.x_mm + right_mm, newest.y_mm + up_mm, newest.angle_deg - turn_deg)
+
+
 def as_poses(array: NDArray[np.floating]) -> list[Pose]:
     """Return the poses of an array (..., 3), in order."""
     return [Pose(*(float(value) for value in row)) for row in array.reshape(-1, 3)]

@@ -25,7 +25,6 @@ from train.experiments.support.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import INPUTS, NOMINAL, Pad
-from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 
@@ -121,10 +120,9 @@ def loss_rows(scores: dict[str, dict[OffPad, NDArray[np.float64]]], off: list[Of
 def draw_shapes(count: int) -> list[tuple[str, Tapped]]:
     """Draw shapes under the pad with their families; all pads have the same cells, and so the same heights."""
     rng = np.random.default_rng(SHAPES_SEED)
-    gripped, error = GrippedPad(NOMINAL), Nuisances()
+    gripped, one_tap = GrippedPad(NOMINAL), np.zeros((1, 3))
     families = [("paper", "glyph", "paper", "polygon")[number % 4] for number in range(count)]
-    sd = (error.pose_error_mm, error.pose_error_deg)
-    return [(family, draw_shape(rng, family, gripped, 1, sd)) for family in families]
+    return [(family, draw_shape(rng, family, gripped, one_tap)) for family in families]
 
 
 @one_thread()

@@ -159,6 +159,7 @@ def _as_set(done: Presses, pad: Pad, number: int) -> PressSet:
         constants=constants(pad)[None],
         counts=done.counts[:, None],
         angle_deg=np.zeros((1, 1), dtype=np.float32),
+        poses=np.zeros((1, 1, 3), dtype=np.float32),
         patterns=done.patterns.astype(np.float16),
         touching=done.touching,
         traction_kpa=done.traction_kpa.astype(np.float16),

@@ -40,7 +40,7 @@ def _pressed(period_mm: float, pads: int, per_pad: int) -> PressSet:
             Lie(angle_deg=float(rng.uniform(0, 180)), x_mm=float(rng.uniform(0, period_mm))) for _ in range(per_pad)
         ]
         maps = [lie.seen(_bars(period_mm), x_mm, y_mm) for lie in lies]
-        tapped = [Tapped(one[None], BARE, np.zeros(1)) for one in maps]
+        tapped = [Tapped(one[None], BARE, np.zeros((1, 3)), np.zeros(1)) for one in maps]
         parts.append(press_shapes(rng, gripped, np.full(per_pad, f"{period_mm:g} mm"), tapped, number))
     return join_presses(parts)
 

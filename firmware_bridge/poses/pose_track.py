@@ -1,0 +1,86 @@
+"""Course of a pad's pose: bounded, and interpolated to the time of a scan."""
+
+from bisect import bisect_right
+from collections import deque
+from dataclasses import replace
+from math import hypot
+from typing import Final
+
+from firmware_bridge.poses.pad_pose import PadPose
+
+MOST_POSES: Final = 4096
+"""Poses that are remembered: 40 s at 100 poses/s, longer than any tap lasts."""
+GAP_NS: Final = 200_000_000
+"""Longest time between two poses that is interpolated, in [ns]."""
+AHEAD_NS: Final = 50_000_000
+"""Longest time for which the course goes on after the last pose, in [ns]: a scan may arrive first."""
+
+
+class PoseTrack:
+    """Poses of one pad with their times, of which the newest MOST_POSES are remembered."""
+
+    def __init__(self) -> None:
+        self._times_ns: deque[int] = deque(maxlen=MOST_POSES)
+        self._poses: deque[tuple[PadPose, bool]] = deque(maxlen=MOST_POSES)
+
+    def __len__(self) -> int:
+        return len(self._times_ns)
+
+    def add(self, time_ns: int, pose: PadPose, *, holds: bool = False) -> bool:
+        """Add a pose; False, and nothing is added, if one at the same time or later was added before.
+
+        Args:
+            time_ns: monotonic time of the pose, in [ns].
+            pose: of the pad.
+            holds: the pad rests there until the next pose, however long that takes.
+        """
+        if self._times_ns and time_ns <= self._times_ns[-1]:
+            return False
+        self._times_ns.append(time_ns)
+        self._poses.append((pose, holds))
+        return True
+
+    def clear(self) -> None:
+        """Forget all poses, as for a new object."""
+        self._times_ns.clear()
+        self._poses.clear()
+
+    def at(self, time_ns: int) -> PadPose | None:
+        """Return the pose at a time; None before the first pose, in a gap, and too long after the last one."""
+        times_ns = self._times_ns
+        # Nearly all scans are as new as the newest poses, so a search from the end is short.
+        after = len(times_ns)
+        if after and time_ns < times_ns[-1]:
+            after = bisect_right(times_ns, time_ns)
+        if not after:
+            return None
+        pose, holds = self._poses[after - 1]
+        since_ns = time_ns - times_ns[after - 1]
+        if holds or not since_ns:
+            return pose
+        if after < len(times_ns):
+            return self._between(after - 1, after, time_ns)
+        if since_ns > AHEAD_NS:
+            return None
+        if after < 2 or self._poses[after - 2][1]:
+            return pose
+        ahead = self._between(after - 2, after - 1, time_ns)
+        if ahead is None:
+            return pose
+        # As far as it is extrapolated it is uncertain.
+        return replace(ahead, error_mm=hypot(ahead.error_mm, ahead.x_mm - pose.x_mm, ahead.y_mm - pose.y_mm))
+
+    def _between(self, first: int, second: int, time_ns: int) -> PadPose | None:
+        start_ns, end_ns = self._times_ns[first], self._times_ns[second]
+        if end_ns - start_ns > GAP_NS:
+            return None
+        share = (time_ns - start_ns) / (end_ns - start_ns)
+        one, other = self._poses[first][0], self._poses[second][0]
+        turned_deg = (other.turn_deg - one.turn_deg + 180) % 360 - 180  # the shorter way round
+        return PadPose(
+            one.x_mm + share * (other.x_mm - one.x_mm),
+            one.y_mm + share * (other.y_mm - one.y_mm),
+            one.turn_deg + share * turned_deg,
+            max(one.error_mm, other.error_mm),
+            max(one.error_deg, other.error_deg),
+        )

@@ -1,0 +1,77 @@
+"""Poses of a pad: in another's axes and back, and their course over time."""
+
+import numpy as np
+import pytest
+
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.pose_track import AHEAD_NS, GAP_NS, MOST_POSES, PoseTrack
+
+MS = 1_000_000
+
+
+def turned(turn_deg):
+    turn = np.radians(turn_deg)
+    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+
+def test_a_pose_seen_from_another_gives_the_place_on_the_object_again():
+    newest, earlier = PadPose(12.0, -3.0, 100.0), PadPose(13.5, -1.0, -170.0)
+    seen = earlier.seen_from(newest)
+    back = turned(newest.turn_deg) @ (seen.x_mm, seen.y_mm) + (newest.x_mm, newest.y_mm)
+    assert back == pytest.approx([13.5, -1.0]) and seen.turn_deg == pytest.approx(90.0)
+    assert seen.error_mm == pytest.approx(np.hypot(0.2, 0.2)) and seen.error_deg == pytest.approx(np.hypot(1, 1))
+
+
+@pytest.mark.parametrize("name", ["x_mm", "y_mm", "turn_deg", "error_mm", "error_deg"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 2e6])
+def test_a_number_that_is_none_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=f"{name} is"):
+        PadPose(**({"x_mm": 0.0, "y_mm": 0.0} | {name: value}))
+
+
+def test_an_error_below_zero_is_refused():
+    with pytest.raises(ValueError, match="error_mm is -1"):
+        PadPose(0, 0, error_mm=-1)
+
+
+def test_a_pose_between_two_is_interpolated_the_shorter_way_round():
+    track = PoseTrack()
+    track.add(0, PadPose(0, 0, 175))
+    track.add(100 * MS, PadPose(2, -4, -175))
+    pose = track.at(25 * MS)
+    assert (pose.x_mm, pose.y_mm) == pytest.approx((0.5, -1.0)) and pose.turn_deg == pytest.approx(177.5)
+
+
+def test_there_is_no_pose_before_the_first_in_a_gap_and_long_after_the_last():
+    track = PoseTrack()
+    assert track.at(0) is None
+    track.add(10 * MS, PadPose(0, 0))
+    track.add(10 * MS + 2 * GAP_NS, PadPose(5, 0))
+    assert track.at(9 * MS) is None and track.at(10 * MS + GAP_NS) is None
+    assert track.at(10 * MS + 2 * GAP_NS + AHEAD_NS + 1) is None
+
+
+def test_shortly_after_the_last_pose_the_course_goes_on_with_a_larger_error():
+    track = PoseTrack()
+    track.add(0, PadPose(0, 0, error_mm=0))
+    track.add(10 * MS, PadPose(1, 0, error_mm=0))
+    pose = track.at(15 * MS)
+    assert pose.x_mm == pytest.approx(1.5) and pose.error_mm == pytest.approx(0.5)
+
+
+def test_a_pose_that_holds_is_that_of_all_times_until_the_next():
+    track = PoseTrack()
+    track.add(0, PadPose(1, 2), holds=True)
+    assert track.at(10**12) == PadPose(1, 2)
+    track.add(10**12, PadPose(3, 2))
+    assert track.at(10**12 - 1) == PadPose(1, 2) and track.at(10**12 + MS) == PadPose(3, 2)
+
+
+def test_a_pose_that_is_not_later_is_not_taken_and_memory_is_bounded():
+    track = PoseTrack()
+    assert track.add(5, PadPose(0, 0)) and not track.add(5, PadPose(1, 0)) and not track.add(4, PadPose(1, 0))
+    for at in range(6, 2 * MOST_POSES):
+        track.add(at, PadPose(0, 0))
+    assert len(track) == MOST_POSES
+    track.clear()
+    assert len(track) == 0 and track.at(7) is None

@@ -1,0 +1,66 @@
+"""Schedules of taps: newest first, within reach, each as its name states."""
+
+import numpy as np
+import pytest
+
+from train.data.presses import PressSet, load_presses
+from train.data.world import World, solve_pad
+from train.errors import DatasetError
+from train.surfaces.poses import MAX_TAPS
+from train.surfaces.tap_schedules import HALF_PITCH_MM, NEAR_DEG, NEAR_MM, REACH_MM, SCHEDULES
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_every_schedule_begins_at_the_newest_tap_and_stays_within_reach(name):
+    for seed in range(30):
+        poses = SCHEDULES[name](np.random.default_rng(seed), MAX_TAPS)
+        assert poses.shape == (MAX_TAPS, 3) and not poses[0].any()
+        assert np.hypot(*poses[:, :2].T).max() <= REACH_MM + 1e-9
+        assert SCHEDULES[name](np.random.default_rng(seed), 1).shape == (1, 3)
+
+
+def test_half_pitch_taps_make_the_grid_twice_as_fine_first():
+    for seed in range(10):
+        places = SCHEDULES["half-pitch"](np.random.default_rng(seed), MAX_TAPS)[:, :2] / HALF_PITCH_MM
+        assert len({tuple(place) for place in places.round(6).tolist()}) == MAX_TAPS
+        four = {tuple(place) for place in np.abs(places[:4]).round(6).tolist()}
+        assert four == {(0, 0), (1, 0), (0, 1), (1, 1)}
+
+
+def test_turns_are_the_papers_and_near_poses_are_within_their_bounds():
+    assert np.allclose(SCHEDULES["turns"](np.random.default_rng(0), 3), [[0, 0, 0], [0, 0, 5], [0, 0, 10]])
+    poses = np.concatenate([SCHEDULES["near"](np.random.default_rng(seed), MAX_TAPS) for seed in range(40)])
+    assert 0.9 * NEAR_MM < np.hypot(*poses[:, :2].T).max() <= NEAR_MM
+    assert 0.9 * NEAR_DEG < np.abs(poses[:, 2]).max() <= NEAR_DEG
+
+
+def test_a_slide_goes_one_way_in_even_steps():
+    steps = np.diff(SCHEDULES["slide"](np.random.default_rng(3), 5), axis=0)
+    assert np.allclose(steps, steps[0]) and np.hypot(*steps[0, :2]) > 0.1
+
+
+def test_an_unknown_schedule_is_refused():
+    with pytest.raises(DatasetError, match="no schedule 'spiral': expected one of turns, half-pitch"):
+        World(schedule="spiral")
+
+
+def test_a_file_of_version_2_has_the_poses_of_its_turns_and_its_hash(tmp_path):
+    made = solve_pad(World(count=3, taps=3, per_pad=3, seed=5, schedule="turns"), 0)
+    made.save(tmp_path / "new.npz")
+    with np.load(tmp_path / "new.npz") as new:
+        old = {name: new[name] for name in new.files if name != "poses"} | {"version": 2}
+    np.savez(tmp_path / "old.npz", **old)
+    loaded = load_presses(tmp_path / "old.npz")
+    assert isinstance(loaded, PressSet) and loaded.sha256() == made.sha256()
+    assert np.allclose(loaded.poses, made.poses, atol=1e-3)
+
+
+def test_shifted_poses_are_part_of_the_hash(tmp_path):
+    made = solve_pad(World(count=3, taps=3, per_pad=3, seed=5, schedule="half-pitch"), 0)
+    made.save(tmp_path / "new.npz")
+    with np.load(tmp_path / "new.npz") as new:
+        changed = {name: new[name] for name in new.files}
+    changed["poses"] = changed["poses"] * np.float32(1.1)
+    np.savez(tmp_path / "new.npz", **changed)
+    with pytest.raises(DatasetError, match="is damaged"):
+        load_presses(tmp_path / "new.npz")
