@@ -49,7 +49,7 @@ class Played:
                 else:
                     self.pieces += self.injector.corrupt(encode_frame(sent.frame), sent)
         for piece in self.pieces:
-            self.truth.hand_on(piece, len(piece.data), 0)
+            self.truth.hand_on(piece, len(piece.data), 0, 0)
         self.truth.settle(0)
         self.told = np.frombuffer(b"".join(rows), dtype=ROW)
         self.scans = []
@@ -192,7 +192,7 @@ def test_what_finds_no_room_is_lost_and_the_rest_of_its_line_is_noise():
     line = encode_frame(frame)
     sent = BusFrame(0.0, frame, 0)
     for written in (len(line), 5, 0, len(line)):
-        truth.hand_on(Piece(line, sent), written, 0)
+        truth.hand_on(Piece(line, sent), written, 0, 0)
     truth.settle(0)
     assert truth.fates == Counter(intact=2, overflow=2)
     assert truth.counters() == {"frames": 2, "foreign": 0, "bad_lines": 0, "skipped_bytes": 5, "duplicates": 1}
@@ -204,7 +204,7 @@ def test_what_lies_unread_when_a_reader_leaves_was_never_read(unread):
     frames = [CanFrame(can_id, bytes(8)) for can_id in (0x004, 0x014)]
     truth.open_channel()
     for frame in frames:
-        truth.hand_on(Piece(encode_frame(frame), BusFrame(0.0, frame, 0)), 22, 0)
+        truth.hand_on(Piece(encode_frame(frame), BusFrame(0.0, frame, 0)), 22, 0, 0)
     reader.feed(b"".join(map(encode_frame, frames))[: 44 - unread], 0)
     truth.close_channel(unread)
     truth.open_channel()
@@ -217,7 +217,7 @@ def test_what_lies_unread_when_a_reader_leaves_was_never_read(unread):
 def test_what_the_kernel_may_not_have_counted_yet_is_not_taken_for_read():
     truth, frame = Truth(), CanFrame(0x004, bytes(8))
     for time_ns in (0, 5, 10):
-        truth.hand_on(Piece(encode_frame(frame), BusFrame(0.0, frame, 0)), 22, time_ns)
+        truth.hand_on(Piece(encode_frame(frame), BusFrame(0.0, frame, 0)), 22, time_ns, time_ns)
     truth.settle(22, counted_ns=5)  # one is counted; the last may be that one, or wait there after it
     assert truth.frames == 1
     truth.close_channel(44)
@@ -232,11 +232,11 @@ def test_what_a_client_left_is_counted_whenever_the_kernel_counts_it(monkeypatch
 
 def test_answers_are_no_bad_lines_unless_they_end_one():
     truth = Truth()
-    truth.hand_on(Piece(b"V1013\r\r\a", None, answer=True), 8, 0)
+    truth.hand_on(Piece(b"V1013\r\r\a", None, answer=True), 8, 0, 0)
     truth.settle(0)
     assert truth.bad_lines == 0 and truth.noise == 0
-    truth.hand_on(Piece(b"t00", None), 3, 0)
-    truth.hand_on(Piece(b"\r", None, answer=True), 1, 0)
+    truth.hand_on(Piece(b"t00", None), 3, 0, 0)
+    truth.hand_on(Piece(b"\r", None, answer=True), 1, 0, 0)
     truth.settle(0)
     assert (truth.bad_lines, truth.skipped_bytes, truth.noise) == (1, 3, 1)
 

@@ -76,10 +76,11 @@ class FaultyEmulator(Emulator):
     def _send(self, pieces: Sequence[Piece], now_ns: int) -> None:
         """Write pieces, and report to the truth how much of each went out."""
         room = self._line.write(b"".join(piece.data for piece in pieces))
+        written_ns = time.monotonic_ns()
         for piece in pieces:
             written = min(max(room, 0), len(piece.data))
             room -= len(piece.data)
-            self._truth.hand_on(piece, written, now_ns)
+            self._truth.hand_on(piece, written, now_ns, written_ns)
             self.sent_frames += room >= 0 and piece.sent is not None
             self.lost_frames += room < 0 and piece.sent is not None
 

@@ -27,7 +27,8 @@ class Forged:
             for at, (can_id, taxel) in enumerate(USPA44_MAP.wire_order("4")):
                 row = self.rows[16 * cycle + at]
                 row["can_id"], row["cycle"], row["bus_us"] = can_id, cycle, 10_000 * cycle + 130 * at
-                row["handed_ns"], row["xyz"] = PERIOD_NS * cycle + 130_000 * at, counts[cycle, :, taxel]
+                row["handed_ns"] = row["written_ns"] = PERIOD_NS * cycle + 130_000 * at
+                row["xyz"] = counts[cycle, :, taxel]
             self.seen.append(self.record(cycle, counts[cycle].T))
 
     def record(self, number: int, counts: np.ndarray, **changes) -> Seen:

@@ -19,26 +19,28 @@ class SentTaxel:
     """The readings of one taxel that were handed on, in order, and how far records have shown them.
 
     Attributes:
-        rows: fate, time on the bus in [us], time of handing on in [ns].
+        rows: fate, time on the bus in [us], times before and after handing on in [ns].
         next: the first row that no record can have shown yet.
         shown: the row that was shown last; -1 before.
     """
 
     def __init__(self) -> None:
         """Begin without readings."""
-        self.rows: list[tuple[int, int, int]] = []
+        self.rows: list[tuple[int, int, int, int]] = []
         self._cycles: list[int] = []
         self._readings: list[tuple[int, int, int]] = []
         self.next = 0
         self.shown = -1
         self._places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
 
-    def add(self, reading: tuple[int, int, int], fate: int, bus_us: int, handed_ns: int, cycle: int) -> None:
+    def add(
+        self, reading: tuple[int, int, int], fate: int, bus_us: int, handed_ns: int, written_ns: int, cycle: int
+    ) -> None:
         """Append one: as `rows`, and the number of the sensor's cycle."""
         self._cycles.append(cycle)
         self._places[reading].append(len(self.rows))
         self._readings.append(reading)
-        self.rows.append((fate, bus_us, handed_ns))
+        self.rows.append((fate, bus_us, handed_ns, written_ns))
 
     def show(self, reading: tuple[int, int, int]) -> bool:
         """Go on to the next row of this reading; False if there is none."""
@@ -90,7 +92,8 @@ def handed_on(told: Told) -> dict[tuple[str, int], SentTaxel]:
     frames = told.frames[told.frames["fate"] < len(READ)]
     frames = frames[np.isin(frames["can_id"], list(USPA44_MAP.taxels))]
     taxels: dict[tuple[str, int], SentTaxel] = defaultdict(SentTaxel)
-    columns = (frames[name].tolist() for name in ("can_id", "xyz", "fate", "bus_us", "handed_ns", "cycle"))
+    names = ("can_id", "xyz", "fate", "bus_us", "handed_ns", "written_ns", "cycle")
+    columns = (frames[name].tolist() for name in names)
     for can_id, (x, y, z), *row in zip(*columns, strict=True):
         taxels[USPA44_MAP.taxels[can_id]].add((x, y, z), *row)
     return taxels

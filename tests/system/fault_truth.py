@@ -28,6 +28,7 @@ was closed; sent while no channel was open."""
 ROW: Final = np.dtype(
     [
         ("handed_ns", "<i8"),
+        ("written_ns", "<i8"),
         ("bus_us", "<i8"),
         ("cycle", "<u4"),
         ("can_id", "<u2"),
@@ -37,9 +38,9 @@ ROW: Final = np.dtype(
     ],
     align=False,
 )
-"""Row of a frame in a log: monotonic time at which it was handed on, in [ns]; time on the bus, in [us] since the first
+"""Row of a frame in a log: monotonic times before and after it was handed on, in [ns]; time on the bus, in [us] since the first
 scan; cycle and id; the reading that the reader gets; openings of the channel so far; and the number of its fate."""
-_pack = struct.Struct("<qqIH3HHB").pack
+_pack = struct.Struct("<qqqIH3HHB").pack
 _xyz = struct.Struct(">xHHHx").unpack
 _FATE_NUMBERS: Final = {fate: number for number, fate in enumerate(FATES)}
 
@@ -69,7 +70,7 @@ class Truth:
         self.openings = 0
         self.noise = 0
         self._log = log
-        self._on_the_way: deque[tuple[Piece, int, int]] = deque()
+        self._on_the_way: deque[tuple[Piece, int, int, int]] = deque()
         self._on_the_way_bytes = 0
         self._pending = 0
         self._last: dict[str, tuple[int, tuple[int, ...]]] = {}
@@ -79,12 +80,12 @@ class Truth:
         names = ("frames", "foreign", "bad_lines", "skipped_bytes", "duplicates")
         return {name: getattr(self, name) for name in names}
 
-    def hand_on(self, piece: Piece, written_bytes: int, time_ns: int) -> None:
-        """Record a piece that went out, as far as there was room for it."""
+    def hand_on(self, piece: Piece, written_bytes: int, time_ns: int, written_ns: int) -> None:
+        """Record a piece that went out, as far as there was room for it, between two monotonic times in [ns]."""
         if written_bytes < len(piece.data) and piece.sent is not None and not piece.sent.lost:
             piece = piece._replace(sent=piece.sent._replace(fate="overflow"))
         self.noise += piece.sent is None and not piece.answer
-        self._on_the_way.append((piece, written_bytes, time_ns))
+        self._on_the_way.append((piece, written_bytes, time_ns, written_ns))
         self._on_the_way_bytes += written_bytes
 
     def settle(self, unread_bytes: int, counted_ns: float = math.inf) -> None:
@@ -95,11 +96,11 @@ class Truth:
             counted_ns: monotonic time in [ns]; the kernel may not have counted all bytes handed on later.
         """
         young = takewhile(lambda one: one[2] > counted_ns, reversed(self._on_the_way))
-        unread_bytes += sum(written_bytes for _, written_bytes, _ in young)
+        unread_bytes += sum(written_bytes for _, written_bytes, *_ in young)
         while self._on_the_way and self._on_the_way_bytes - self._on_the_way[0][1] >= unread_bytes:
-            piece, written_bytes, time_ns = self._on_the_way.popleft()
+            piece, written_bytes, time_ns, written_ns = self._on_the_way.popleft()
             self._on_the_way_bytes -= written_bytes
-            self._read(piece, written_bytes, time_ns)
+            self._read(piece, written_bytes, time_ns, written_ns)
 
     def open_channel(self) -> None:
         """Note that the reader begins again: its unfinished line belongs to no frame."""
@@ -111,7 +112,7 @@ class Truth:
     def close_channel(self, unread_bytes: int) -> None:
         """Note that the reader has gone and left `unread_bytes`."""
         self.settle(unread_bytes)
-        for piece, written_bytes, time_ns in self._on_the_way:
+        for piece, written_bytes, time_ns, _ in self._on_the_way:
             fetched = max(0, self._on_the_way_bytes - unread_bytes)
             self._pending += fetched  # at most the head of a line, since whole pieces are settled
             self._on_the_way_bytes -= written_bytes
@@ -124,18 +125,18 @@ class Truth:
 
     def lose(self, sent: BusFrame, time_ns: int) -> None:
         """Record a frame without a byte that is read, with the fate of its loss."""
-        self._keep(sent, time_ns)
+        self._keep(sent, time_ns, time_ns)
 
-    def _read(self, piece: Piece, written_bytes: int, time_ns: int) -> None:
+    def _read(self, piece: Piece, written_bytes: int, time_ns: int, written_ns: int) -> None:
         sent = piece.sent
         if sent is not None and not sent.lost:
             self.skipped_bytes += self._pending
             self._pending = 0
             self.frames += 1
-            self._keep(sent, time_ns)
+            self._keep(sent, time_ns, written_ns)
             return
         if sent is not None:
-            self._keep(sent, time_ns)
+            self._keep(sent, time_ns, written_ns)
         if piece.answer and not self._pending:
             return
         for byte in piece.data[:written_bytes]:
@@ -146,7 +147,7 @@ class Truth:
                 self.skipped_bytes += self._pending
                 self._pending = 0
 
-    def _keep(self, sent: BusFrame, time_ns: int) -> None:
+    def _keep(self, sent: BusFrame, time_ns: int, written_ns: int) -> None:
         self.fates[sent.fate] += 1
         place = USPA44_MAP.taxels.get(sent.frame.can_id)
         xyz = _xyz(sent.frame.data) if len(sent.frame.data) == 8 else (0, 0, 0)
@@ -158,4 +159,4 @@ class Truth:
                 self.duplicates += self._last.get(place[0]) == reading
                 self._last[place[0]] = reading
         fate, bus_us = _FATE_NUMBERS[sent.fate], round(sent.time_s * 1e6)
-        self._log(_pack(time_ns, bus_us, sent.cycle, sent.frame.can_id, *xyz, self.openings, fate))
+        self._log(_pack(time_ns, written_ns, bus_us, sent.cycle, sent.frame.can_id, *xyz, self.openings, fate))

@@ -57,6 +57,17 @@ def test_a_reading_that_is_held_for_too_long_is_found():
     assert not forged.judged().false_patterns
 
 
+def test_a_reading_that_the_emulator_wrote_late_is_held_from_then_on():
+    """The emulator looked at the clock, and then did not get the processor: no reader can know."""
+    forged = Forged(cycles=30)
+    for number in range(5, 30):
+        forged.change(number, fresh=ALL & ~2, renewed=ALL & ~2)
+    (at,) = (at for at, (_, taxel) in enumerate(USPA44_MAP.wire_order("4")) if taxel == 1)
+    for cycle in range(5):
+        forged.rows["written_ns"][16 * cycle + at] += 200_000_000
+    assert not forged.judged().false_patterns
+
+
 def test_readings_that_lie_apart_are_found():
     forged = Forged()
     forged.rows["bus_us"][10 * 16 + 8 :] += 150_000
