@@ -30,10 +30,12 @@ from train.networks.registry import NETWORKS
 from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
 
-GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45)}
-"""Share of windows with 1, 2, ... K taps."""
+GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.15, 0.1, 0.1, 0.35, 0.06, 0.06, 0.18)}
+"""Share of windows with 1, 2, ... K taps; of batches, for a network that takes poses."""
 
 _KNOWN: Final = {"known": KNOWN}
+_COMPACT: Final = ("compact-", "small-", "fusion-")
+"""Networks that take constants of the pad and give deviations."""
 BUNDLED: Final = (
     Training("stsr", "compact-stsr", Recipe(steps=24_000, learning_rate=3e-3), options=_KNOWN),
     Training("stsr-small", "small-stsr", Recipe(steps=8000, learning_rate=3e-3), options=_KNOWN),
@@ -118,7 +120,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
         bf16=options.bf16,
         minutes=options.minutes,
     )
-    compact = options.network.startswith(("compact-", "small-"))
+    compact = options.network.startswith(_COMPACT)
     return Training(
         options.name or _name(options.network),
         options.network,
@@ -132,7 +134,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
 
 def _name(network: str) -> str:
     """Return a checkpoint's name that differs from a bundled one's, which a network of the paper must not overwrite."""
-    return network if network.startswith(("compact-", "small-")) else f"seed-{network}"
+    return network if network.startswith(_COMPACT) else f"seed-{network}"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -38,8 +38,9 @@ ROW: Final = np.dtype(
     ],
     align=False,
 )
-"""Row of a frame in a log: monotonic times before and after it was handed on, in [ns]; time on the bus, in [us] since the first
-scan; cycle and id; the reading that the reader gets; openings of the channel so far; and the number of its fate."""
+"""Row of a frame in a log: monotonic times before and after it was handed on, in [ns]; time on the bus, in [us] since
+the first scan; cycle and id; the reading that the reader gets; openings of the channel so far; and the number of its
+fate."""
 _pack = struct.Struct("<qqqIH3HHB").pack
 _xyz = struct.Struct(">xHHHx").unpack
 _FATE_NUMBERS: Final = {fate: number for number, fate in enumerate(FATES)}

@@ -5,6 +5,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+_MIRRORED = torch.tensor([-1.0, 1.0, -1.0, 1.0, 1.0])
+"""Signs of a pose's x, y, turn and errors in a mirror image."""
+
 
 @dataclass(frozen=True, slots=True)
 class Batch:
@@ -15,15 +18,20 @@ class Batch:
         pattern: (n, H, W) in [mm].
         pad: (n, known), inputs of the pads, or None.
         traction: (n, 3, h, w) in [kPa], or None if it is not trained on.
+        poses: (n, K, 5) of the taps in the newest one's axes, with their errors; None for a fixed schedule.
     """
 
     window: Tensor
     pattern: Tensor
     pad: Tensor | None = None
     traction: Tensor | None = None
+    poses: Tensor | None = None
 
     def mirrored(self, which: Tensor) -> "Batch":
-        """Return the batch with mirror images, left for right, of some windows of one tap, (n,) of bool."""
+        """Return the batch with mirror images, left for right, of some windows, (n,) of bool.
+
+        Without poses the windows are of one tap: a mirrored pad would turn the other way from tap to tap.
+        """
 
         def flipped(maps: Tensor, vectors: bool) -> Tensor:
             image = maps.flip(-1)
@@ -36,6 +44,7 @@ class Batch:
             window=flipped(self.window, True),
             pattern=flipped(self.pattern, False),
             traction=None if self.traction is None else flipped(self.traction, True),
+            poses=None if self.poses is None else torch.where(which[:, None, None], self.poses * _MIRRORED, self.poses),
         )
 
     def share(self, rank: int, world: int, device: torch.device) -> "Batch":
@@ -49,4 +58,5 @@ class Batch:
             mine(self.pattern),
             None if self.pad is None else mine(self.pad),
             None if self.traction is None else mine(self.traction),
+            None if self.poses is None else mine(self.poses),
         )

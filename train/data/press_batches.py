@@ -74,15 +74,7 @@ class PressBatches:
         rng = np.random.default_rng([self._seed, 1, number])
         index = np.concatenate([part(number) for part in self._parts])
         picked = self._presses.pick(index)
-        certainty = np.zeros(len(index), dtype=np.float32)
-        readings = np.empty_like(picked.counts)
-        ends = np.rint(np.cumsum([share for share, _ in _GAIN_SPREADS]) * len(index)).astype(int)[:-1]
-        for part, (_, spread) in zip(np.split(rng.permutation(len(index)), ends), _GAIN_SPREADS, strict=True):
-            if len(part):
-                certainty[part] = max(1 - spread, 0)
-                new = Nuisances() if spread < 1 else self._nuisances
-                nuisances = replace(self._nuisances, gain_spread=spread * new.gain_spread)
-                readings[part] = read_presses(picked.pick(part), nuisances, int(rng.integers(2**62)))
+        readings, certainty = read_by_many(rng, picked, self._nuisances)
         taps = len(self._given)
         there = np.ones(len(index), dtype=np.int64)
         shares = np.array(self._given)
@@ -93,22 +85,12 @@ class PressBatches:
         batch = Batch(
             window=network_input(readings),
             pattern=torch.from_numpy(picked.patterns.astype(np.float32)),
-            pad=torch.from_numpy(self._known(rng, picked.constants, certainty)),
+            pad=torch.from_numpy(known_of_pads(rng, picked.constants, certainty)),
             traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
         )
         if taps > 1 or not self._mirror:  # a mirrored pad would turn the other way from tap to tap
             return batch
         return batch.mirrored(torch.from_numpy(rng.random(len(index)) < 0.5))
-
-    @staticmethod
-    def _known(
-        rng: np.random.Generator, constants: NDArray[np.float32], certainty: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        toss = rng.random(len(constants))[:, None]
-        coins = rng.random(constants.shape) < 0.5
-        known = np.where(toss < _NOTHING, False, (toss < _NOTHING + _ALL) | coins)
-        unsure = (_SURE * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
-        return known_numbers(constants + unsure, known, certainty)
 
 
 class _Part:
@@ -133,3 +115,30 @@ def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[
     absent = ~presses.counts.any(axis=(2, 3, 4))
     readings[absent] = 0
     return readings
+
+
+def read_by_many(
+    rng: np.random.Generator, presses: PressSet, nuisances: Nuisances
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return windows (n, K, 3, rows, cols) in counts, each of another sensor, and the certainty (n,) of its gains."""
+    certainty = np.zeros(len(presses), dtype=np.float32)
+    readings = np.empty_like(presses.counts)
+    ends = np.rint(np.cumsum([share for share, _ in _GAIN_SPREADS]) * len(presses)).astype(int)[:-1]
+    for part, (_, spread) in zip(np.split(rng.permutation(len(presses)), ends), _GAIN_SPREADS, strict=True):
+        if len(part):
+            certainty[part] = max(1 - spread, 0)
+            new = Nuisances() if spread < 1 else nuisances
+            drawn = replace(nuisances, gain_spread=spread * new.gain_spread)
+            readings[part] = read_presses(presses.pick(part), drawn, int(rng.integers(2**62)))
+    return readings, certainty
+
+
+def known_of_pads(
+    rng: np.random.Generator, constants: NDArray[np.float32], certainty: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return pad inputs (n, width) with none, all or some of the constants, drawn as in training."""
+    toss = rng.random(len(constants))[:, None]
+    coins = rng.random(constants.shape) < 0.5
+    known = np.where(toss < _NOTHING, False, (toss < _NOTHING + _ALL) | coins)
+    unsure = (_SURE * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
+    return known_numbers(constants + unsure, known, certainty)

@@ -18,6 +18,7 @@ from firmware_bridge.in_place import write_in_place
 from train.data.batch import Batch
 from train.data.batches import Draw, WindowBatches, network_input
 from train.data.dataset import Sequences
+from train.data.posed_batches import PosedBatches
 from train.data.press_batches import PressBatches
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
@@ -103,7 +104,7 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
     device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
-    batches = batches_of(data, training.scale, recipe, seed, training.draw)
+    batches = batches_of(data, training.scale, recipe, seed, training.draw, posed=net.takes_poses)
     done = train(
         net,
         _objective(net, device, seed),
@@ -145,18 +146,37 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
 
 
 def batches_of(
-    data: Sequences | PressSet, scale: int, recipe: Recipe, seed: int, draw: Draw | None = None
+    data: Sequences | PressSet,
+    scale: int,
+    recipe: Recipe,
+    seed: int,
+    draw: Draw | None = None,
+    *,
+    posed: bool = False,
 ) -> Callable[[int], Batch]:
     """Return batches for a recipe; of presses, only the sequences that have all taps.
 
+    Args:
+        data: taps to draw from.
+        scale: pattern pixels per taxel pitch.
+        recipe: hyperparameters.
+        seed: of all draws.
+        draw: settings by which windows are drawn from sequences of whole taps.
+        posed: with the poses of the taps, for a network that takes them.
+
     Raises:
-        DatasetError: no sequence has as many taps, or the scale is not that of the presses.
+        DatasetError: no sequence has as many taps, the scale is not that of the presses, or sequences have no poses.
     """
     if isinstance(data, Sequences):
+        if posed:
+            raise DatasetError(
+                "a network that takes poses is trained on presses: make some with train.data.make_presses"
+            )
         return WindowBatches(data.at_scale(scale), draw or Draw(), recipe.given, recipe.batch, seed)
     if scale != SCALE:
         raise DatasetError(f"patterns at x{scale} asked for, presses have them at x{SCALE}: take 'train.generate'")
-    return PressBatches(data, recipe.given, recipe.batch, seed)
+    batches = PosedBatches if posed else PressBatches
+    return batches(data, recipe.given, recipe.batch, seed)
 
 
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:

@@ -25,10 +25,12 @@ class PatternNet(nn.Module):
     Attributes:
         taps: K.
         scale: pattern pixels per taxel pitch.
+        takes_poses: True if it takes the poses of the taps as well, and any number of taps up to K.
     """
 
     taps: int
     scale: int
+    takes_poses: bool = False
 
 
 class Residual(nn.Module):

@@ -19,7 +19,7 @@ from train.networks.interval_correction import IntervalCorrection
 from train.networks.losses import relative_rms_error, truth_size
 from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
 
-_QUIET_UNITS: Final = 0.02
+QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a tap's own before the division by it: noise and absent taps stay small."""
 
 _LEAST_DEVIATION: Final = 1e-4
@@ -165,7 +165,10 @@ class CompactNet(PatternNet):
             window: (n, 3K, rows, cols) in network units.
             pad: (n, known), constants of the pads; None for no constants.
         """
-        seen = self.see(window, pad)
+        return self.finished(self.see(window, pad))
+
+    def finished(self, seen: "Seen") -> tuple[Tensor, Tensor, Tensor]:
+        """Return the outputs at the newest tap's amplitude; in evaluation cut at zero, and corrected by region."""
         if self.training:
             return seen.pattern * seen.newest, seen.deviation * seen.newest, seen.traction
         pattern, deviation = torch.relu(seen.pattern), seen.deviation
@@ -177,28 +180,39 @@ class CompactNet(PatternNet):
         """Return the outputs before any correction, and what they were made of; arguments as `forward`."""
         count, _, rows, cols = window.shape
         taps = window.view(count, self.taps, 3, rows, cols)
-        amplitude = taps.square().mean(dim=(2, 3, 4), keepdim=True).sqrt() + _QUIET_UNITS
+        amplitude = tap_amplitude(taps)
         shapes = (taps / amplitude).view(count, 3 * self.taps, rows, cols)
         newest = amplitude[:, 0, 0]
-        size = newest / (newest + 1)
-        about = size[:, :, 0] if pad is None else torch.cat([pad, size[:, :, 0]], dim=1)
-        if pad is None and self.known:
-            about = F.pad(about, (self.known, 0))
-        planes = about[:, :, None, None].expand(count, self.known + 1, rows, cols)
+        entered = self.enter_pad(shapes, shapes[:, :3], self.about(newest, pad))
+        state = self.trunk(torch.relu(entered.merged * (1 + entered.scale) + entered.shift))
+        return self.leave_pad(state, entered, newest, (amplitude[:, 1:, 0, 0, 0] > QUIET_UNITS).to(window.dtype))
+
+    def about(self, newest: Tensor, pad: Tensor | None) -> Tensor:
+        """Return (n, known + 1): what is known of the pad, and a bounded number of an amplitude (n, 1, 1)."""
+        size = (newest / (newest + 1))[:, :, 0]
+        if pad is None:
+            return F.pad(size, (self.known, 0))
+        return torch.cat([pad, size], dim=1)
+
+    def enter_pad(self, shapes: Tensor, newest: Tensor, about: Tensor) -> "Entered":
+        """Return what enters the trunk, of readings of amplitude 1: all taps' for the pattern, the newest for force."""
+        planes = about[:, :, None, None].expand(-1, -1, *shapes.shape[2:])
         entered = self.enter(torch.cat([shapes, planes], dim=1))
-        felt = self.force(torch.cat([shapes[:, :3], planes], dim=1))
+        felt = self.force(torch.cat([newest, planes], dim=1))
         everywhere = torch.cat([torch.relu(entered).mean(dim=(2, 3), keepdim=True), about[:, :, None, None]], dim=1)
         scale, shift = self.context(everywhere).chunk(2, dim=1)
-        merged = torch.relu(self.merge(entered) * (1 + scale) + shift)
-        features = torch.cat([self.trunk(merged), felt], dim=1)
+        return Entered(self.merge(entered), scale, shift, felt, about)
+
+    def leave_pad(self, state: Tensor, entered: "Entered", newest: Tensor, later: Tensor) -> "Seen":
+        """Return the outputs of the trunk's last state, for amplitudes `newest` (n, 1, 1) and earlier taps `later`."""
+        features = torch.cat([state, entered.felt], dim=1)
         pattern = self.leave(features)[:, 0]
         traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
         # Not an exponential, which would be unbounded on a window unlike all others.
-        logits = self.uncertainty(features.detach())[:, 0].to(window.dtype) + _FIRST_UNCERTAINTY
+        logits = self.uncertainty(features.detach())[:, 0].to(newest.dtype) + _FIRST_UNCERTAINTY
         uncertainty = F.softplus(logits) if self.training else _softplus(logits)
         deviation = (uncertainty + _LEAST_DEVIATION) * self.deviation_scale
-        later = (amplitude[:, 1:, 0, 0, 0] > _QUIET_UNITS).to(window.dtype)
-        return Seen(features, newest, about, later, pattern, deviation, traction)
+        return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 
     def take_over(self, start: "CompactNet") -> None:
         """Copy another network's function of the newest taps; further taps are ignored until trained.
@@ -235,6 +249,29 @@ def _softplus(values: Tensor) -> Tensor:
     return torch.log(1 + torch.exp(values.clamp_max(_MOST_LOGIT)))
 
 
+def tap_amplitude(taps: Tensor) -> Tensor:
+    """Return the amplitudes of taps (n, K, 3, rows, cols), (n, K, 1, 1, 1), above zero even of absent ones."""
+    return taps.square().mean(dim=(2, 3, 4), keepdim=True).sqrt() + QUIET_UNITS
+
+
+class Entered(NamedTuple):
+    """Features at the trunk's entrance.
+
+    Attributes:
+        merged: (n, channels, h, w).
+        scale: (n, channels, 1, 1), by which they are multiplied, less 1.
+        shift: (n, channels, 1, 1), which is added to them.
+        felt: (n, channels / 2, h, w), of the newest tap alone.
+        about: (n, known + 1), the pad's inputs and the bounded amplitude.
+    """
+
+    merged: Tensor
+    scale: Tensor
+    shift: Tensor
+    felt: Tensor
+    about: Tensor
+
+
 class Seen(NamedTuple):
     """Outputs of a compact network for n windows, and what they were made of.
 
@@ -242,7 +279,7 @@ class Seen(NamedTuple):
         features: (n, channels, h, w).
         newest: amplitude of the newest tap, (n, 1, 1).
         about: (n, known + 1), the pad's inputs and the bounded amplitude.
-        later: (n, K - 1), 1 for each earlier tap that is there, else 0.
+        later: (n, K - 1), as many times 1 as there are earlier taps, else 0.
         pattern: (n, H, W), not cut at zero, over the amplitude, in [mm].
         deviation: (n, H, W), not corrected, over the amplitude, in [mm].
         traction: (n, 3, h, w) in [kPa].
@@ -262,7 +299,8 @@ class HeteroscedasticError:
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
         """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
-        pattern, deviation, traction = net(batch.window, batch.pad)
+        posed = () if batch.poses is None else (batch.poses,)
+        pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.traction is not None:
             size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)

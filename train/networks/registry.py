@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
+from train.networks.fusion import FusionNet
 from train.networks.srcnn import TactileSRCNN
 from train.networks.srgan import TactileSRGAN
 from train.networks.wu_liu_2024 import MAX_TAPS, SeedNet
@@ -19,6 +20,7 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srgan": (TactileSRGAN, {}),
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
     **{f"compact-{name}": (CompactNet, {"taps": taps}) for name, taps in _TAPS.items()},
+    **{f"fusion-{name}": (FusionNet, {"taps": taps}) for name, taps in _TAPS.items() if taps > 1},
     **{f"small-{name}": (CompactNet, {"taps": taps} | _SMALL) for name, taps in _TAPS.items()},
 }
 """Class and fixed arguments of each network, by name."""

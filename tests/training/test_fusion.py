@@ -1,0 +1,167 @@
+"""Network that fuses taps from any poses: one tap is a network of one tap, and the geometry is exact."""
+
+import numpy as np
+import pytest
+import torch
+from press_samples import make_press_set
+
+from train.data.posed_batches import PosedBatches, stated_poses
+from train.errors import DatasetError
+from train.learning.checkpoint import batches_of
+from train.learning.training_loop import Recipe
+from train.networks.compact import CompactNet, HeteroscedasticError
+from train.networks.fusion import FusionNet
+from train.networks.registry import grown
+
+KNOWN = 5
+
+
+@pytest.fixture(scope="module")
+def net():
+    """Small network whose earlier taps matter."""
+    torch.manual_seed(0)
+    net = FusionNet(7, 10, channels=16, blocks=2, known=KNOWN).eval()
+    for part in (net.receive, net.revise):
+        for free in part.parameters():
+            torch.nn.init.normal_(free, 0, 0.1)
+    net.own_share.data += 0.3
+    return net
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    rng = torch.Generator().manual_seed(1)
+    window, pad = torch.randn(2, 9, 4, 4, generator=rng), torch.randn(2, KNOWN, generator=rng)
+    poses = torch.randn(2, 3, 5, generator=rng) * torch.tensor([2, 2, 30, 0.3, 1.0])
+    poses[:, :, 3:] = poses[:, :, 3:].abs()
+    poses[:, 0] = 0
+    return window, pad, poses
+
+
+def run(net, *inputs):
+    with torch.inference_mode():
+        return net(*inputs)
+
+
+def test_one_tap_is_the_network_of_one_tap_it_started_from(inputs):
+    torch.manual_seed(3)
+    one = CompactNet(1, 10, channels=16, blocks=2, known=KNOWN).eval()
+    fused = grown(one, "fusion-mtsr4", 10, channels=16, blocks=2, known=KNOWN).eval()
+    window, pad, _ = inputs
+    for ours, theirs in zip(run(fused, window[:, :3], pad), run(one, window[:, :3], pad), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_after_training_one_tap_is_one_tap_whatever_the_weights_of_earlier_ones(net, inputs):
+    window, pad, poses = inputs
+    alone = run(net, window[:, :3], pad, poses[:, :1])[0]
+    empty = torch.cat([window[:, :3], torch.zeros(2, 6, 4, 4)], dim=1)
+    assert torch.equal(run(net, empty, pad, poses)[0], alone)
+    assert not torch.allclose(run(net, window, pad, poses)[0], alone, atol=1e-3)
+
+
+def test_a_quarter_turn_of_everything_turns_the_pattern(net, inputs):
+    window, pad, poses = inputs
+    turned = torch.rot90(window.unflatten(1, (3, 3)), 1, (-2, -1))
+    turned = torch.stack([turned[:, :, 1], -turned[:, :, 0], turned[:, :, 2]], dim=2).flatten(1, 2)
+    round_ = poses.clone()
+    round_[..., 0], round_[..., 1] = poses[..., 1], -poses[..., 0]
+    expected = torch.rot90(run(net, window, pad, poses)[0], 1, (-2, -1))
+    assert torch.allclose(run(net, turned, pad, round_)[0], expected, atol=1e-5)
+
+
+def test_the_order_of_earlier_taps_is_free_and_absent_ones_change_nothing(net, inputs):
+    window, pad, poses = inputs
+    pattern = run(net, window, pad, poses)[0]
+    order = [0, 2, 1]
+    shuffled = window.unflatten(1, (3, 3))[:, order].flatten(1, 2)
+    assert torch.allclose(run(net, shuffled, pad, poses[:, order])[0], pattern, atol=1e-6)
+    longer = torch.cat([window, torch.zeros(2, 6, 4, 4)], dim=1)
+    padded = torch.cat([poses, torch.zeros(2, 2, 5)], dim=1)
+    assert torch.allclose(run(net, longer, pad, padded)[0], pattern, atol=1e-6)
+
+
+def test_a_shift_by_half_a_pitch_moves_what_an_earlier_tap_shows_by_a_cell(net):
+    """Carried features land where the pose says: the same tap shifted by two cells changes the pattern two cells on."""
+    from train.networks.fusion import _Carrier
+
+    there = torch.ones(1, 1, 1, 1, 1)
+    state = torch.zeros(1, 1, 8, 8)
+    state[0, 0, 3, 4] = 1
+    pose = torch.tensor([[[2.35, -2.35, 0.0, 0.0, 0.0]]])
+    moved = _Carrier(pose, there, (8, 8), torch.tensor([-2.0, -2.0])).to_taps(state)
+    assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (4, 3), (
+        "one cell up and to the right of the newest tap"
+    )
+    turned = torch.tensor([[[0.0, 0.0, 90.0, 0.0, 0.0]]])
+    moved = _Carrier(turned, there, (8, 8), torch.tensor([-2.0, -2.0])).to_taps(state)
+    # x of the turned pad points down the newest one's rows: half a cell right, half a cell up is half up, half left.
+    assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (3, 3)
+
+
+def test_a_larger_stated_error_widens_the_weights():
+    from train.networks.fusion import _Carrier
+
+    there, state = torch.ones(1, 1, 1, 1, 1), torch.zeros(1, 1, 8, 8)
+    state[0, 0, 3, 4] = 1
+    peaks = []
+    for error_mm in (0.0, 2.0):
+        pose = torch.tensor([[[0.0, 0.0, 0.0, error_mm, 0.0]]])
+        peaks.append(float(_Carrier(pose, there, (8, 8), torch.tensor([-1.0, -1.0])).to_taps(state).max()))
+    assert peaks[1] < 0.5 * peaks[0]
+
+
+def test_without_poses_the_schedule_of_the_paper_is_assumed(net, inputs):
+    window, pad, _ = inputs
+    poses = torch.zeros(2, 3, 5)
+    poses[:, 1:, 2] = torch.tensor([5.0, 10.0])
+    poses[:, 1:, 3], poses[:, 1:, 4] = 0.2, 1.0
+    assert torch.equal(run(net, window, pad)[0], run(net, window, pad, poses)[0])
+
+
+def test_every_parameter_has_a_gradient_with_one_tap_and_with_four():
+    presses = make_press_set(48, taps=4)
+    for given in ((1.0, 0, 0, 0), (0, 0, 0, 1.0)):
+        net = FusionNet(4, 10, channels=16, blocks=2, known=presses.constants.shape[1] * 2 + 1).train()
+        batch = PosedBatches(presses, given, 8, seed=1)(0)
+        HeteroscedasticError().loss(net, batch).backward()
+        assert all(part.grad is not None for part in net.parameters())
+
+
+class TestBatches:
+    def test_a_batch_has_one_number_of_taps_and_follows_from_its_number(self):
+        presses = make_press_set(48, taps=4)
+        draw = PosedBatches(presses, (0.25,) * 4, 16, seed=3)
+        shapes = {draw(number).window.shape[1] for number in range(24)}
+        assert shapes == {3, 6, 9, 12}
+        one, again = draw(5), PosedBatches(presses, (0.25,) * 4, 16, seed=3)(5)
+        assert torch.equal(one.window, again.window) and torch.equal(one.poses, again.poses)
+        assert one.poses.shape[1] * 3 == one.window.shape[1] and not one.poses[:, 0].any()
+
+    def test_stated_errors_are_kept_to(self):
+        rng = np.random.default_rng(0)
+        true = np.zeros((4000, 3, 3), dtype=np.float32)
+        stated = stated_poses(rng, true, (0.2, 1.0))
+        assert np.allclose(stated[:, 1:, 3:], (0.2, 1.0)) and not stated[:, 0].any()
+        assert stated[:, 1:, 0].std() == pytest.approx(0.2, rel=0.1)
+        assert stated[:, 1:, 2].std() == pytest.approx(1.0, rel=0.1)
+        drawn = stated_poses(rng, true)[:, 1:].reshape(-1, 5)
+        assert 0.05 <= drawn[:, 3].min() < 0.06 and 1.4 < drawn[:, 3].max() <= 1.5
+        beyond = (np.abs(drawn[:, 0]) > 2.01 * drawn[:, 3]).mean()
+        assert 0.01 < beyond < 0.05, "some lie farther off than stated"
+
+    def test_mirror_images_of_poses_go_with_those_of_windows(self):
+        batch = PosedBatches(make_press_set(48, taps=4), (0, 0, 0, 1.0), 16, seed=3)(0)
+        image = batch.mirrored(torch.ones(16, dtype=torch.bool))
+        assert torch.equal(image.poses, batch.poses * torch.tensor([-1.0, 1, -1, 1, 1]))
+        assert torch.equal(image.mirrored(torch.ones(16, dtype=torch.bool)).window, batch.window)
+
+    def test_too_few_taps_are_refused(self):
+        with pytest.raises(DatasetError, match="no sequences of 5 taps"):
+            PosedBatches(make_press_set(48, taps=4), (0.2,) * 5, 16, seed=3)
+
+    def test_batches_of_a_network_with_poses_have_poses(self):
+        presses = make_press_set(48, taps=4)
+        recipe = Recipe(1, batch=8, given=(0, 0, 0, 1.0))
+        assert batches_of(presses, 10, recipe, 1, posed=True)(0).poses is not None
+        assert batches_of(presses, 10, recipe, 1)(0).poses is None
