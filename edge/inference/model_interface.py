@@ -15,12 +15,20 @@ class Model(Protocol):
     name: str
     contract: Contract
 
-    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Return the pattern (H, W) of a window (taps, 3, rows, cols) in network input units and its pad row."""
+    def run(
+        self,
+        window: NDArray[np.float32],
+        pad: NDArray[np.float32] | None = None,
+        poses: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Return the pattern (H, W) of a window (taps, 3, rows, cols) in network input units, its pad and its poses."""
         ...
 
     def run_together(
-        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
+        self,
+        windows: Sequence[NDArray[np.float32]],
+        pads: Sequence[NDArray[np.float32]] | None = None,
+        poses: Sequence[NDArray[np.float32]] | None = None,
     ) -> NDArray[np.float32]:
         """Return the patterns (n, H, W) of several windows in one call."""
         ...
