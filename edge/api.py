@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING
 from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, SinkError, UsageError, WindowError
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
+from edge.inference.model_interface import Model
 from edge.inference.timed_loading import unfinished_load
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
 from edge.perception.gain_learning import load_contact_model
 from edge.perception.result import Result
-from edge.perception.runtime import Model, Runtime
+from edge.perception.runtime import Runtime
 from edge.perception.wrench import Wrench
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands

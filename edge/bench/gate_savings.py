@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet
+from edge.inference.model_interface import Model
 from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.runtime import Model, Runtime
+from edge.perception.runtime import Runtime
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import Scan, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.runtime import Model
+from edge.inference.model_interface import Model
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.schedule import Clock, Ticker
 

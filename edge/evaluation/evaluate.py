@@ -16,7 +16,7 @@ from edge.evaluation.metrics import (
 )
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import Contract
-from edge.perception.runtime import Model
+from edge.inference.model_interface import Model
 from firmware_bridge.pad_geometry import USPA44
 
 

@@ -12,25 +12,33 @@ from numpy.typing import NDArray
 from edge.errors import ModelError
 from edge.inference.expected_error import is_confidence, is_number
 from edge.inference.intervals import is_interval_levels
+from edge.inference.pose_input import POSE_WIDTH
 from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
-CONTRACT_VERSION: Final = 6
+CONTRACT_VERSION: Final = 7
 ADDED: Final = MappingProxyType(
-    {5: ("pad_inputs", "takes_gains", "traction_scale"), 6: ("trust", "interval_levels")},
+    {
+        5: ("pad_inputs", "takes_gains", "traction_scale"),
+        6: ("trust", "interval_levels"),
+        7: ("takes_poses", "reach_mm"),
+    },
 )
-"""Keys that each version added; without them a model takes no pad, gives no traction, and checks nothing."""
-EARLIER_VERSIONS: Final = (4, 5)
-"""Versions that are still loaded."""
+"""Keys that each version added; without them a model takes no pad, gives no traction, checks nothing, takes no pose."""
+FIRST_VERSION: Final = 4
+"""First version that is still loaded."""
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 PAD_NAME: Final = "pad"
+POSES_NAME: Final = "poses"
 OUTPUT_NAME: Final = "pattern"
 DEVIATION_NAME: Final = "deviation"
 TRACTION_NAME: Final = "traction"
 ANY_BATCH: Final = "any"
 """Batch of a graph that takes any number of windows in one run; its first dimension bears this name."""
+ANY_TAPS: Final = "taps"
+"""Name of the second dimension of window and poses of a graph that takes poses: 1 to K taps in one run."""
 ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
 MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
@@ -49,8 +57,8 @@ STAND_IN_KEYS: Final = (
 )
 """Keys that two models must share for one to replace the other: the same taps, and patterns of one meaning."""
 
-Shape = tuple[int | str, *tuple[int, ...]]
-"""Shape of an input or output: the batch first."""
+Shape = tuple[Any, ...]
+"""Shape of an input or output, the batch first: a number for each dimension, or a name where it is free."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +95,9 @@ class Contract:
         trust: forward model and checks as JSON, see edge.inference.trust; empty if the model has none.
         interval_levels: percentage -> deviations that make half of the interval that holds so many of the pixels in
             each of edge.inference.intervals.REGIONS; empty if they were not measured.
+        takes_poses: True if it takes 1 to K taps, the earlier ones in any order, each with its pose, see
+            edge.inference.pose_input; False if it takes K taps by the schedule of `angle_step_deg`.
+        reach_mm: distance from the newest tap beyond which it takes no tap, in [mm]; 0 if it takes no poses.
     """
 
     version: int
@@ -114,10 +125,17 @@ class Contract:
     traction_scale: int | None = None
     trust: dict[str, Any] = field(default_factory=dict)
     interval_levels: dict[str, list[float]] = field(default_factory=dict)
+    takes_poses: bool = False
+    reach_mm: float = 0.0
 
     @property
-    def window_shape(self) -> tuple[int | str, int, int, int]:
-        """Shape of the graph's input: (batch, 3 taps, rows, cols), a tap's x, y, z side by side."""
+    def window_shape(self) -> Shape:
+        """Shape of the window: (batch, 3 taps, rows, cols), a tap's x, y, z side by side.
+
+        With poses it is (batch, taps, 3, rows, cols), of as many taps as there are.
+        """
+        if self.takes_poses:
+            return (self.batch, ANY_TAPS, len(AXES), self.rows, self.cols)
         return (self.batch, 3 * self.taps, self.rows, self.cols)
 
     @property
@@ -138,9 +156,13 @@ class Contract:
 
     @property
     def input_shapes(self) -> dict[str, Shape]:
-        """Shapes of the graph's inputs by name: the window, and the pad if the model takes it."""
+        """Shapes of the graph's inputs by name: the window, and the poses and the pad if the model takes them."""
         shapes: dict[str, Shape] = {INPUT_NAME: self.window_shape}
-        return shapes | ({PAD_NAME: (self.batch, self.pad_width)} if self.pad_width else {})
+        if self.takes_poses:
+            shapes[POSES_NAME] = (self.batch, ANY_TAPS, POSE_WIDTH)
+        if self.pad_width:
+            shapes[PAD_NAME] = (self.batch, self.pad_width)
+        return shapes
 
     @property
     def output_shapes(self) -> dict[str, Shape]:
@@ -159,16 +181,15 @@ class Contract:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "Contract":
-        """Read and check a contract, of this version or the one before.
+        """Read and check a contract, of this version or an earlier one.
 
         Raises:
             ModelError: a key is missing, unreadable or out of range; the key is named.
         """
         version = _value(metadata, "version")
         # Before the other keys, which another version may lack.
-        if version not in (CONTRACT_VERSION, *EARLIER_VERSIONS):
-            earlier = " or ".join(map(str, EARLIER_VERSIONS))
-            expected = f"expected {CONTRACT_VERSION}, {earlier}: export the model again with this release"
+        if type(version) is not int or not FIRST_VERSION <= version <= CONTRACT_VERSION:
+            expected = f"expected {FIRST_VERSION} to {CONTRACT_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
         values = {key: _value(metadata, key) for key in _keys(version)}
         _check(values)
@@ -204,13 +225,15 @@ class Contract:
         """
         keys = {key: (getattr(self, key), getattr(other, key)) for key in STAND_IN_KEYS}
         keys["interval_factor"] = (self.interval_factor is not None, other.interval_factor is not None)
+        if self.taps > 1:  # a single tap is the same with poses and without
+            keys["takes_poses"] = (self.takes_poses, other.takes_poses)
         for key, (got, expected) in keys.items():
             if got != expected:
                 raise ModelError(f"contract key '{key}' is {got!r}, that of the model asked for {expected!r}")
 
     def read_trust(self) -> Trust | None:
         """Return the forward model and the checks; None if the model has none."""
-        return trust_of(self.trust, len(self.pad_inputs))
+        return trust_of(self.trust, len(self.pad_inputs), poses=self.takes_poses)
 
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
@@ -312,8 +335,13 @@ def _check(values: Mapping[str, Any]) -> None:
     if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
         refuse("test_error", "a map from taps to metrics")
     _check_pad_and_traction(values, refuse)
+    takes_poses, reach_mm = values.get("takes_poses", False), values.get("reach_mm", 0.0)
+    if not isinstance(takes_poses, bool):
+        refuse("takes_poses", "true or false")
+    if not is_number(reach_mm) or reach_mm < (LEAST_UNIT if takes_poses else 0):
+        refuse("reach_mm", f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0")
     try:
-        trust = trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])))
+        trust = trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])), poses=takes_poses)
         readings = len(AXES) * values["rows"] * values["cols"]
         if trust is not None and trust.forward.operator.shape[1] != readings:
             raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")

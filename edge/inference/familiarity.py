@@ -18,6 +18,13 @@ QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a scan's own before the division by it: noise stays small."""
 _MOST: Final = 12.0
 """Largest reading over the amplitude; a contact on one taxel alone has 4."""
+PLACE_MM: Final = 5.0
+"""Unit of a tap's place among features: about a taxel pitch."""
+ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)
+"""Units of the errors of a pose among features, in [mm] and [deg]: five usual errors."""
+MOST_ERROR: Final = 5.0
+"""Largest error of a pose among features, in its unit: beyond it a pose states nothing."""
+_POSE_FEATURES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +72,11 @@ def contact_features(tap: NDArray[np.float32], pad_row: NDArray[np.float32]) -> 
     return features
 
 
+def pair_width(readings: int, *, poses: bool) -> int:
+    """Return the number of features of a pair of taps with so many readings each."""
+    return 2 * readings + 2 + (_POSE_FEATURES if poses else 2)
+
+
 def tap_features(window: NDArray[np.float32], steps: Sequence[int] | None = None) -> NDArray[np.float32]:
     """Return the features (K - 1, inputs) of the earlier taps of a window, each beside the newest one.
 
@@ -72,14 +84,40 @@ def tap_features(window: NDArray[np.float32], steps: Sequence[int] | None = None
         window: (K, 3, rows, cols) in network units, newest tap first.
         steps: turns of the schedule from the newest tap to each earlier one; by default 1, 2, ...
     """
+    features = _pair_features(window, pair_width(window[0].size, poses=False))
+    features[:, -2] = np.arange(1, len(window)) if steps is None else steps
+    np.square(features[:, -2], out=features[:, -1])
+    return features
+
+
+def pose_tap_features(window: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the features (K - 1, inputs) of the earlier taps of a window with poses, each beside the newest one.
+
+    The pose stands in place of the turns of the schedule: place, sine and cosine of the turn, and the errors of both.
+
+    Args:
+        window: (K, 3, rows, cols) in network units, newest tap first.
+        poses: (K, 5), as edge.inference.pose_input makes them.
+    """
+    features = _pair_features(window, pair_width(window[0].size, poses=True))
+    posed, earlier = features[:, -_POSE_FEATURES:], poses[1:]
+    turn = np.radians(earlier[:, 2])
+    np.multiply(earlier[:, :2], 1 / PLACE_MM, out=posed[:, :2])
+    np.cos(turn, out=posed[:, 2])
+    np.sin(turn, out=posed[:, 3])
+    np.minimum(earlier[:, 3:] / ERROR_UNITS, MOST_ERROR, out=posed[:, 4:])
+    return features
+
+
+def _pair_features(window: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Return features (K - 1, width) with the newest tap, its difference to each earlier one, and the sizes of both."""
     readings = window[0].size
-    features = np.empty((len(window) - 1, 2 * readings + 4), dtype=np.float32)
-    newest, differences, sizes = features[:, :readings], features[:, readings : 2 * readings], features[:, -4:]
-    size = math.log(_put_shape(window[0], newest[0]))
+    features = np.empty((len(window) - 1, width), dtype=np.float32)
+    newest, differences = features[:, :readings], features[:, readings : 2 * readings]
+    features[:, 2 * readings] = math.log(_put_shape(window[0], newest[0]))
     newest[1:] = newest[0]
     for row, tap in enumerate(window[1:]):
-        step = row + 1 if steps is None else steps[row]
-        sizes[row] = (size, math.log(_put_shape(tap, differences[row])), step, step * step)
+        features[row, 2 * readings + 1] = math.log(_put_shape(tap, differences[row]))
     differences -= newest
     return features
 

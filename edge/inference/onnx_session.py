@@ -1,4 +1,4 @@
-"""Model session in onnxruntime: checked against its contract, with arrays bound once per number of windows."""
+"""Model session in onnxruntime: checked against its contract, with arrays bound once per number of windows and taps."""
 
 import os
 import re
@@ -15,18 +15,23 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 from edge.errors import ModelError, WindowError
 from edge.inference.contract import (
     ANY_BATCH,
+    ANY_TAPS,
     DEVIATION_NAME,
     INPUT_NAME,
     OUTPUT_NAME,
     PAD_NAME,
+    POSES_NAME,
     TRACTION_NAME,
     Contract,
 )
 from edge.inference.onnx_guard import read_model
+from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
 from edge.inference.timed_loading import flush_denormals, within_limit
 
 WARM_UP_RUNS: Final = 10
 """Runs before run times stay: the first takes 3 to 10 times as long as the tenth."""
+MOST_RUNS: Final = 32
+"""Numbers of windows and of taps for which arrays are kept: four sensors with seven taps have 28."""
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
 """Most characters of a message of onnxruntime, which may quote a whole graph."""
@@ -99,7 +104,7 @@ class ModelSession:
             raise ModelError(f"{path}: {error}") from error
         except UnicodeDecodeError as error:
             raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
-        self._runs: dict[int, _Run] = {}
+        self._runs: dict[tuple[int, int], _Run] = {}
         self._options = onnxruntime.RunOptions()
         self.deviation: NDArray[np.float32] | None = None
         self.traction: NDArray[np.float32] | None = None
@@ -107,12 +112,20 @@ class ModelSession:
         self._unknown_pad = self.contract.pad_row(None)
         within_limit(self._warm_up, path, stop, give_up=self._end_run)
 
-    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def run(
+        self,
+        window: NDArray[np.float32],
+        pad: NDArray[np.float32] | None = None,
+        poses: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
         """Infer the pattern of one window.
 
         Args:
-            window: (taps, 3, rows, cols) float32, newest first, in network input units.
+            window: (taps, 3, rows, cols) float32, newest first, in network input units; 1 to K taps of a model that
+                takes poses, else K.
             pad: the contract's `pad_row` of the sensor's pad; by default that of an unknown pad.
+            poses: (taps, 5) float32 as edge.inference.pose_input makes them, for a model that takes poses; by default
+                those of the paper's schedule, and zeros for taps of zeros.
 
         Returns:
             (H, W) float32 in the contract's output unit: the session's own array, read-only, and
@@ -123,7 +136,8 @@ class ModelSession:
             ModelError: the model cannot be run on it, or gave a pattern or a traction that is not finite, or a
                 deviation that is not finite and above zero.
         """
-        pattern = self.run_together([window], None if pad is None else [pad])[0]
+        pads, rows = None if pad is None else [pad], None if poses is None else [poses]
+        pattern = self.run_together([window], pads, rows)[0]
         if self.deviation is not None:
             self.deviation = self.deviation[0]
         if self.traction is not None:
@@ -131,33 +145,41 @@ class ModelSession:
         return pattern
 
     def run_together(
-        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
+        self,
+        windows: Sequence[NDArray[np.float32]],
+        pads: Sequence[NDArray[np.float32]] | None = None,
+        poses: Sequence[NDArray[np.float32]] | None = None,
     ) -> NDArray[np.float32]:
         """Infer the patterns of several windows in one call; see `run`.
 
-        A graph of one window a run is called once for each.
+        A graph of one window a run is called once for each. With poses, windows may have different numbers of taps.
 
         Args:
             windows: one or more, of different sensors.
             pads: rows of the same sensors; by default those of unknown pads.
+            poses: of the taps of each window, for a model that takes poses.
 
         Returns:
             (n, H, W).
         """
         for window in windows:
-            if window.shape != self._shape or window.dtype != np.float32:
-                raise WindowError(f"window is {window.shape} {window.dtype}, expected {self._shape} float32")
-            if not np.isfinite(window).all():
-                raise WindowError("window has values that are not finite")
+            self._check_window(window)
         count = len(windows)
         pads = [self._unknown_pad] * count if pads is None else pads
         for pad in pads:
             if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
                 expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
                 raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
-        run = self._runs.get(count) or self._runs.setdefault(count, _Run(self._session, self.contract, count))
+        if not self.contract.takes_poses and poses is not None:
+            raise WindowError(f"poses are given, but model '{self.name}' takes none: leave them out")
+        run = self._run_of(count, max(map(len, windows)))
         for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
-            run.window[index] = window.reshape(run.window.shape[1:])
+            if run.poses is None:
+                run.window[index] = window.reshape(run.window.shape[1:])
+            else:
+                rows = self._scheduled(window) if poses is None else poses[index]
+                _check_poses(rows, len(window))
+                run.put(index, window, rows)
             if run.pad is not None:
                 run.pad[index] = pad
         try:
@@ -176,20 +198,50 @@ class ModelSession:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
         return pattern
 
+    def _check_window(self, window: NDArray[np.float32]) -> None:
+        shape, expected = window.shape, str(self._shape)
+        if self.contract.takes_poses:
+            expected = f"(1 to {self._shape[0]}, {expected.partition(', ')[2]}"
+            fits = shape[1:] == self._shape[1:] and 1 <= shape[0] <= self._shape[0]
+        else:
+            fits = shape == self._shape
+        if not fits or window.dtype != np.float32:
+            raise WindowError(f"window is {shape} {window.dtype}, expected {expected} float32")
+        if not np.isfinite(window).all():
+            raise WindowError("window has values that are not finite")
+
+    def _scheduled(self, window: NDArray[np.float32]) -> NDArray[np.float32]:
+        rows = scheduled_rows(len(window), self.contract.angle_step_deg)
+        rows[~window.any(axis=(1, 2, 3))] = 0
+        return rows
+
+    def _run_of(self, count: int, taps: int) -> "_Run":
+        """Return the arrays for so many windows and taps; those that were made first are given up for new ones."""
+        run = self._runs.get((count, taps))
+        if run is None:
+            if len(self._runs) >= MOST_RUNS:
+                del self._runs[next(iter(self._runs))]
+            run = self._runs[count, taps] = _Run(self._session, self.contract, count, taps)
+        return run
+
     def _warm_up(self) -> None:
-        for _ in range(WARM_UP_RUNS):
-            self.run(np.zeros(self._shape, dtype=np.float32))
+        for taps in sorted({1 if self.contract.takes_poses else self.contract.taps, self.contract.taps}):
+            for _ in range(WARM_UP_RUNS):
+                self.run(np.zeros((taps, *self._shape[1:]), dtype=np.float32))
 
     def _end_run(self) -> None:
         self._options.terminate = True  # checked before each operator
 
 
 class _Run:
-    """Arrays for so many windows, and what binds them to a session."""
+    """Arrays for so many windows of so many taps, and what binds them to a session."""
 
-    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int) -> None:
+    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int, taps: int) -> None:
         inputs, outputs = (
-            {name: np.zeros((count, *shape[1:]), dtype=np.float32) for name, shape in shapes.items()}
+            {
+                name: np.zeros([count, *(taps if size == ANY_TAPS else size for size in shape[1:])], dtype=np.float32)
+                for name, shape in shapes.items()
+            }
             for shapes in (contract.input_shapes, contract.output_shapes)
         )
         at_once = count if contract.batch == ANY_BATCH else 1
@@ -203,10 +255,31 @@ class _Run:
         for output in outputs.values():
             output.setflags(write=False)
         self.window = inputs[INPUT_NAME]
+        self.poses = inputs.get(POSES_NAME)
         self.pad = inputs.get(PAD_NAME)
         self.pattern = outputs[OUTPUT_NAME]
         self.deviation = outputs.get(DEVIATION_NAME)
         self.traction = outputs.get(TRACTION_NAME)
+
+    def put(self, index: int, window: NDArray[np.float32], poses: NDArray[np.float32]) -> None:
+        """Put in a window with poses; absent taps are zeros."""
+        if self.poses is None:
+            raise ValueError("the model takes no poses")
+        taps = len(window)
+        self.window[index, :taps], self.window[index, taps:] = window, 0
+        self.poses[index, :taps], self.poses[index, taps:] = poses, 0
+
+
+def _check_poses(poses: NDArray[np.float32], taps: int) -> None:
+    if poses.shape != (taps, POSE_WIDTH) or poses.dtype != np.float32:
+        expected = f"({taps}, {POSE_WIDTH}) float32: {', '.join(POSE_KEYS)} of each tap of the window"
+        raise WindowError(f"poses are {poses.shape} {poses.dtype}, expected {expected}")
+    if not np.isfinite(poses).all():
+        raise WindowError("poses have values that are not finite")
+    if poses[0].any():
+        raise WindowError(
+            f"the newest tap's pose is {poses[0].tolist()}, expected zeros: give poses as that tap sees them"
+        )
 
 
 def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:

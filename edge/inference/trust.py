@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Final
 
-from edge.inference.familiarity import Check, check_of
+from edge.inference.familiarity import Check, check_of, pair_width
 from edge.inference.forward_model import ForwardModel, forward_model
 
 _KEYS: Final = ("forward", "contact", "tap")
@@ -28,8 +28,13 @@ class Trust:
         return {name: getattr(self, name).to_json() for name in _KEYS}
 
 
-def trust_of(value: Any, constants: int) -> Trust | None:
+def trust_of(value: Any, constants: int, *, poses: bool = False) -> Trust | None:
     """Return what `Trust.to_json` has made of it, for a model that takes so many constants; None if it is empty.
+
+    Args:
+        value: as read from a file.
+        constants: of the pad that the model takes.
+        poses: True for a model that takes poses, whose check of earlier taps takes them, too.
 
     Raises:
         ValueError: it is damaged, or of other constants; the message names the part.
@@ -41,7 +46,7 @@ def trust_of(value: Any, constants: int) -> Trust | None:
     forward = forward_model(value["forward"], constants)
     contact, tap = check_of(value["contact"]), check_of(value["tap"])
     readings = forward.operator.shape[1]
-    expected = {"contact": (contact, readings + 1 + 2 * constants + 1), "tap": (tap, 2 * readings + 4)}
+    expected = {"contact": (contact, readings + 1 + 2 * constants + 1), "tap": (tap, pair_width(readings, poses=poses))}
     for name, (check, inputs) in expected.items():
         if check.network.inputs != inputs:
             raise ValueError(f"{name} takes {check.network.inputs} features, expected {inputs}")

@@ -3,13 +3,13 @@
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import WindowError
-from edge.inference.contract import Contract
+from edge.inference.model_interface import Model
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import Event, EventKind, Note, Untimed
@@ -17,6 +17,7 @@ from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
 from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
+from edge.perception.reading_age import OLD_NS, age_notes
 from edge.perception.result import MADE, Result
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_tracker import TapTracker
@@ -29,37 +30,6 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
-
-OLD_NS: Final = 50_000_000
-"""Age from which a reading is old, in [ns], by the device's time stamps and counted from its fastest recent reading:
-three times as long as a slow adapter holds readings."""
-
-
-class Model(Protocol):
-    """Interface of a model session as the runtime uses it."""
-
-    name: str
-    contract: Contract
-
-    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Return the pattern (H, W) of a window (taps, 3, rows, cols) in network input units and its pad row."""
-        ...
-
-    def run_together(
-        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
-    ) -> NDArray[np.float32]:
-        """Return the patterns (n, H, W) of several windows in one call."""
-        ...
-
-    @property
-    def deviation(self) -> NDArray[np.float32] | None:
-        """Standard deviation of each pixel of the last run's patterns, of their shape; None without."""
-        ...
-
-    @property
-    def traction(self) -> NDArray[np.float32] | None:
-        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]; None without."""
-        ...
 
 
 class Runtime:
@@ -237,8 +207,8 @@ class Runtime:
         filled = None if readings is None else readings.filled
         watch = sensor.watch
         taxel_notes = () if watch.sound else watch.notes(filled)
-        age_notes = () if scan.time_ns - scan.not_before_ns <= OLD_NS else _age_notes(scan)
-        notes = (*taxel_notes, *sensor.zeroing_notes, *sensor.drift_notes, *age_notes)
+        notes_of_age = () if scan.time_ns - scan.not_before_ns <= OLD_NS else age_notes(scan)
+        notes = (*taxel_notes, *sensor.zeroing_notes, *sensor.drift_notes, *notes_of_age)
         unit, dead = self._model.contract.output_unit, watch.reasons
         events = self._take_events(sensor, scan.time_ns) if self._events or sensor.events else ()
         known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "notes": notes, "events": events}
@@ -368,20 +338,6 @@ class Runtime:
     def _new_tracker(self) -> TapTracker:
         grid_shape = (self._geometry.rows, self._geometry.cols)
         return TapTracker(self._model.contract.taps, self._options, grid_shape)
-
-
-def _age_notes(scan: Scan) -> tuple[Note, ...]:
-    """Return notes on readings that were old when they arrived."""
-    if scan.device_ns is None:
-        if scan.unread_ns <= OLD_NS:
-            return ()
-        text = (
-            f"this reading may have been {scan.unread_ns / 1e9:.2f} s old when it arrived: nothing was read meanwhile"
-        )
-        return (Note("late", text),)
-    if scan.time_ns - scan.device_ns <= OLD_NS:
-        return ()
-    return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it arrived"),)
 
 
 class _Due(NamedTuple):

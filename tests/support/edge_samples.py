@@ -237,7 +237,7 @@ class FakeModel:
         self.traction: np.ndarray | None = None
         self._on_run = on_run
 
-    def run(self, window: np.ndarray, pad: np.ndarray | None = None) -> np.ndarray:
+    def run(self, window: np.ndarray, pad: np.ndarray | None = None, poses: np.ndarray | None = None) -> np.ndarray:
         self._on_run()
         self.windows.append(window.copy())
         self.pads.append(pad)
@@ -249,7 +249,12 @@ class FakeModel:
             self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32) * stiffness
         return pattern
 
-    def run_together(self, windows: Sequence[np.ndarray], pads: Sequence[np.ndarray] | None = None) -> np.ndarray:
+    def run_together(
+        self,
+        windows: Sequence[np.ndarray],
+        pads: Sequence[np.ndarray] | None = None,
+        poses: Sequence[np.ndarray] | None = None,
+    ) -> np.ndarray:
         patterns, deviations, tractions = [], [], []
         for index, window in enumerate(windows):
             patterns.append(self.run(window, None if pads is None else pads[index]))

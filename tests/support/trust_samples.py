@@ -61,5 +61,5 @@ class WrongModel(FakeModel):
         super().__init__(contract)
         self.factor = factor
 
-    def run(self, window, pad=None):
+    def run(self, window, pad=None, poses=None):
         return super().run(window, pad) * np.float32(self.factor)

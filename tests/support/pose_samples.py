@@ -1,0 +1,117 @@
+"""Model that takes poses, as a real graph and without onnxruntime: each tap counts by a sum of its pose's numbers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+from edge_samples import FakeModel, make_contract, tiny_deviation, tiny_traction
+from onnx import TensorProto, helper, numpy_helper
+
+from edge.inference.contract import (
+    ANY_BATCH,
+    DEVIATION_NAME,
+    INPUT_NAME,
+    OUTPUT_NAME,
+    POSES_NAME,
+    Contract,
+)
+
+WEIGHTS = np.array([0.5, 0.25, 0.0625, 2.0, 0.125], dtype=np.float32)
+"""Of dx, dy, turn and the errors: each number of a pose has its own, so that none can be lost or exchanged."""
+
+
+def make_posed_contract(**changes) -> Contract:
+    """Return the contract of the model."""
+    return make_contract(**({"batch": ANY_BATCH, "taps": 7, "takes_poses": True, "reach_mm": 10.0} | changes))
+
+
+def posed_pattern(window: np.ndarray, poses: np.ndarray, scale: int = 10) -> np.ndarray:
+    """Return the model's pattern for a window (taps, 3, rows, cols) and its poses (taps, 5)."""
+    z = sum(tap[2] * (1 + pose @ WEIGHTS) for tap, pose in zip(window, poses, strict=True))
+    return np.kron(z, np.ones((scale, scale)))
+
+
+def write_posed_model(path: Path, contract: Contract | None = None, **properties: str) -> Path:
+    """Write the graph; `properties` replace keys of its metadata."""
+    contract = contract or make_posed_contract()
+    scale, shape = contract.scale, [contract.batch, *contract.pattern_shape]
+    nodes = [
+        helper.make_node("Mul", [POSES_NAME, "weights"], ["weighed"]),
+        helper.make_node("ReduceSum", ["weighed", "numbers"], ["sum"], keepdims=0),
+        helper.make_node("Add", ["sum", "one"], ["shares"]),
+        helper.make_node("Unsqueeze", ["shares", "grid"], ["share"]),
+        helper.make_node("Gather", [INPUT_NAME, "z"], ["normal"], axis=2),
+        helper.make_node("Mul", ["normal", "share"], ["parts"]),
+        helper.make_node("ReduceSum", ["parts", "taps"], ["whole"], keepdims=1),
+        helper.make_node("ConvTranspose", ["whole", "square"], ["squares"], strides=[scale, scale]),
+        helper.make_node("Squeeze", ["squares", "taps"], [OUTPUT_NAME]),
+    ]
+    outputs = [OUTPUT_NAME]
+    if contract.interval_factor is not None:
+        outputs.append(DEVIATION_NAME)
+        nodes += [
+            helper.make_node("Abs", [OUTPUT_NAME], ["size"]),
+            helper.make_node("Add", ["size", "one"], ["doubted"]),
+            helper.make_node("Mul", ["doubted", "doubt"], [DEVIATION_NAME]),
+        ]
+    constants = {
+        "weights": WEIGHTS,
+        "numbers": np.array([2]),
+        "one": np.array(1, dtype=np.float32),
+        "grid": np.array([2, 3]),
+        "z": np.array(2),
+        "taps": np.array([1]),
+        "square": np.ones((1, 1, scale, scale), dtype=np.float32),
+        "doubt": np.array(0.01, dtype=np.float32),
+    }
+    graph = helper.make_graph(
+        nodes,
+        "posed",
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, list(of))
+            for name, of in contract.input_shapes.items()
+        ],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in outputs],
+        [numpy_helper.from_array(values, name) for name, values in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
+    helper.set_model_props(model, contract.to_metadata() | properties)
+    onnx.save(model, path)
+    return path
+
+
+class PosedModel(FakeModel):
+    """The model without onnxruntime; `poses` are those of its runs."""
+
+    def __init__(self, contract: Contract | None = None) -> None:
+        super().__init__(contract or make_posed_contract())
+        self.poses: list[np.ndarray] = []
+
+    def run(self, window: np.ndarray, pad: np.ndarray | None = None, poses: np.ndarray | None = None) -> np.ndarray:
+        assert poses is not None and len(poses) == len(window)
+        self.windows.append(window.copy())
+        self.pads.append(pad)
+        self.poses.append(poses.copy())
+        pattern = posed_pattern(window, poses).astype(np.float32)
+        if self.contract.interval_factor is not None:
+            self.deviation = tiny_deviation(pattern)
+        if self.contract.traction_scale is not None:
+            self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32)
+        return pattern
+
+    def run_together(
+        self,
+        windows: Sequence[np.ndarray],
+        pads: Sequence[np.ndarray] | None = None,
+        poses: Sequence[np.ndarray] | None = None,
+    ) -> np.ndarray:
+        assert poses is not None
+        made = []
+        for index, (window, rows) in enumerate(zip(windows, poses, strict=True)):
+            pattern = self.run(window, None if pads is None else pads[index], rows)
+            made.append((pattern, self.deviation, self.traction))
+        patterns, deviations, tractions = zip(*made, strict=True)
+        self.deviation = None if deviations[0] is None else np.stack(deviations)
+        self.traction = None if tractions[0] is None else np.stack(tractions)
+        return np.stack(patterns)
