@@ -46,6 +46,7 @@ from train.learning.trust_limits import TrustFit, load_trust
 from train.networks.blocks import PatternNet
 from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG
+from train.surfaces.tap_schedules import REACH_MM
 
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1
@@ -96,6 +97,8 @@ def contract_of(
         pad_inputs=tuple(input_scale()) if known else (),
         takes_gains=bool(known),
         traction_scale=given[2].shape[-1] // geometry.cols if len(given) > 2 else None,
+        takes_poses=net.takes_poses,
+        reach_mm=REACH_MM if net.takes_poses else 0.0,
     )
 
 

@@ -154,7 +154,7 @@ def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
         earlier = (newest[:, None] + np.arange(contract.taps) * _SCANS_APART) % len(scans.counts)
         windows.append(contract.scale_window(scans.counts[earlier].astype(np.float32)))
     joined = np.concatenate(windows)
-    return joined.reshape(len(joined), *contract.window_shape[1:])
+    return joined.reshape(len(joined), -1, contract.rows, contract.cols)
 
 
 def _judge(

@@ -8,12 +8,23 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from edge.inference.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME
+from edge.inference.contract import (
+    ANY_TAPS,
+    DEVIATION_NAME,
+    INPUT_NAME,
+    OUTPUT_NAME,
+    PAD_NAME,
+    POSES_NAME,
+    TRACTION_NAME,
+)
+from edge.inference.pose_input import POSE_WIDTH
 from export.errors import ExportError
 from firmware_bridge.pad_geometry import SensorGeometry
 from train.networks.blocks import PatternNet
 
 OPSET: Final = 18
+_ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
+"""Argument of a network's forward for each input of its graph."""
 _TRACED: Final = 2
 """Windows with which a graph of any batch is traced: with one window, the tracer would take the size 1 as fixed."""
 
@@ -35,19 +46,26 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
         raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
     traced = _TRACED if isinstance(batch, str) else batch
     example = torch.zeros(traced, 3 * net.taps, geometry.rows, geometry.cols)
-    width = known_width(net)
-    inputs = {INPUT_NAME: example} | ({PAD_NAME: torch.zeros(traced, width)} if width else {})
+    width, free = known_width(net), {0: torch.export.Dim(batch)} if isinstance(batch, str) else {}
+    inputs, dims = {INPUT_NAME: example}, {INPUT_NAME: free}
+    if net.takes_poses:
+        inputs[INPUT_NAME] = example.unflatten(1, (net.taps, 3))
+        inputs[POSES_NAME] = torch.zeros(traced, net.taps, POSE_WIDTH)
+        dims[INPUT_NAME] = dims[POSES_NAME] = free | {1: torch.export.Dim(ANY_TAPS)}
+    if width:
+        inputs[PAD_NAME], dims[PAD_NAME] = torch.zeros(traced, width), free
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # raised inside torch about torch
+        warnings.filterwarnings("ignore", "# The axis name", UserWarning)  # two inputs share an axis, as they must
         program = torch.onnx.export(
             net,
-            tuple(inputs.values()),
+            kwargs={_ARGUMENTS[name]: given for name, given in inputs.items()},
             dynamo=True,
             opset_version=OPSET,
             input_names=list(inputs),
             output_names=[OUTPUT_NAME, DEVIATION_NAME, TRACTION_NAME][: len(outputs(net, example))],
-            dynamic_shapes=tuple({0: torch.export.Dim(batch)} for _ in inputs) if isinstance(batch, str) else None,
+            dynamic_shapes={_ARGUMENTS[name]: shape for name, shape in dims.items()} if any(dims.values()) else None,
             verbose=False,
         )
     if program is None:
@@ -70,8 +88,18 @@ def known_width(net: nn.Module) -> int:
     return getattr(net, "known", 0)
 
 
-def outputs(net: nn.Module, windows: Tensor, pads: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the patterns, and deviations and tractions if any; without pads all constants are absent."""
+def outputs(
+    net: nn.Module, windows: Tensor, pads: Tensor | None = None, poses: Tensor | None = None
+) -> tuple[Tensor, ...]:
+    """Return the patterns, and deviations and tractions if any.
+
+    Args:
+        net: in evaluation mode.
+        windows: (n, 3K, rows, cols) in network units.
+        pads: inputs of the pads; without them all constants are absent.
+        poses: of the taps, for a network that takes them; without them those of the paper's schedule.
+    """
+    known = {"pad": pads, "poses": poses}
     with torch.inference_mode():
-        given = net(windows) if pads is None else net(windows, pads)
+        given = net(windows, **{name: one for name, one in known.items() if one is not None})
     return given if isinstance(given, tuple) else (given,)

@@ -53,7 +53,7 @@ class IntervalData:
             other.add_intervals().contact_level.fill_(contact_level)
         else:
             fit_correction(other, self.training, contact_level)
-        return self._conformed(other, lambda windows, pads: _run(other, windows, pads))
+        return self._conformed(other, lambda *given: _run(other, *given))
 
     def conformed(self, net: PatternNet, graph: onnx.ModelProto) -> Corrected:
         """Return a copy of a corrected network whose correction holds for its graph, which is in integers."""
@@ -62,10 +62,13 @@ class IntervalData:
         return self._conformed(copy.deepcopy(net), GraphRun(graph))
 
     def _conformed(self, net: CompactNet, run: Run) -> Corrected:
-        return Corrected(net, conform(net, run, readings_of_presses(self.validation, net.taps)))
+        readings = readings_of_presses(self.validation, net.taps, posed=net.takes_poses)
+        return Corrected(net, conform(net, run, readings))
 
 
-def _run(net: CompactNet, windows: NDArray, pads: NDArray | None) -> Sequence[NDArray]:
-    pads_of = [None] if pads is None else torch.from_numpy(pads).split(_AT_ONCE)
-    parts = zip(torch.from_numpy(windows).split(_AT_ONCE), pads_of, strict=True)
+def _run(net: CompactNet, *given: NDArray | None) -> Sequence[NDArray]:
+    """Return the outputs for windows, pads and poses, in parts."""
+    windows, *known = (None if one is None else torch.from_numpy(one).split(_AT_ONCE) for one in given)
+    count = 0 if windows is None else len(windows)
+    parts = zip(windows or (), *(one or [None] * count for one in known), strict=True)
     return [torch.cat(maps).numpy() for maps in zip(*(outputs(net, *part) for part in parts), strict=True)]

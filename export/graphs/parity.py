@@ -12,10 +12,20 @@ from numpy.typing import NDArray
 from torch import nn
 
 from edge.evaluation.test_set import FrozenSet
-from edge.inference.contract import DEVIATION_NAME, INPUT_NAME, OUTPUT_NAME, PAD_NAME, TRACTION_NAME, Contract
+from edge.inference.contract import (
+    DEVIATION_NAME,
+    INPUT_NAME,
+    OUTPUT_NAME,
+    PAD_NAME,
+    POSES_NAME,
+    TRACTION_NAME,
+    Contract,
+)
 from edge.inference.onnx_session import LOG_FATAL_ONLY
+from edge.inference.pose_input import scheduled_rows
 from export.errors import ParityError
 from export.graphs.graph import known_width, outputs
+from train.surfaces.poses import ANGLE_STEP_DEG
 
 LEVELS: Final = {
     "none": onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL,
@@ -87,20 +97,30 @@ class GraphRun:
         inputs = {given.name: given.shape for given in self._session.get_inputs()}
         batch = inputs[INPUT_NAME][0]
         self._pad_width = inputs[PAD_NAME][1] if PAD_NAME in inputs else 0
+        self._takes_poses = POSES_NAME in inputs
         self._batch = batch if isinstance(batch, int) else 1
         self.outputs: list[str] = [output.name for output in self._session.get_outputs()]
 
     def __call__(
-        self, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
+        self,
+        windows: NDArray[np.float32],
+        pads: NDArray[np.float32] | None = None,
+        poses: NDArray[np.float32] | None = None,
     ) -> list[NDArray[np.float32]]:
         """Return each output (n, ...) of windows (n, 3K, rows, cols); the last batch is padded with zeros.
 
         Args:
             windows: in network units.
             pads: (n, width), inputs of the pads; None for no constants.
+            poses: (n, K, 5) of the taps, for a graph that takes them; None for the paper's schedule.
         """
         count = len(windows)
         inputs = {INPUT_NAME: windows}
+        if self._takes_poses:
+            inputs[INPUT_NAME] = windows.reshape(count, -1, 3, *windows.shape[2:])
+            taps = inputs[INPUT_NAME].shape[1]
+            scheduled = np.tile(scheduled_rows(taps, ANGLE_STEP_DEG), (count, 1, 1))
+            inputs[POSES_NAME] = scheduled if poses is None else poses
         if self._pad_width:
             inputs[PAD_NAME] = np.zeros((count, self._pad_width), np.float32) if pads is None else pads
         filled = {
@@ -175,6 +195,18 @@ def example_pads(count: int, width: int) -> NDArray[np.float32]:
     return pads.astype(np.float32)
 
 
+def example_poses(count: int, contract: Contract) -> NDArray[np.float32]:
+    """Draw poses of all taps within reach, (count, K, 5); every third window has the paper's schedule."""
+    rng, shape = np.random.default_rng(0), (count, contract.taps)
+    away_mm, way = contract.reach_mm * np.sqrt(rng.random(shape)), rng.uniform(0, 2 * np.pi, shape)
+    turn_deg, errors = rng.uniform(-180, 180, shape), rng.uniform(0, (2, 10), (*shape, 2))
+    place = np.stack([away_mm * np.cos(way), away_mm * np.sin(way), turn_deg], axis=2)
+    poses = np.concatenate([place, errors], axis=2).astype(np.float32)
+    poses[::3] = scheduled_rows(contract.taps, contract.angle_step_deg)
+    poses[:, 0] = 0
+    return poses
+
+
 def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
     """Return the largest relative difference between torch and a float32 graph, on readings and extreme windows.
 
@@ -195,9 +227,10 @@ def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, cont
         (np.concatenate([*extreme_windows(contract).values()]), EXTREME_TOLERANCE),
     ):
         pads = example_pads(len(windows), width) if width else None
-        known = None if pads is None else torch.from_numpy(pads)
-        expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), known)]
-        for difference in differences(run.outputs, expected, run(windows, pads), contract.output_full_scale):
+        poses = example_poses(len(windows), contract) if contract.takes_poses else None
+        known = [None if given is None else torch.from_numpy(given) for given in (pads, poses)]
+        expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), *known)]
+        for difference in differences(run.outputs, expected, run(windows, pads, poses), contract.output_full_scale):
             most = accepted(difference.output, tolerance)
             if not difference.relative <= most:
                 raise ParityError(
@@ -214,7 +247,7 @@ def read_windows(frozen: FrozenSet, contract: Contract, count: int | None = PARI
     step = 1 if count is None else max(1, len(frozen) // count) | 1
     windows = frozen.windows(contract.taps)[::step]
     return np.stack([contract.scale_window(window) for window in windows]).reshape(
-        len(windows), *contract.window_shape[1:]
+        len(windows), -1, contract.rows, contract.cols
     )
 
 
@@ -241,6 +274,7 @@ def extreme_windows(contract: Contract) -> Mapping[str, NDArray[np.float32]]:
         present = (np.arange(contract.taps) < given)[:, None, None, None]
         counts[f"{given} of {contract.taps} taps"] = np.where(present, press, 0).astype(np.float32)
     windows = {
-        name: contract.scale_window(window).reshape(1, *contract.window_shape[1:]) for name, window in counts.items()
+        name: contract.scale_window(window).reshape(1, -1, contract.rows, contract.cols)
+        for name, window in counts.items()
     }
     return windows | {"denormals": np.full(windows["zeros"].shape, _DENORMAL_BITS, dtype=np.uint32).view(np.float32)}

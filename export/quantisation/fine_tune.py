@@ -90,7 +90,7 @@ def fine_tuned(
     """
     trained = copy.deepcopy(net)
     objective = HeteroscedasticError() if isinstance(trained, CompactNet) else RelativeError()
-    batches = batches_of(sequences, net.scale, recipe, seed)
+    batches = batches_of(sequences, net.scale, recipe, seed, posed=net.takes_poses)
     with contextlib.ExitStack() as done:
         done.enter_context(rounded(trained, integer_convolutions(model, quantised_model)))
         folder = done.enter_context(tempfile.TemporaryDirectory())

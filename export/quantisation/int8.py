@@ -10,19 +10,22 @@ import io
 import logging
 import tempfile
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import onnx
 import onnxruntime
+import torch
 from numpy.typing import NDArray
 from onnx import NodeProto
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-from edge.inference.contract import INPUT_NAME, PAD_NAME, Contract
+from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ExportError
+from firmware_bridge.pad_geometry import AXES
 from train.data.batch import Batch
 from train.data.batches import Draw
 from train.data.dataset import Sequences
@@ -55,8 +58,15 @@ def calibration_batch(taps: Sequences | PressSet, contract: Contract) -> Batch:
     if len(taps) < _FEWEST:
         raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
     given = (1 / contract.taps,) * contract.taps
+    if contract.takes_poses:  # its batches have one number of taps each: all, of which some are left out below
+        given = (*[0.0] * (contract.taps - 1), 1.0)
     recipe = Recipe(1, batch=min(len(taps), _CALIBRATED_ON), given=given)
-    return batches_of(taps, contract.scale, recipe, 0, Draw(set_force_n=_SET_FORCE_N))(0)
+    draw = Draw(set_force_n=_SET_FORCE_N)
+    batch = batches_of(taps, contract.scale, recipe, 0, draw, posed=contract.takes_poses)(0)
+    if contract.takes_poses:
+        there = torch.arange(contract.taps) <= torch.arange(len(batch.window))[:, None] % contract.taps
+        batch = replace(batch, window=batch.window * there.repeat_interleave(len(AXES), dim=1)[:, :, None, None])
+    return batch
 
 
 class _Inputs(CalibrationDataReader):
@@ -89,6 +99,9 @@ def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> on
     if not nodes:
         raise ExportError("no convolution of the graph may be quantised: export it without --int8")
     inputs = {INPUT_NAME: seen.window.numpy()}
+    if seen.poses is not None:
+        inputs[INPUT_NAME] = seen.window.unflatten(1, (-1, len(AXES))).numpy()
+        inputs[POSES_NAME] = seen.poses.numpy()
     if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
         inputs[PAD_NAME] = seen.pad.numpy()
     with tempfile.TemporaryDirectory() as drafts, _quiet():

@@ -14,6 +14,7 @@ from train.networks.fusion import FusionNet
 from train.networks.registry import grown
 
 KNOWN = 5
+REACHES = (torch.tensor(0.1), torch.tensor(0.1))
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +90,12 @@ def test_a_shift_by_half_a_pitch_moves_what_an_earlier_tap_shows_by_a_cell(net):
     state = torch.zeros(1, 1, 8, 8)
     state[0, 0, 3, 4] = 1
     pose = torch.tensor([[[2.35, -2.35, 0.0, 0.0, 0.0]]])
-    moved = _Carrier(pose, there, (8, 8), torch.tensor([-2.0, -2.0])).to_taps(state)
+    moved = _Carrier(pose, there, (4, 4), REACHES).to_taps(state)
     assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (4, 3), (
         "one cell up and to the right of the newest tap"
     )
     turned = torch.tensor([[[0.0, 0.0, 90.0, 0.0, 0.0]]])
-    moved = _Carrier(turned, there, (8, 8), torch.tensor([-2.0, -2.0])).to_taps(state)
+    moved = _Carrier(turned, there, (4, 4), REACHES).to_taps(state)
     # x of the turned pad points down the newest one's rows: half a cell right, half a cell up is half up, half left.
     assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (3, 3)
 
@@ -107,7 +108,7 @@ def test_a_larger_stated_error_widens_the_weights():
     peaks = []
     for error_mm in (0.0, 2.0):
         pose = torch.tensor([[[0.0, 0.0, 0.0, error_mm, 0.0]]])
-        peaks.append(float(_Carrier(pose, there, (8, 8), torch.tensor([-1.0, -1.0])).to_taps(state).max()))
+        peaks.append(float(_Carrier(pose, there, (4, 4), REACHES).to_taps(state).max()))
     assert peaks[1] < 0.5 * peaks[0]
 
 

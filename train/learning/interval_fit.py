@@ -21,6 +21,7 @@ from edge.terminal.progress_bar import tracked
 from train.data.batches import network_input
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
+from train.data.posed_batches import PosedBatches, stated_poses
 from train.data.press_batches import PressBatches
 from train.data.presses import PressSet
 from train.learning.interval_calibration import LEVEL, half_width_mm
@@ -44,8 +45,10 @@ _LEAST_RATIO: Final = 1e-3
 _READINGS: Final = 3
 """Sensors that read each validation press."""
 
-Run = Callable[[NDArray[np.float32], NDArray[np.float32] | None], Sequence[NDArray[np.float32]]]
-"""Function from windows in network units, and pads, to patterns and deviations, in [mm]."""
+Run = Callable[
+    [NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32] | None], Sequence[NDArray[np.float32]]
+]
+"""Function from windows in network units, pads and poses to patterns and deviations, in [mm]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +59,13 @@ class Readings:
         windows: (n, K, 3, rows, cols) in zeroed counts.
         pads: (n, width), inputs of the pads; None if nothing is known.
         truth: (n, H, W) in [mm].
+        poses: (n, K, 5) of the taps, as a robot states them; None for the schedule.
     """
 
     windows: NDArray[np.float32]
     pads: NDArray[np.float32] | None
     truth: NDArray[np.float32]
+    poses: NDArray[np.float32] | None = None
 
     def with_taps(self, given: int) -> NDArray[np.float32]:
         """Return the windows in network units with the newest `given` taps, the others zero: (n, 3K, rows, cols)."""
@@ -69,14 +74,17 @@ class Readings:
         return network_input(windows).numpy()
 
 
-def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS) -> list[Readings]:
+def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS, *, posed: bool = False) -> list[Readings]:
     """Return presses as sensors of their own read them, with nothing and with everything known of each sensor."""
     found = []
     for number in range(times):
         frozen = freeze_presses(presses, SEED + number)
+        poses = None
+        if posed:
+            poses = stated_poses(np.random.default_rng(SEED + number), presses.with_taps(taps).poses)
         for known in (False, True):
             windows = frozen.windows(taps, gains_known=known)
-            found.append(Readings(windows, frozen.pads(known=known), frozen.patterns()))
+            found.append(Readings(windows, frozen.pads(known=known), frozen.patterns(), poses))
     return found
 
 
@@ -147,7 +155,7 @@ def _ratios(
     """Return errors over half widths in each region, with the newest `given` taps."""
     parts: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
     for one in readings:
-        pattern, deviation = run(one.with_taps(given), one.pads)[:2]
+        pattern, deviation = run(one.with_taps(given), one.pads, one.poses)[:2]
         ratio = np.abs(pattern - one.truth) / half_width_mm(deviation)
         region = regions(pattern, float(correction.contact_level), correction.near)
         for number, part in enumerate(parts):
@@ -172,12 +180,14 @@ def _samples(
     kept = [rng.permutation(usable[names == name])[:_PER_FAMILY] for name in np.unique(names)]
     chosen = whole.pick(rng.permutation(np.concatenate(kept))) if kept else whole
     at_once = min(_PRESSES_AT_ONCE, len(chosen))
-    draw = PressBatches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
+    batches = PosedBatches if net.takes_poses else PressBatches
+    draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
     found: list[tuple[Any, ...]] = []
     for number in tracked(range(max(_ROUNDS * len(chosen) // at_once, 1)), "intervals", "batch"):
         batch = draw(number)
         with torch.inference_mode():
-            seen = net.see(batch.window, batch.pad)
+            posed = () if batch.poses is None else (batch.poses,)
+            seen = net.see(batch.window, batch.pad, *posed)
             pattern = torch.relu(seen.pattern)
             peak = pattern.amax(dim=(1, 2), keepdim=True)
             masks = correction.masks(pattern, peak)

@@ -7,15 +7,19 @@ readings, and what differs comes back. What a chip shows in all taps is averaged
 chip and not to the place. Number and order of the earlier taps are free, and one tap alone is a network of one tap.
 """
 
+from collections.abc import Sequence
+from functools import lru_cache
 from math import log
 from typing import Final
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from edge.inference.pose_input import scheduled_rows
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.networks.compact import QUIET_UNITS, CompactNet, Seen, tap_amplitude
 from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 from train.surfaces.poses import ANGLE_STEP_DEG
@@ -29,6 +33,10 @@ _CELLS: Final = 2
 _FIRST_REACH: Final = 0.5
 """Distance in cells at which a weight has fallen to .6, before training."""
 _LEAST_WEIGHT: Final = 1e-2
+_TERMS: Final = 4
+_CELL_MM: Final = USPA44.pitch_mm / _CELLS
+_APART: Final = 5
+"""Dimensions of a window whose taps have a dimension of their own."""
 _PLACE_MM: Final = 5.0
 _TURN_ERROR_DEG: Final = 5.0
 """Lengths and angles that enter as 1."""
@@ -51,6 +59,8 @@ class FusionNet(CompactNet):
     """
 
     takes_poses = True
+    reach_to: Tensor
+    reach_from: Tensor
 
     def __init__(
         self,
@@ -108,13 +118,25 @@ class FusionNet(CompactNet):
         self.enter_earlier.assign(weight, self.enter.bias.detach())
         self.encode[1].load_state_dict(self.merge[1].state_dict())
 
+    def write_out(self) -> None:
+        """Replace the logarithms of the reaches by variances, which a graph holds under their own names."""
+        for name, variance in zip(("reach_to", "reach_from"), torch.exp(2 * self.log_reach.detach()), strict=True):
+            self.register_buffer(name, variance.clone())
+        del self.log_reach
+
+    def _reaches(self) -> Sequence[Tensor]:
+        if hasattr(self, "reach_to"):
+            return self.reach_to, self.reach_from
+        return torch.exp(2 * self.log_reach).unbind()
+
     def forward(
         self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
 
         Args:
-            window: (n, 3k, rows, cols) in network units, of 1 to K taps, newest first; absent taps are all zeros.
+            window: (n, 3k, rows, cols), or (n, k, 3, rows, cols), in network units, of 1 to K taps, newest first;
+                absent taps are all zeros.
             pad: (n, known), constants of the pads; None for no constants.
             poses: (n, k, 5), x, y in [mm] and turn in [deg] of each tap in the newest one's axes, then the standard
                 deviations of place and turn; None for the paper's schedule.
@@ -123,14 +145,16 @@ class FusionNet(CompactNet):
 
     def see(self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None) -> Seen:
         """Return the outputs before any correction, and what they were made of; arguments as `forward`."""
-        rows, cols = window.shape[2:]
-        taps = window.unflatten(1, (-1, 3))
+        taps = window if window.ndim == _APART else window.unflatten(1, (-1, 3))
+        rows, cols = taps.shape[3:]
         amplitude = tap_amplitude(taps)
         shapes, newest = taps / amplitude, amplitude[:, 0, 0]
         there = (amplitude[:, 1:] > QUIET_UNITS).to(window.dtype)
         entered = self.enter_pad(shapes[:, 0], shapes[:, 0], self.about(newest, pad))
-        poses = self._schedule(taps) if poses is None else poses
-        carrier = _Carrier(poses[:, 1:], there, (rows * _CELLS, cols * _CELLS), self.log_reach)
+        if poses is None:
+            rows_of_schedule = torch.from_numpy(scheduled_rows(taps.shape[1], ANGLE_STEP_DEG)).to(taps)
+            poses = rows_of_schedule.expand(len(taps), -1, -1)
+        carrier = _Carrier(poses[:, 1:], there, (rows, cols), self._reaches())
 
         sizes = (amplitude / (amplitude + 1))[:, 1:, 0, 0]
         pads = entered.about[:, None, :-1].expand(-1, there.shape[1], -1)
@@ -153,83 +177,110 @@ class FusionNet(CompactNet):
         later = (number > torch.arange(self.taps - 1)).to(window.dtype)
         return self.leave_pad(state, entered, newest, later)
 
-    @staticmethod
-    def _schedule(taps: Tensor) -> Tensor:
-        """Return the poses of the paper's schedule, (n, k, 5)."""
-        number = torch.arange(taps.shape[1], dtype=taps.dtype)[:, None]
-        later = (number > 0).to(taps.dtype)
-        zeros = torch.zeros_like(number)
-        errors = [later * PLACE_ERROR_MM, later * TURN_ERROR_DEG]
-        return torch.cat([zeros, zeros, number * ANGLE_STEP_DEG, *errors], dim=1).expand(len(taps), -1, -1)
-
 
 class _Carrier:
     """Exchange of features between the cells of earlier taps and those of the newest one, by the taps' poses.
 
-    A weight is a Gaussian of two cells' distance; the error of the pose widens it.
+    A weight is a Gaussian of two cells' distance; the error of the pose widens it. Cells of an earlier tap are in the
+    order in which its channels hold them: the four parts of a taxel first, then rows and columns.
 
     Args:
         poses: (n, k - 1, 5) of the earlier taps.
         there: (n, k - 1, 1, 1, 1), 1 for each that is there, else 0.
-        shape: cells of a pad, (height, width).
-        log_reach: (2,), logarithms of the Gaussians' deviations in cells, to the newest tap and from it.
+        grid: taxels of a pad, (rows, cols).
+        reaches: variances of the Gaussians in cells, to the newest tap and from it.
 
     Attributes:
         inputs: (n, k - 1, 7), the poses as inputs of the encoder.
         any: (n, 1, 1, 1), 1 where some earlier tap is there, else 0.
     """
 
-    def __init__(self, poses: Tensor, there: Tensor, shape: tuple[int, int], log_reach: Tensor) -> None:
-        self._taps, self._shape = poses.shape[:2], shape
-        place, turn, errors = poses[..., :2], torch.deg2rad(poses[..., 2:3]), poses[..., 3:]
-        cosine, sine = torch.cos(turn), torch.sin(turn)
-        about_errors = torch.cat([errors[..., :1], errors[..., 1:] / _TURN_ERROR_DEG], dim=2)
-        self.inputs = torch.cat([place / _PLACE_MM, torch.zeros_like(turn), 1 - cosine, sine, about_errors], dim=2)
+    def __init__(self, poses: Tensor, there: Tensor, grid: tuple[int, int], reaches: Sequence[Tensor]) -> None:
+        self._taps, self._grid, self._cells = poses.shape[:2], grid, _CELLS**2 * grid[0] * grid[1]
         self.any = (there.sum(dim=1) > 0).to(poses.dtype)
-        cell_mm = USPA44.pitch_mm / _CELLS
-        down, across = (torch.arange(length) - (length - 1) / 2 for length in shape)
-        y, x = (grid.flatten().to(poses.dtype) for grid in torch.meshgrid(down, across, indexing="ij"))
-        x_there = cosine * x - sine * y + place[..., :1] / cell_mm  # (n, k - 1, cells), in the newest tap's axes
-        y_there = sine * x + cosine * y + place[..., 1:] / cell_mm
-        away = x * x + y * y
-        error = (errors[..., :1] / cell_mm).square() + torch.deg2rad(errors[..., 1:]).square() * away
-        # Minus half the squared distance over the variance, as one product of matrices.
-        here = torch.stack([x, y, torch.ones_like(x), away], dim=1)
-        whole = x_there * x_there + y_there * y_there
+        self._there = there.transpose(1, 2)[..., 0]  # (n, 1, k - 1, 1)
+        constants = [torch.from_numpy(one).to(poses.dtype) for one in (*_encoding(), *_geometry(*grid))]
+        factors, offsets, here, course, spread = constants
+        turn = torch.deg2rad(poses[..., 2:3])
+        cosine, sine = torch.cos(turn), torch.sin(turn)
+        place, errors = poses[..., :2] / _CELL_MM, poses[..., 3:]
+        self.inputs = torch.cat([poses[..., :2], cosine, sine, errors], dim=2) @ factors + offsets
+        # Where a cell lies in the newest tap's axes, and its distance there from the pad's centre, follow from the pose
+        # linearly.
+        x, y = place[..., :1], place[..., 1:]
+        moved = [cosine, sine, place, cosine * x + sine * y, cosine * y - sine * x, x * x + y * y]
+        terms = (torch.cat([*moved, torch.ones_like(x)], dim=2) @ course).unflatten(2, (_TERMS, -1))
+        variance = (torch.cat([errors[..., :1] / _CELL_MM, torch.deg2rad(errors[..., 1:])], dim=2).square() @ spread)[
+            :, :, None
+        ]
         self._weights: list[Tensor] = []
-        for variance in torch.exp(2 * log_reach).unbind():
-            inverse = 1 / (variance + error)
-            terms = torch.stack([x_there, y_there, -whole / 2, torch.full_like(whole, -0.5)], dim=3)
-            terms = (terms * inverse[..., None]).flatten(1, 2).transpose(1, 2)
-            self._weights.append(torch.exp((here @ terms).clamp_max(0.0)))  # (n, cells, (k - 1) cells)
-        self._there = there[:, :, 0, 0].expand(-1, -1, len(x)).flatten(1)[..., None]
+        for reach in reaches:
+            # Minus half the squared distance over the variance, as one product of matrices.
+            over = (terms / (variance + reach)).transpose(1, 2).flatten(2)  # (n, 4, (k - 1) cells)
+            self._weights.append(torch.exp((here @ over).clamp_max(0.0)))  # (n, cells, (k - 1) cells)
 
     def to_newest(self, sent: Tensor) -> Tensor:
         """Return carried channels and the logarithms of their weights, (n, c + heads, H, W), of what taps sent.
 
         Args:
-            sent: (n (k - 1), 4 (c + heads), rows, cols), four cells of a taxel side by side as before a pixel shuffle.
+            sent: (n (k - 1), 4 (c + heads), rows, cols).
         """
-        count, earlier = self._taps
-        apart = sent.view(count, earlier, _CARRIED + _HEADS, _CELLS, _CELLS, *sent.shape[2:])
-        cells = apart.permute(0, 1, 5, 3, 6, 4, 2).flatten(1, 5)  # (n, (k - 1) cells, c + heads)
-        weight = F.softplus(cells[..., _CARRIED:]) * self._there
-        weighted = (cells[..., :_CARRIED].unflatten(2, (_HEADS, -1)) * weight[..., None]).flatten(2)
-        total = self._weights[0] @ torch.cat([weighted, weight], dim=2)
-        amount = total[..., _CARRIED:] + _LEAST_WEIGHT
-        mean = (total[..., :_CARRIED].unflatten(2, (_HEADS, -1)) / amount[..., None]).flatten(2)
-        return torch.cat([mean, torch.log(amount)], dim=2).transpose(1, 2).unflatten(2, self._shape)
+        cells = sent.reshape(*self._taps, _CARRIED + _HEADS, self._cells).transpose(1, 2)
+        weight = F.softplus(cells[:, _CARRIED:]) * self._there
+        weighted = cells[:, :_CARRIED].unflatten(1, (_HEADS, -1)) * weight[:, :, None]
+        total = torch.cat([weighted.flatten(1, 2), weight], dim=1).flatten(2) @ self._weights[0].transpose(1, 2)
+        amount = total[:, _CARRIED:] + _LEAST_WEIGHT
+        mean = (total[:, :_CARRIED].unflatten(1, (_HEADS, -1)) / amount[:, :, None]).flatten(1, 2)
+        return torch.cat([mean, torch.log(amount)], dim=1).unflatten(2, [_CELLS * length for length in self._grid])
 
     def to_taps(self, state: Tensor) -> Tensor:
-        """Return channels (n, c, H, W) of the newest tap's cells in each earlier tap's axes.
+        """Return channels (n, c, H, W) in each earlier tap's axes, (n (k - 1), 4 c, rows, cols)."""
+        (count, earlier), (rows, cols), channels = self._taps, self._grid, state.shape[1]
+        weight = self._weights[1]
+        weight = weight / (weight.sum(dim=1, keepdim=True) + _LEAST_WEIGHT)
+        moved = (state.flatten(2) @ weight).reshape(count, channels, earlier, self._cells)
+        return moved.transpose(1, 2).reshape(count * earlier, _CELLS**2 * channels, rows, cols)
 
-        Returns:
-            (n (k - 1), 4 c, rows, cols), four cells of a taxel side by side.
-        """
-        weight = self._weights[1].transpose(1, 2)
-        weight = weight / (weight.sum(dim=2, keepdim=True) + _LEAST_WEIGHT)
-        moved = weight @ state.flatten(2).transpose(1, 2)
-        (count, earlier), (height, width), channels = self._taps, self._shape, state.shape[1]
-        rows, cols = height // _CELLS, width // _CELLS
-        apart = moved.view(count, earlier, rows, _CELLS, cols, _CELLS, channels).permute(0, 1, 6, 3, 5, 2, 4)
-        return apart.reshape(count * earlier, channels * _CELLS**2, rows, cols)
+
+@lru_cache
+def _encoding() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return factors (6, 7) and offsets (7,) from x, y, cosine, sine and both errors to inputs of the encoder."""
+    factors, offsets = np.zeros((6, 7), dtype=np.float32), np.zeros(7, dtype=np.float32)
+    factors[0, 0] = factors[1, 1] = 1 / _PLACE_MM  # a vector, whose third part is 0
+    factors[2, 3], offsets[3] = -1, 1
+    factors[3, 4] = factors[4, 5] = 1
+    factors[5, 6] = 1 / _TURN_ERROR_DEG
+    return factors, offsets
+
+
+@lru_cache
+def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return constants of a grid of taxels.
+
+    Returns:
+        Terms of the newest tap's cells, (cells, 4); factors (8, 4 cells) from a pose to the terms of an earlier tap's
+        cells; and factors (2, cells) from the squared errors of a pose to their variances.
+    """
+    part_y, part_x, row, col = np.meshgrid(*map(np.arange, (_CELLS, _CELLS, rows, cols)), indexing="ij")
+    x = (_CELLS * col + part_x - (_CELLS * cols - 1) / 2).ravel()
+    y = (_CELLS * row + part_y - (_CELLS * rows - 1) / 2).ravel()
+    away, none, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)
+    order = np.lexsort((x, y))  # the newest tap's rows and columns
+    here = np.stack([x, y, one, away], axis=1)[order]
+    course = np.stack(
+        [  # of x there, y there, minus half their squares, and the constant
+            np.stack(terms)
+            for terms in (
+                (x, y, none, none),
+                (-y, x, none, none),
+                (one, none, none, none),
+                (none, one, none, none),
+                (none, none, -x, none),
+                (none, none, -y, none),
+                (none, none, -one / 2, none),
+                (none, none, -away / 2, -one / 2),
+            )
+        ]
+    )
+    spread = np.stack([one, away])
+    return here.astype(np.float32), course.reshape(len(course), -1).astype(np.float32), spread.astype(np.float32)

@@ -197,7 +197,12 @@ class SymmetricResidual(nn.Module):
 
 
 def write_out(net: nn.Module) -> nn.Module:
-    """Replace every symmetric convolution of a network, in place, by the equivalent ordinary one."""
+    """Replace every symmetric convolution of a network, in place, by the equivalent ordinary one.
+
+    A part that computes with its parameters before it uses them has a `write_out` of its own.
+    """
+    if (own := getattr(net, "write_out", None)) is not None:
+        own()
     for name, part in net.named_children():
         if isinstance(part, SymmetricConv2d):
             setattr(net, name, part.written_out())
