@@ -12,13 +12,14 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Mapping, Sequence
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edge.errors import SinkError
 from edge.perception.field import Columns, Out
@@ -52,6 +53,7 @@ class NpzSink(Sink):
         *,
         deviations: bool = False,
         traction_shape: tuple[int, ...] | None = None,
+        poses_shape: tuple[int, ...] | None = None,
         origin: SourceKind | None = None,
     ) -> None:
         """Start the parts.
@@ -62,6 +64,7 @@ class NpzSink(Sink):
             pattern_shape: (H, W).
             deviations: patterns come with deviations.
             traction_shape: (3, h, w), where patterns come with tractions.
+            poses_shape: (taps, 5) of the most taps, where patterns are made from taps with poses.
             origin: kind of source that the scans come from, where results are of a recording; else that of the results.
 
         Raises:
@@ -78,6 +81,7 @@ class NpzSink(Sink):
             "pattern": pattern_shape,
             "deviation": pattern_shape if deviations else None,
             "traction": traction_shape,
+            "poses": poses_shape,
         }
         self._layout: dict[str, tuple[str, tuple[int, ...]]] = {}
         columns = []
@@ -85,6 +89,8 @@ class NpzSink(Sink):
             shape, column = shapes[field.kind.shape], field.in_array()
             if Out.NPZ in field.out and shape is not None:
                 kind = field.kind.array
+                if field.kind.shape == "poses":
+                    column = column._replace(make=partial(_filled_up, taps=shape[0]))
                 self._layout[field.name] = (kind, (len(field.parts),) if field.parts else shape)
                 columns.append(column._replace(unknown=np.full(shape, column.unknown, kind)) if shape else column)
         self._columns = Columns(columns)
@@ -207,6 +213,11 @@ def gather(path: Path) -> int:
 def _write_whole(file: FileIO, data: bytes) -> None:
     while data:  # a disk that fills takes a part of it, and refuses the rest
         data = data[file.write(data) :]
+
+
+def _filled_up(poses: NDArray[np.float32], taps: int) -> NDArray[np.float32]:
+    """Return the poses (K, 5) of fewer taps, with NaN for the others."""
+    return np.pad(poses, ((0, taps - len(poses)), (0, 0)), constant_values=np.nan)
 
 
 def _read_layout(parts: Path) -> dict[str, tuple[str, list[int]]]:
