@@ -52,7 +52,7 @@ class TapPoses:
         for peak in tap.peaks:
             if peak.tap not in known and (pose := track.at(peak.time_ns)) is not None:
                 known[peak.tap] = pose
-        if len(known) > len(tap.peaks):
+        if max(len(known), len(self._reported) - 1) > len(tap.peaks):
             remembered = {peak.tap for peak in tap.peaks}
             self._poses = {number: pose for number, pose in known.items() if number in remembered}
             self._reported &= remembered | {tap.tap}

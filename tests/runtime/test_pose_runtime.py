@@ -127,6 +127,21 @@ def test_a_newest_scan_without_a_pose_is_used_alone():
     assert pad.events == ["tap_without_pose"]
 
 
+def test_taps_that_have_left_the_window_are_forgotten():
+    runtime = make_runtime(PosedModel(), options=EVERY)
+    pad = Pad(runtime)
+    pad.tap(PadPose(0, 0))
+    pad.lose_pose()
+    for _ in range(20):
+        pad.tap()
+    assert pad.events.count("tap_without_pose") >= 19
+    pad.tap(PadPose(0, 0))
+    for _ in range(20):
+        pad.tap()
+    poses = runtime._sensors["4"].poses
+    assert len(poses._reported) <= 8 and len(poses._poses) <= 6
+
+
 def test_a_pose_that_comes_after_its_tap_counts():
     pad = Pad(make_runtime(PosedModel(), options=EVERY))
     pad.place(PadPose(0, 0), sensor="another")
