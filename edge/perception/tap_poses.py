@@ -1,4 +1,4 @@
-"""Which of a sensor's taps a model that takes poses can use, and their poses."""
+"""Choice of a sensor's taps for a model that takes poses, and their poses."""
 
 from collections.abc import Callable, Sequence
 from math import hypot
