@@ -13,11 +13,11 @@ that makes the runtime. A request that cannot be met raises a BridgeError or an 
 
 import math
 import threading
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edge.doctor.unattended import examine
 from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, SinkError, UsageError, WindowError
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
@@ -37,7 +37,7 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
+from edge.pipeline.source_setup import links_to, references, settled, with_recorded
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
@@ -54,6 +54,8 @@ from firmware_bridge.errors import (
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP
 from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap, layout_c
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
@@ -61,7 +63,6 @@ from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:
-    from edge.doctor.findings import Finding
     from edge.inference.onnx_session import ModelSession
     from firmware_bridge.links.discovery import Found
 
@@ -93,6 +94,7 @@ __all__ = [
     "NoDeviceError",
     "Note",
     "Pad",
+    "PadPose",
     "RecordingError",
     "Result",
     "Runtime",
@@ -108,6 +110,7 @@ __all__ = [
     "SourceKind",
     "Statistics",
     "Stream",
+    "TimedPose",
     "UsageError",
     "WindowError",
     "Wrench",
@@ -248,6 +251,7 @@ def open_runtime(
     follow_drift: bool = True,
     fallback: bool = True,
     learn: bool = True,
+    taps: int | None = None,
 ) -> Runtime:
     """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
 
@@ -268,11 +272,14 @@ def open_runtime(
         follow_drift: let the rest level follow the readings of a free pad.
         fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
+        taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
+            none: taps then follow the paper's schedule, each turned by 5 degrees from the one before.
 
     Raises:
         ModelError: the model does not exist, cannot be used, or is for another sensor.
         RecordingError: the baseline file cannot be used, or its taxel order is not that of the sensor file.
-        UsageError: the source is not open; a baseline is of another grid; a number is out of range.
+        UsageError: the source is not open; a baseline is of another grid; a number is out of range; `taps` is more than
+            the model takes.
     """
     known, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
     return Runtime(
@@ -287,7 +294,8 @@ def open_runtime(
         pad=known.pads if pad is None else pad,
         measured=known.measured_pads if pad is None else None,
         options=RuntimeOptions(
-            contact_on_counts, contact_off_counts, idle_reset_s, every_scan, every_tap, follow_drift, fallback, learn
+            *(contact_on_counts, contact_off_counts, idle_reset_s),
+            *(every_scan, every_tap, follow_drift, fallback, learn, taps),
         ),
         unix_time_s=source.unix_time_s,
     )
@@ -355,41 +363,3 @@ def devices() -> "tuple[list[Found], list[str]]":
     from firmware_bridge.links import discovery as devices
 
     return devices.devices()
-
-
-def examine(
-    *texts: str,
-    sensor: str | Path | None = None,
-    id_map: str | None = None,
-    rate_hz: float | None = None,
-    baselines: Mapping[str, Baseline] | str | Path | None = None,
-    duration_s: float = 60.0,
-    stop: threading.Event | None = None,
-) -> "list[Finding]":
-    """Watch free, still pads and report faults of sensor and adapter, as `edge-sr doctor` does without a person.
-
-    Args:
-        texts: as for `open_source`, but at most one; no other program may read it meanwhile.
-        sensor: as for `open_source`.
-        id_map: as for `open_source`.
-        rate_hz: expected rate of each sensor, in [Hz].
-        baselines: of the free pads, or their file; by default those of the sensor file.
-        duration_s: how long to watch, in [s].
-        stop: event that ends it early.
-
-    Raises:
-        BridgeError: as for `open_source`; LinkLostError if the link is lost meanwhile.
-        UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
-    """
-    from edge.doctor.examine import examine as judge
-    from edge.doctor.watch import Watch
-
-    check_positive("duration_s", duration_s)
-    known = settled(sensor, id_map)
-    stop = threading.Event() if stop is None else stop
-    watch = Watch(texts, known, references=references(baselines, known), rate_hz=rate_hz, stop=stop)
-    with watch.link:
-        refuse_emulated(known, watch.link.kind, force=False)
-        watch.run(duration_s)
-        watched = watch.watched()
-    return judge(watched, time.time()).findings

@@ -85,3 +85,16 @@ def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry)
         if mounting.taxel_count != geometry.taxel_count:
             got = f"mounting of sensor {name} is of {mounting.taxel_count} taxels"
             raise UsageError(f"{got}, expected {geometry.taxel_count}: run edge-sr doctor with the sensor's --id-map")
+
+
+def check_counts_per_newton(counts: float | Mapping[str, float] | None) -> None:
+    """Refuse counts per newton, of all sensors or by name, that are not positive and finite.
+
+    Raises:
+        UsageError: they are out of range.
+    """
+    if isinstance(counts, Mapping):
+        for name, one in counts.items():
+            check_positive(f"counts_per_newton of sensor {name}", one)
+    elif counts is not None:
+        check_positive("counts_per_newton", counts)

@@ -107,15 +107,23 @@ class _Counted:
     def traction(self) -> NDArray[np.float32] | None:
         return self._model.traction
 
-    def run(self, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def run(
+        self,
+        window: NDArray[np.float32],
+        pad: NDArray[np.float32] | None = None,
+        poses: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
         self.windows += 1
-        return self._model.run(window, pad)
+        return self._model.run(window, pad, poses)
 
     def run_together(
-        self, windows: Sequence[NDArray[np.float32]], pads: Sequence[NDArray[np.float32]] | None = None
+        self,
+        windows: Sequence[NDArray[np.float32]],
+        pads: Sequence[NDArray[np.float32]] | None = None,
+        poses: Sequence[NDArray[np.float32]] | None = None,
     ) -> NDArray[np.float32]:
         self.windows += len(windows)
-        return self._model.run_together(windows, pads)
+        return self._model.run_together(windows, pads, poses)
 
 
 def _measured(

@@ -253,6 +253,12 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     add("--every-scan", action="store_true", help="run the inference even if nothing has changed")
     add("--every-tap", action="store_true", help="use all taps, even those not expected to help")
     add(
+        "--taps",
+        metavar="K",
+        type=whole(1),
+        help="most taps of a pattern (default: all that the model takes; 1 if it takes poses and there are none)",
+    )
+    add(
         "--no-fallback",
         dest="fallback",
         action="store_false",

@@ -21,6 +21,8 @@ CHANGED_RMS_COUNTS: Final = 1.4 * math.sqrt(2) * NOISE_COUNTS
 """RMS change of all readings that noise, present in both scans, does not reach: four of its deviations away."""
 CHANGED_COUNTS: Final = 5 * math.sqrt(2) * NOISE_COUNTS
 """Change of one reading that noise does not reach."""
+MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
+"""Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
 
 
 class TapsThatMatter:
@@ -60,10 +62,21 @@ class LastReading:
         self._counts = np.zeros(scan_shape, dtype=np.float32)
         self._change = np.zeros(scan_shape, dtype=np.float32)
         self._made_by: Hashable = None
+        self._poses: NDArray[np.float32] | None = None
 
-    def holds(self, counts: NDArray[np.float32], made_by: Hashable) -> bool:
-        """Return whether zeroed readings (3, rows, cols) differ by noise alone and the pattern has the same maker."""
+    def holds(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> bool:
+        """Return whether nothing has changed: zeroed readings and poses beyond noise, and the pattern's maker.
+
+        Args:
+            counts: (3, rows, cols).
+            made_by: what distinguishes the pattern from others; it includes the number of taps.
+            poses: (taps, 5) of the taps, for a model that takes them.
+        """
         if made_by != self._made_by:
+            return False
+        if poses is not None and (
+            self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
+        ):
             return False
         np.subtract(counts, self._counts, out=self._change)
         np.abs(self._change, out=self._change)
@@ -71,7 +84,8 @@ class LastReading:
             return False
         return float(np.vdot(self._change, self._change)) <= CHANGED_RMS_COUNTS**2 * self._change.size
 
-    def keep(self, counts: NDArray[np.float32], made_by: Hashable) -> None:
-        """Keep the readings that a pattern was made from, and its maker; None as the maker keeps nothing."""
+    def keep(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> None:
+        """Keep the readings and poses that a pattern was made from, and its maker; None as the maker keeps nothing."""
         self._counts[...] = counts
+        self._poses = poses
         self._made_by = made_by

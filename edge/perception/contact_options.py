@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from edge.errors import UsageError
+from edge.validation import check_whole
 
 ON_COUNTS: Final = 1500.0
 """Summed z at which a tap begins: about 1.3 N, twelve times the thermal drift of one taxel."""
@@ -25,9 +26,11 @@ class RuntimeOptions:
         follow_drift: let the rest level follow the readings of a free pad.
         fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the channels from contacts.
+        taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
+            none: its taps then follow the paper's schedule.
 
     Raises:
-        UsageError: the contact thresholds or the time are out of range.
+        UsageError: the contact thresholds, the time or the taps are out of range.
     """
 
     contact_on_counts: float = ON_COUNTS
@@ -38,6 +41,7 @@ class RuntimeOptions:
     follow_drift: bool = True
     fallback: bool = True
     learn: bool = True
+    taps: int | None = None
 
     def __post_init__(self) -> None:
         on_counts, off_counts = self.contact_on_counts, self.contact_off_counts
@@ -45,6 +49,8 @@ class RuntimeOptions:
             raise UsageError(f"contact thresholds are on {on_counts}, off {off_counts}: expected 0 < off <= on")
         if not self.idle_reset_s > 0:
             raise UsageError(f"idle_reset_s is {self.idle_reset_s} s, expected more than 0")
+        if self.taps is not None:
+            check_whole("taps", self.taps, 1)
 
 
 DEFAULTS: Final = RuntimeOptions()

@@ -11,7 +11,9 @@ from firmware_bridge.links.base import Notice, NoticeKind
 
 ZeroingKind = Literal["zeroing", "zeroed", "in_contact", "given_up", "rest_level"]
 TrustKind = Literal["tap_dropped", "suspected", "cleared", "gains_learned"]
-EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, "sink", "reset", "refused"]
+TapPoseKind = Literal["tap_without_pose", "tap_out_of_reach"]
+PoseSourceKind = Literal["poses_silent", "poses_back", "poses_trouble"]
+EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, TapPoseKind, PoseSourceKind, "sink", "reset", "refused"]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
 NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]
@@ -30,13 +32,15 @@ class Event:
 
             Kinds of a link, as in `Notice`, or of one sensor while others go on: "lost", "silent", "back", "trouble",
             "well". Kind of a recording that is played or made: "note". Kind of a sink: "sink", it was given up, or
-            nobody reads it.
+            nobody reads it. Kinds of a source of poses: "poses_silent", it stopped; "poses_back"; "poses_trouble",
+            poses are refused, or their times are off.
 
             Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
             has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
             its end; "tap_dropped", earlier taps do not belong to the contact; "suspected", contact after contact reads
-            like none, and "cleared", no longer; "gains_learned", gains learned from contacts are in use.
+            like none, and "cleared", no longer; "gains_learned", gains learned from contacts are in use;
+            "tap_without_pose" and "tap_out_of_reach", a tap is left out.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
         sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
@@ -70,8 +74,6 @@ class Event:
                 return f"zeroing refused: sensor {self.sensor} is in contact: {remedy}"
             case "given_up":
                 return f"sensor {self.sensor}: zeroing given up, the old baseline stays: {self.detail}"
-            case "tap_dropped":
-                return f"sensor {self.sensor}: {self.detail}"
             case "suspected":
                 causes = (
                     "several contacts in a row read like none: is a magnet or steel near it, is it another --id-map?"
@@ -79,7 +81,7 @@ class Event:
                 return f"sensor {self.sensor} is suspected: {self.detail or causes}"
             case "cleared":
                 return f"sensor {self.sensor}: contacts read as they should again"
-            case "rest_level" | "gains_learned":
+            case "rest_level" | "gains_learned" | "tap_dropped" | "tap_without_pose" | "tap_out_of_reach":
                 return f"sensor {self.sensor}: {self.detail}"
             case _:
                 return self.detail

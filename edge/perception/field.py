@@ -47,7 +47,8 @@ class Kind:
         unknown: value for "unknown" in outputs without null; None where the value is always available.
         words: the values of a choice. In shared memory they are numbered from 1, so that memory that nobody wrote is
             none of them, and the order is part of the format.
-        shape: name of a map's shape: "scan", "pattern", "deviation" or "traction".
+        shape: name of an array's shape: "scan", "pattern", "deviation", "traction" or "poses", which has a row for each
+            tap.
         cut: npz cuts a text that is too long, rather than refuse it.
     """
 

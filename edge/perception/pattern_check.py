@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.familiarity import contact_features, tap_features
+from edge.inference.familiarity import contact_features, pose_tap_features, tap_features
 from edge.inference.trust import Trust
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
@@ -92,17 +92,21 @@ class PatternCheck:
         certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
         self._gain_error = GAIN_SPREAD * (1 - certainty)
 
-    def belonging(self, window: NDArray[np.float32], taps: int) -> list[float]:
+    def belonging(
+        self, window: NDArray[np.float32], taps: int, poses: NDArray[np.float32] | None = None
+    ) -> list[float]:
         """Return how little each earlier tap belongs to the newest one: 0 to 1, and from .5 it does not.
 
         Args:
             window: (K, 3, rows, cols) in network units, newest tap first.
             taps: taps in it; the rest is empty.
+            poses: (K, 5) as edge.inference.pose_input makes them, for a model that takes poses.
         """
         check = self._trust.tap
         if taps < 2:
             return []
-        return [_share(score - check.limit) for score in check.network(tap_features(window[:taps]))]
+        features = tap_features(window[:taps]) if poses is None else pose_tap_features(window[:taps], poses[:taps])
+        return [_share(score - check.limit) for score in check.network(features)]
 
     def judge(
         self,

@@ -1,6 +1,7 @@
 """Result of a scan with a pattern: which taps it is made from, whether it is believed, and what follows from it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,11 @@ from firmware_bridge.pad_geometry import SensorGeometry
 
 
 def with_taps_that_belong(
-    result: Result, sensor: Sensor, counts: NDArray[np.float32], window: NDArray[np.float32]
+    result: Result,
+    sensor: Sensor,
+    counts: NDArray[np.float32],
+    window: NDArray[np.float32],
+    slots: Sequence[int],
 ) -> Result:
     """Return the result with fewer taps where an earlier one does not belong to the contact.
 
@@ -29,18 +34,20 @@ def with_taps_that_belong(
         sensor: its state.
         counts: (K, 3, rows, cols), the window in zeroed counts.
         window: the same in network units.
+        slots: places of its taps in the window of the sensor's tracker.
     """
     if sensor.check is None or result.taps_used < 2:
         return result
-    belonging = tuple(sensor.check.belonging(window, result.taps_used))
+    belonging = tuple(sensor.check.belonging(window, result.taps_used, result.poses))
     stranger = first_stranger(belonging)
     if stranger is None:
         return replace(result, tap_mismatch=belonging)
     if window[0, 2].sum() >= SAME_STRENGTH * window[stranger, 2].sum():
-        sensor.taps.keep(stranger - 1)
+        sensor.taps.keep(slots[stranger] - 1)
         which = "the tap before does" if stranger == 1 else f"taps from the {stranger}. before on do"
         sensor.report("tap_dropped", f"{which} not belong to this contact, and is forgotten")
-    return replace(result, tap_mismatch=belonging, taps_used=stranger, window=counts[:stranger])
+    poses = None if result.poses is None else result.poses[:stranger]
+    return replace(result, tap_mismatch=belonging, taps_used=stranger, window=counts[:stranger], poses=poses)
 
 
 def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32], *, fallback: bool) -> Result:

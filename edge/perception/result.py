@@ -12,6 +12,7 @@ from edge.perception.event import Event, Note, joined
 from edge.perception.pattern_check import REASON_TEXTS, Reason
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 from firmware_bridge.zeroing.drift_tracker import Drift
@@ -43,6 +44,9 @@ class Result:
             NaN if it was not zeroed; dead taxels as they read. None without a baseline.
         window: (taps, 3, rows, cols) float32, the taps that the pattern is made from, newest first, as `zeroed` with
             estimates for dead taxels; None without contact.
+        pose: of the pad at this scan, in the object's plane; None where it is not available.
+        poses: (taps, 5) float32, poses of the same taps as `window` in the axes of the newest tap's pad: dx and dy in
+            [mm], turn in [deg], and their standard deviations; None for a model that takes no poses.
         wrench: sums of the traction over the pad, see edge.perception.wrench.
         baseline: subtracted from the scan.
         drift: drift that was followed since the baseline was taken, and the step in rest level that was not.
@@ -62,6 +66,8 @@ class Result:
     deviation: NDArray[np.float32] | None = None
     zeroed: NDArray[np.float32] | None = None
     window: NDArray[np.float32] | None = None
+    pose: PadPose | None = None
+    poses: NDArray[np.float32] | None = None
     force_counts: float | None = None
     force_n: float | None = None
     area_mm2: float | None = None

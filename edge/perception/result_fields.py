@@ -19,6 +19,7 @@ from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
 from edge.perception.pattern_check import REASONS, dropped_taps
 from edge.perception.result import Result, mask_bits
 from edge.perception.wrench import Wrench
+from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.scans.scan import Scan, VendorReading
 from firmware_bridge.zeroing.drift_tracker import Drift
 
@@ -47,6 +48,7 @@ _SCAN: Final = Kind("array", "<f4", unknown=math.nan, shape="scan")
 _PATTERN: Final = Kind("array", "<f4", unknown=0.0, shape="pattern")
 _DEVIATION: Final = Kind("array", "<f4", unknown=0.0, shape="deviation")
 _TRACTION: Final = Kind("array", "<f4", unknown=0.0, shape="traction")
+_POSES: Final = Kind("array", "<f4", unknown=math.nan, shape="poses")
 
 
 def _there(_: object) -> bool:
@@ -96,6 +98,18 @@ def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
     }
 
 
+def _pose_numbers(pose: PadPose) -> tuple[float, ...]:
+    return (pose.x_mm, pose.y_mm, pose.turn_deg, pose.error_mm, pose.error_deg)
+
+
+def _pose(pose: PadPose) -> dict[str, float]:
+    return dict(zip(_POSE_KEYS, map(round, _pose_numbers(pose), repeat(4)), strict=True))
+
+
+def _poses(poses: NDArray[np.float32]) -> list[list[float]]:
+    return [list(map(round, row, repeat(4))) for row in poses.tolist()]
+
+
 _RECORD_NPZ: Final = Out.RECORD | Out.NPZ
 _RECORD_ROS: Final = Out.RECORD | Out.ROS
 _NONE: Final = Out(0)
@@ -103,6 +117,8 @@ _WRENCH_PARTS: Final = (
     *("force_x_n", "force_y_n", "force_z_n"),
     *("torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm"),
 )
+_POSE_KEYS: Final = ("x_mm", "y_mm", "turn_deg", "error_mm", "error_deg")
+_POSE_PARTS: Final = tuple(f"pose_{key}" for key in _POSE_KEYS)
 _CENTRE_PARTS: Final = ("centre_of_pressure_x_mm", "centre_of_pressure_y_mm")
 
 # fmt: off
@@ -169,6 +185,14 @@ FIELDS: Final = (
           "noise, gains and drift", decimals=4, byte=584),
     Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "
           "this contact, 0 to 1; from .5 it is left out", json=_rounded, out=Out.RECORD),
+    Field("pose", _REAL, "pose", "pose of the pad at this scan in the object's plane: place, turn from x to y, and "
+          "their standard deviations; unknown without poses", make=_pose_numbers, parts=_POSE_PARTS, json=_pose,
+          out=_RECORD_ROS),
+    Field("scan_pose", _REAL, "pose", "in records `pose`: x, y in mm, turn in degrees, and their standard deviations",
+          make=_pose_numbers, parts=_POSE_PARTS, out=Out.NPZ),
+    Field("poses", _POSES, "poses", "of each tap that the pattern is made from, newest first, its pad's pose as the "
+          "newest tap's pad sees it: dx, dy in mm, turn in degrees, and their standard deviations; unknown for models "
+          "that take no poses", json=_poses, out=_RECORD_NPZ),
     Field("run_time_us", _REAL, "run_time_us", "time of the inference, of all sensors in one call; unknown where the "
           "pattern was there already", decimals=1, byte=168),
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",

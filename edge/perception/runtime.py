@@ -1,27 +1,29 @@
 """Scan in, result out: all state between scans is kept here, per sensor."""
 
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.errors import WindowError
+from edge.errors import UsageError, WindowError
 from edge.inference.model_interface import Model
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
-from edge.perception.event import Event, EventKind, Note, Untimed
+from edge.perception.event import Event, EventKind, Untimed
 from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
 from edge.perception.pattern_check import REPEATS, PatternCheck
+from edge.perception.pattern_input import Due
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
-from edge.perception.reading_age import OLD_NS, age_notes
 from edge.perception.result import MADE, Result
+from edge.perception.scan_notes import OLD_NS, age_notes, notes_on_missing
 from edge.perception.sensor_state import Sensor
+from edge.perception.tap_poses import TapPoses
 from edge.perception.tap_tracker import TapTracker
-from edge.validation import check_baselines, check_mountings, check_pads, check_positive
+from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.poses.pad_pose import PadPose
@@ -57,7 +59,7 @@ class Runtime:
     Raises:
         ModelError: the model is for another sensor.
         UsageError: counts per newton, a pad or a number of taps are out of range, or a baseline or a mounting is of
-            another grid.
+            another grid; the options ask for more taps than the model takes.
     """
 
     def __init__(
@@ -79,21 +81,21 @@ class Runtime:
     ) -> None:
         model.contract.check_sensor(geometry)
         check_baselines(baselines or {}, geometry)
-        if isinstance(counts_per_newton, Mapping):
-            for name, counts in counts_per_newton.items():
-                check_positive(f"counts_per_newton of sensor {name}", counts)
-        elif counts_per_newton is not None:
-            check_positive("counts_per_newton", counts_per_newton)
+        check_counts_per_newton(counts_per_newton)
         check_pads(pad, geometry)
         check_pads(measured, geometry)
         check_mountings(mountings or {}, geometry)
+        contract = model.contract
+        if options.taps is not None and options.taps > contract.taps:
+            raise UsageError(f"taps is {options.taps}, but model '{model.name}' takes {contract.taps} at most")
         self._model = model
+        self._taps = contract.taps if options.taps is None else options.taps
         self._events: list[Untimed] = []
         self._source: SourceKind = source
         self._estimator = estimator
         self._contacts = contacts if options.learn else None
         self._geometry, self._scan_shape = geometry, geometry.scan_shape
-        self._describe, self._trust = Describer(model.contract, geometry), model.contract.read_trust()
+        self._describe, self._trust = Describer(contract, geometry), contract.read_trust()
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad, self._measured = pad, measured
@@ -182,7 +184,7 @@ class Runtime:
                 above zero.
         """
         results: list[Result] = []
-        due: dict[int, _Due] = {}
+        due: dict[int, Due] = {}
         for scan, infer in scans:
             result, touch = self._follow(scan)
             if touch is not None:
@@ -197,7 +199,7 @@ class Runtime:
             self._infer(due, results)
         return results
 
-    def _follow(self, scan: Scan) -> tuple[Result, "_Due | None"]:
+    def _follow(self, scan: Scan) -> tuple[Result, Due | None]:
         """Return the result without a pattern, and the input of a pattern if one is due."""
         if scan.counts.shape != self._scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
@@ -215,13 +217,19 @@ class Runtime:
         if sensor.baseline is None or zeroed is None:
             return Result(scan, self._source, self._model.name, "zeroing", **known), None
         age_s = sensor.age_s(scan.time_ns)
+        # Without a pose of any pad, which is the rule, this is all that poses cost.
+        track = self._track_of(scan.sensor) if self._tracks else None
+        pose = None if track is None else track.at(scan.on_bus_ns)
         known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "drift": sensor.drift, "filled": filled}
-        known["zeroed"] = zeroed
+        known |= {"zeroed": zeroed, "pose": pose}
         if not watch.sound and (watch.waiting or (dead and readings is None)):
             return Result(scan, self._source, self._model.name, "incomplete", **known), None
 
         force_counts = float(np.add.reduce(zeroed[2], axis=None)) if readings is None else readings.z_counts
-        tap = sensor.taps.push(zeroed if readings is None else readings.counts, scan.time_ns, force_counts)
+        readings_counts = zeroed if readings is None else readings.counts
+        tap = sensor.taps.push(readings_counts, scan.time_ns, force_counts, scan.on_bus_ns)
+        if sensor.poses is not None and track is not None:
+            sensor.poses.follow(tap, track)
         if self._follow_drift:
             sensor.follow_drift(scan, tap.contact)
         if not tap.contact and sensor.follower is not None and sensor.follower.waiting:
@@ -229,13 +237,23 @@ class Runtime:
         taps_used = sensor.taps_that_matter.of(tap)
         if self._every_tap:
             taps_used = tap.taps_used
-        taps_used = min(taps_used, self._model.contract.taps)
+        taps_used = min(taps_used, self._taps)
         if sensor.counts_per_newton is not None:
             force_n = force_counts / sensor.counts_per_newton
         else:
             force_n = None if scan.vendor_force_n is None else scan.vendor_force_n[2]
-        # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
-        window = tap.window.copy() if tap.contact else None
+        due: Due | None = None
+        if tap.contact:
+            posed = None if sensor.poses is None else sensor.poses.choose(tap, pose, scheduled=track is None)
+            if posed is None:
+                # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
+                window, slots, poses = tap.window.copy(), range(len(tap.window)), None
+            else:
+                taps_used = min(taps_used, len(posed.slots))
+                slots, poses = posed.slots[:taps_used], posed.rows[:taps_used]
+                window = tap.window[list(slots)]
+            made_by = (self._model.name, tap.tap, tuple(slots), taps_used, filled, watch.most_repeats >= REPEATS)
+            due = Due(sensor, window, slots, poses, tap.tap, made_by)
         result = Result(
             scan,
             self._source,
@@ -243,14 +261,18 @@ class Runtime:
             "idle",
             contact=tap.contact,
             taps_used=taps_used,
-            window=None if window is None else window[:taps_used],
+            window=None if due is None else due.window[:taps_used],
+            poses=None if due is None else due.poses,
             force_counts=force_counts,
             force_n=force_n,
             gains_certainty=sensor.gains_certainty,
             **known,
         )
-        made_by = (self._model.name, tap.tap, taps_used, filled, watch.most_repeats >= REPEATS)
-        return result, None if window is None else _Due(sensor, window, tap.tap, made_by)
+        return result, due
+
+    def _track_of(self, sensor: str) -> PoseTrack | None:
+        """Return the poses of a sensor's pad, its own or those of all; None before the first."""
+        return self._tracks.get(sensor) or self._tracks.get(None) or None
 
     def _take_events(self, sensor: Sensor, time_ns: int) -> tuple[Event, ...]:
         """Return the events up to a scan of a sensor, at its time in [ns]."""
@@ -259,29 +281,39 @@ class Runtime:
         sensor.events.clear()
         return events
 
-    def _unchanged(self, result: Result, due: "_Due") -> Result | None:
+    def _unchanged(self, result: Result, due: Due) -> Result | None:
         """Return the result with the last pattern, or None if a new pattern is needed."""
         before = due.sensor.last
-        if self._every_scan or before is None or not due.sensor.last_reading.holds(due.window[0], due.made_by):
+        if self._every_scan or before is None:
+            return None
+        if not due.sensor.last_reading.holds(due.window[0], due.made_by, due.poses):
             return None
         made = {name: getattr(before, name) for name in MADE}
         # The pattern may be of fewer taps than there are, where one did not belong.
         window = None if result.window is None else result.window[: before.taps_used]
-        return replace(result, **made, taps_used=before.taps_used, window=window, reused_from=before.scan.number)
+        made |= {"taps_used": before.taps_used, "poses": before.poses, "reused_from": before.scan.number}
+        return replace(result, **made, window=window)
 
-    def _infer(self, due: Mapping[int, "_Due"], results: list[Result]) -> None:
+    def _infer(self, due: Mapping[int, Due], results: list[Result]) -> None:
         """Put the patterns that are due into their results."""
         contract = self._model.contract
         start_ns = self._clock_ns()
         windows: list[NDArray[np.float32]] = []
         pads: list[NDArray[np.float32]] = []
+        poses: list[NDArray[np.float32]] = []
         for index, touch in due.items():
             window = contract.scale_window(touch.window[: contract.taps], touch.sensor.gains)
-            results[index] = with_taps_that_belong(results[index], touch.sensor, touch.window, window)
-            window[results[index].taps_used :] = 0
+            made = with_taps_that_belong(results[index], touch.sensor, touch.window, window, touch.slots)
+            results[index] = made
+            if made.poses is None:
+                window[made.taps_used :] = 0
+            else:
+                window = window[: made.taps_used]
+                poses.append(made.poses)
             windows.append(window)
             pads.append(touch.sensor.pad_row)
-        patterns = self._model.run_together(windows, pads)
+        given = (windows, pads, poses) if contract.takes_poses else (windows, pads)
+        patterns = self._model.run_together(*given)
         run_time_us = (self._clock_ns() - start_ns) / 1e3
         deviations, tractions = self._model.deviation, self._model.traction
         for row, (index, touch) in enumerate(due.items()):
@@ -299,7 +331,7 @@ class Runtime:
             sensor = touch.sensor
             made = self._describe(checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback), sensor)
             sensor.last = made
-            sensor.last_reading.keep(touch.window[0], touch.made_by)
+            sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
             sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
             results[index] = made
             if sensor.follower is not None and sensor.follower.see(made, touch.window[0]):
@@ -308,17 +340,16 @@ class Runtime:
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor
         baseline = self._baselines.get(name)
-        notes: list[Note] = []
-        if self._mounted and name not in self._mounted:
-            known = ", ".join(sorted(self._mounted))
-            text = f"the sensor file has no sensor {name}, only {known}: taken as wired"
-            notes.append(Note("not_in_sensor_file", text))
-        if baseline is None and self._baselines:
-            text = f"no stored baseline for sensor {name}, only for {', '.join(sorted(self._baselines))}: zeroing"
-            notes.append(Note("no_stored_baseline", text))
         mounting = self._mountings.get(name)
+        notes = notes_on_missing(name, self._mounted, self._baselines)
         self._sensors[name] = sensor = Sensor(
-            name, self._geometry, self._new_tracker(), self._estimator, tuple(notes), mounting, self._unix_time_s
+            name,
+            self._geometry,
+            self._new_tracker(),
+            self._estimator,
+            notes,
+            mounting,
+            self._unix_time_s,
         )
         per_newton = self._counts_per_newton
         sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton
@@ -326,6 +357,8 @@ class Runtime:
         if self._trust is not None:
             sensor.check = PatternCheck(self._trust, self._model.contract)
         sensor.take_pad(self._model.contract)
+        if self._model.contract.takes_poses:
+            sensor.poses = TapPoses(self._model.contract, self._options.taps or 1, sensor.report)
         if self._contacts is not None:
             measured = sensor.pad if self._measured is None else self._measured.get(name)
             sensor.follower = GainFollower(self._contacts, measured, sensor.pad)
@@ -338,12 +371,3 @@ class Runtime:
     def _new_tracker(self) -> TapTracker:
         grid_shape = (self._geometry.rows, self._geometry.cols)
         return TapTracker(self._model.contract.taps, self._options, grid_shape)
-
-
-class _Due(NamedTuple):
-    """Input of a pattern: the sensor's window, and the key that distinguishes its pattern from others."""
-
-    sensor: Sensor
-    window: NDArray[np.float32]
-    tap: int
-    made_by: Hashable

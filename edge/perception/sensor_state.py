@@ -14,6 +14,7 @@ from edge.perception.event import EventKind, Note, Untimed
 from edge.perception.gain_following import GainFollower
 from edge.perception.pattern_check import PatternCheck
 from edge.perception.result import Result, WrenchOrigin
+from edge.perception.tap_poses import TapPoses
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from edge.perception.zero_on_demand import Rezeroing
@@ -38,6 +39,7 @@ class Sensor:
         counts_per_newton: summed z per [N], if that is known.
         pad: what is known of it.
         pad_row: the same as the model takes it.
+        poses: chooses the taps of a model that takes poses; None for other models.
         check: decides whether its patterns are to be believed; None where the model has no checks.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
         gains_certainty: of the gains that are available, see firmware_bridge.scans.pad_constants.Pad; None without.
@@ -59,6 +61,7 @@ class Sensor:
     ) -> None:
         self.taps = taps
         self.taps_that_matter = TapsThatMatter()
+        self.poses: TapPoses | None = None
         self.last_reading = LastReading(geometry.scan_shape)
         self.last: Result | None = None
         # Plain attributes, since properties would make a scan at rest take a twentieth longer.

@@ -7,7 +7,7 @@ taps are remembered by their peaks.
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,18 @@ MIN_TAP_SCANS: Final = 2
 """Fewest scans of a tap. A touch in a single scan may be a flipped bit; it is reported, but not remembered as a tap."""
 
 
+class TapPeak(NamedTuple):
+    """Peak of an earlier tap.
+
+    Attributes:
+        tap: number of the tap.
+        time_ns: when the readings of its peak were taken, in [ns].
+    """
+
+    tap: int
+    time_ns: int
+
+
 @dataclass(frozen=True, slots=True)
 class TapState:
     """State of the tracker after a scan.
@@ -30,12 +42,14 @@ class TapState:
         taps_used: taps in the window, the current one included; 0 without contact.
         window: (K, 3, rows, cols) float32, newest first, zeros in place of missing taps. It is the
             tracker's own array: read-only, and overwritten by the next push.
+        peaks: of the earlier taps in the window, newest first.
     """
 
     contact: bool
     tap: int
     taps_used: int
     window: NDArray[np.float32]
+    peaks: tuple[TapPeak, ...] = ()
 
 
 class TapTracker:
@@ -81,15 +95,23 @@ class TapTracker:
         self._tap += self._contact
         self._window.fill(0)
         self._earlier = 0
+        self._peaks: tuple[TapPeak, ...] = ()
         self._tap_scans = 0
-        self._peak_counts = -math.inf
+        self._peak_counts, self._peak_ns = -math.inf, 0
 
     def keep(self, earlier: int) -> None:
         """Forget the earlier taps but for the newest `earlier` ones."""
         self._earlier = min(self._earlier, earlier)
         self._window[1 + self._earlier :] = 0
+        self._peaks = self._peaks[: self._earlier]
 
-    def push(self, deformation: NDArray[np.float32], time_ns: int, z_counts: float | None = None) -> TapState:
+    def push(
+        self,
+        deformation: NDArray[np.float32],
+        time_ns: int,
+        z_counts: float | None = None,
+        taken_ns: int | None = None,
+    ) -> TapState:
         """Take one scan and return the new state.
 
         The idle time is measured between scans, from the last one in contact. Time that runs
@@ -99,6 +121,7 @@ class TapTracker:
             deformation: (3, rows, cols) float32, zeroed counts.
             time_ns: of the scan, in [ns].
             z_counts: its summed z, if available more exactly than from `deformation`.
+            taken_ns: when its readings were taken, in [ns]; by default `time_ns`.
         """
         z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
         if self._contact:
@@ -116,11 +139,12 @@ class TapTracker:
             self._window[0] = deformation
             if z_counts > self._peak_counts:
                 self._peak_counts = z_counts
+                self._peak_ns = time_ns if taken_ns is None else taken_ns
                 self._peak[...] = deformation
         else:
             self._forget_if_idle(time_ns)
         taps_used = 1 + self._earlier if self._contact else 0
-        return TapState(self._contact, self._tap, taps_used, self._shown)
+        return TapState(self._contact, self._tap, taps_used, self._shown, self._peaks)
 
     def _release(self) -> None:
         if self._tap_scans >= MIN_TAP_SCANS and len(self._window) > 1:
@@ -128,6 +152,7 @@ class TapTracker:
                 self._window[slot] = self._window[slot - 1]
             self._window[1] = self._peak
             self._earlier = min(self._earlier + 1, len(self._window) - 1)
+            self._peaks = (TapPeak(self._tap, self._peak_ns), *self._peaks)[: self._earlier]
         self._window[0].fill(0)
         self._tap_scans = 0
         self._peak_counts = -math.inf

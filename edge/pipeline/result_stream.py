@@ -5,18 +5,25 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from numbers import Real
 
+from edge.errors import UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
 from edge.pipeline.gain_keeper import GainKeeper
+from edge.pipeline.pose_fields import PoseError, pose_of_fields
+from edge.pipeline.pose_intake import PoseIntake
+from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.silence import Silence
 from edge.validation import check_positive
 from firmware_bridge.links.base import Notice
+from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
@@ -25,9 +32,9 @@ class Stream:
     """Iterator over the results of a source, until it ends, `stop` is set or `duration_s` is over.
 
     Of the scans that wait, the newest of each sensor gets a pattern; the older ones get their result without one.
-    Everything happens in the thread that iterates: between two results the runtime may be asked to zero or to reset. A
-    sensor that has a baseline or counts per newton, and of which no scan arrives, is reported as an event. A loop that
-    was left may be continued by another, from the next result on.
+    Everything happens in the thread that iterates: between two results the runtime may be asked to zero or to reset.
+    Any thread may state poses. A sensor that has a baseline or counts per newton, and of which no scan arrives, is
+    reported as an event. A loop that was left may be continued by another, from the next result on.
 
     Attributes:
         statistics: of the results so far.
@@ -39,6 +46,7 @@ class Stream:
         runtime: Runtime,
         *,
         on_event: Callable[[Event], object] = lambda event: None,
+        on_poses: Callable[[Sequence[TimedPose]], object] = lambda poses: None,
         on_wait: Callable[[], object] = lambda: None,
         stop: threading.Event | None = None,
         duration_s: float | None = None,
@@ -53,6 +61,7 @@ class Stream:
             source: open.
             runtime: makes the results.
             on_event: called with each event, in its place between results.
+            on_poses: called with the poses that the runtime has taken, before the results that are made with them.
             on_wait: called several times a second while no scan comes.
             stop: ends the stream after the scans in hand.
             duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
@@ -71,12 +80,16 @@ class Stream:
         self._source = source
         self._runtime = runtime
         self._on_event = on_event
+        self._on_poses = on_poses
         self._on_wait = on_wait
         self._stop = threading.Event() if stop is None else stop
         self._duration_s = duration_s
         self._commands = commands
+        self._poses = PoseQueue() if commands is None else commands.poses
+        self._intake = PoseIntake(runtime, self._poses, recorded=source.patient)
         self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
         self._deadlines: dict[str, Deadline] = {}
+        self._now_ns = 0
         self._clock_s = clock_s
         self._clock_ns = clock_ns
         path = None if source.kind == "replay" else source.sensor_file.path
@@ -92,7 +105,50 @@ class Stream:
         counters["overruns"] = statistics.overruns
         counters["late"] = statistics.late
         counters["missed"] = statistics.missed
+        counters["poses"] = statistics.poses
+        counters["poses_refused"] = statistics.poses_refused
+        counters["poses_dropped"] = statistics.poses_dropped
         return counters
+
+    def pose(
+        self,
+        x_mm: float,
+        y_mm: float,
+        turn_deg: float = 0.0,
+        *,
+        error_mm: float = PLACE_ERROR_MM,
+        error_deg: float = TURN_ERROR_DEG,
+        time_ns: int | None = None,
+        sensor: str | None = None,
+        holds: bool = False,
+    ) -> None:
+        """State where the pad of a sensor is; any thread may call it, and it applies from the next scans on.
+
+        Args:
+            x_mm: place of the pad's middle in the object's plane, along x, in [mm].
+            y_mm: along y.
+            turn_deg: turn of the pad from x to y, in [deg].
+            error_mm: standard deviation of the place along x and along y, in [mm].
+            error_deg: standard deviation of the turn, in [deg].
+            time_ns: when it was there, by `time.monotonic_ns`, later than the pose before; None for now.
+            sensor: name of the sensor; None for every sensor without poses of its own.
+            holds: the pad rests there until the next pose. Without it poses must come several times a second.
+
+        Raises:
+            UsageError: a value is out of range, or the source is a recording, whose scans are not of now.
+        """
+        if self._source.patient:
+            raise UsageError(
+                f"{self._source.name} is a recording: give `runtime.pose` a PadPose and a time of its scans"
+            )
+        now_ns = self._clock_ns()
+        numbers = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
+        fields = {name: float(value) if isinstance(value, Real) else value for name, value in numbers.items()}
+        fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
+        try:
+            self._poses.put(pose_of_fields(fields, now_ns))
+        except PoseError as error:
+            raise UsageError(f"a pose: {error}") from error
 
     def __iter__(self) -> Iterator[Result]:
         """Return the results, from the next one on; raises as `__next__` does."""
@@ -122,10 +178,13 @@ class Stream:
             if self._commands is not None:
                 obey(self._commands, self._runtime)
                 self.statistics.commands_refused = self._commands.refused
+            self._take_poses(taken)
             scans: list[Scan] = []
             for one in taken:
                 if isinstance(one, Scan):
                     scans.append(one)
+                    continue
+                if isinstance(one, TimedPose):
                     continue
                 yield from self._results(scans)
                 self._heed(one)
@@ -136,8 +195,25 @@ class Stream:
             if not taken:
                 self._on_wait()
 
-    def _taken(self) -> Iterator[list[Scan | Notice]]:
-        """Yield the scans and notices of the source, until it ends, `stop` is set, or the time is over.
+    def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
+        """Pass poses on to the runtime: those from outside, and those of the source."""
+        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
+        first_ns = min(times_ns, default=None)
+        if not self._source.patient:
+            self._now_ns = self._clock_ns()
+        elif first_ns is not None:
+            self._now_ns = first_ns
+        intake, statistics = self._intake, self.statistics
+        poses = intake.take([one for one in taken if isinstance(one, TimedPose)], first_ns, self._now_ns)
+        statistics.poses, statistics.poses_refused = intake.used, intake.refused
+        statistics.poses_dropped = intake.dropped
+        if poses:
+            self._on_poses(poses)
+        for event in intake.look(self._now_ns):
+            self._tell(event)
+
+    def _taken(self) -> Iterator[list[Scan | Notice | TimedPose]]:
+        """Yield the scans, notices and poses of the source, until it ends, `stop` is set, or the time is over.
 
         A patient source's time is that of its scans.
         """

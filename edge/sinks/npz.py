@@ -12,21 +12,26 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Mapping, Sequence
+from functools import partial
+from io import FileIO
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edge.errors import SinkError
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
 from edge.pipeline.sink import Sink
+from edge.sinks.npz_poses import ROWS as POSE_ROWS
+from edge.sinks.npz_poses import add_pose_arrays, pose_rows
 from edge.terminal.forced_end import finishing
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 
 LAYOUT: Final = "layout.json"
@@ -48,6 +53,7 @@ class NpzSink(Sink):
         *,
         deviations: bool = False,
         traction_shape: tuple[int, ...] | None = None,
+        poses_shape: tuple[int, ...] | None = None,
         origin: SourceKind | None = None,
     ) -> None:
         """Start the parts.
@@ -58,6 +64,7 @@ class NpzSink(Sink):
             pattern_shape: (H, W).
             deviations: patterns come with deviations.
             traction_shape: (3, h, w), where patterns come with tractions.
+            poses_shape: (taps, 5) of the most taps, where patterns are made from taps with poses.
             origin: kind of source that the scans come from, where results are of a recording; else that of the results.
 
         Raises:
@@ -67,12 +74,14 @@ class NpzSink(Sink):
         self._scans = 0
         self._failed = False
         self._origin = origin
+        self._poses: FileIO | None = None
         shapes = {
             "": (),
             "scan": scan_shape,
             "pattern": pattern_shape,
             "deviation": pattern_shape if deviations else None,
             "traction": traction_shape,
+            "poses": poses_shape,
         }
         self._layout: dict[str, tuple[str, tuple[int, ...]]] = {}
         columns = []
@@ -80,6 +89,8 @@ class NpzSink(Sink):
             shape, column = shapes[field.kind.shape], field.in_array()
             if Out.NPZ in field.out and shape is not None:
                 kind = field.kind.array
+                if field.kind.shape == "poses":
+                    column = column._replace(make=partial(_filled_up, taps=shape[0]))
                 self._layout[field.name] = (kind, (len(field.parts),) if field.parts else shape)
                 columns.append(column._replace(unknown=np.full(shape, column.unknown, kind)) if shape else column)
         self._columns = Columns(columns)
@@ -106,15 +117,25 @@ class NpzSink(Sink):
         row = [*self._columns.of(result), self._origin or result.source]
         data = b"".join(_row_bytes(*cell, value) for cell, value in zip(self._cells, row, strict=True))
         try:
-            while data:  # a disk that fills takes a part of it, and refuses the rest
-                data = data[self._rows.write(data) :]
+            _write_whole(self._rows, data)
         except OSError as error:
             raise self._failure(error) from error
         self._scans += 1
 
+    def pose(self, poses: Sequence[TimedPose]) -> None:
+        """Add one row for each pose."""
+        try:
+            if self._poses is None:
+                self._poses = (parts_dir(self._path) / POSE_ROWS).open("wb", buffering=0)
+            _write_whole(self._poses, pose_rows(poses))
+        except OSError as error:
+            raise self._failure(error) from error
+
     def close(self) -> None:
         """Make arrays of the rows. Without a single scan nothing is written."""
         self._rows.close()
+        if self._poses is not None:
+            self._poses.close()
         if self._failed:
             return
         if self._scans:
@@ -175,6 +196,7 @@ def gather(path: Path) -> int:
                         chunk = column[start : start + CHUNK_SCANS].tobytes()
                         entry.write(chunk)
                         bar.advance(len(chunk))
+            add_pose_arrays(archive, parts / POSE_ROWS)
         with draft.open("rb") as file:
             os.fsync(file.fileno())  # otherwise a power cut could leave an empty .npz, and no rows
         draft.replace(path)
@@ -186,6 +208,16 @@ def gather(path: Path) -> int:
         reason = error.strerror or error
         raise SinkError(f"cannot gather {parts}: {reason}; the parts are kept: {_remedy(path)}") from error
     return scans
+
+
+def _write_whole(file: FileIO, data: bytes) -> None:
+    while data:  # a disk that fills takes a part of it, and refuses the rest
+        data = data[file.write(data) :]
+
+
+def _filled_up(poses: NDArray[np.float32], taps: int) -> NDArray[np.float32]:
+    """Return the poses (K, 5) of fewer taps, with NaN for the others."""
+    return np.pad(poses, ((0, taps - len(poses)), (0, 0)), constant_values=np.nan)
 
 
 def _read_layout(parts: Path) -> dict[str, tuple[str, list[int]]]:

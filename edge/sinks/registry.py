@@ -7,6 +7,7 @@ from typing import Final
 
 from edge.errors import UsageError
 from edge.inference.contract import Contract
+from edge.inference.pose_input import POSE_WIDTH
 from edge.pipeline.sink import Sink
 from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
@@ -101,6 +102,7 @@ def open_sink(
             contract.pattern_shape,
             deviations=contract.interval_factor is not None,
             traction_shape=contract.traction_shape,
+            poses_shape=(contract.taps, POSE_WIDTH) if contract.takes_poses else None,
             origin=origin,
         )
     if form == "mcap":

@@ -68,9 +68,9 @@ class TestContract:
         assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
 
     def test_what_is_written_is_read(self):
-        for contract in (make_pad_contract(), make_contract(), make_contract(version=5), make_contract(version=4)):
+        for contract in (make_pad_contract(), *(make_contract(version=version) for version in (7, 6, 5, 4))):
             assert Contract.from_metadata(contract.to_metadata()) == contract
-        assert len(make_contract().to_metadata()) == len(make_contract(version=5).to_metadata()) + 2
+        assert len(make_contract().to_metadata()) == len(make_contract(version=5).to_metadata()) + 4
         assert len(make_contract(version=5).to_metadata()) == len(make_contract(version=4).to_metadata()) + 3
 
     def test_of_version_4_later_keys_are_not_looked_at(self):

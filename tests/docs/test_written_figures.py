@@ -8,13 +8,14 @@ from dataclasses import fields
 
 import field_tables
 import numpy as np
+import onnx
 import pytest
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT
 
 from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
-from edge.inference.contract import ADDED, Contract
+from edge.inference.contract import ADDED, KEY_PREFIX, Contract
 from edge.perception.pattern_check import REASONS
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
@@ -65,15 +66,18 @@ def test_keys_of_a_record(tmp_path):
     keys = {key for line in path.read_text().splitlines() for key in json.loads(line)}
     assert keys | {"vendor_force_n", "temperature_k"} == told("Records")
     with np.load(tmp_path / "records.npz") as arrays:
-        assert set(arrays.files) | {"traction"} == told("Recordings")  # which not every model gives
+        assert set(arrays.files) | {"traction", "poses"} == told("Recordings")  # which not every model has
     assert load_recording(tmp_path / "records.npz").tracks
 
 
 def test_keys_of_the_contract_and_of_datasets():
     assert {field.name for field in fields(Contract)} == told("The contract in a model")
     assert set(dataset._AXES) == told("Datasets")
-    lacking = set(ADDED) if b"tactile.traction_scale" not in (content := find_model("stsr").read_bytes()) else set()
-    assert content.count(b"tactile.") >= len(fields(Contract)) - len(lacking)
+    stated = {one.key: one.value for one in onnx.load(find_model("stsr")).metadata_props}
+    later = {
+        name for version, names in ADDED.items() if version > int(stated[f"{KEY_PREFIX}version"]) for name in names
+    }
+    assert {f"{KEY_PREFIX}{name}" for name in told("The contract in a model") - later} <= set(stated)
 
 
 def test_each_reason_and_each_field_of_trust_is_on_its_page():

@@ -39,7 +39,7 @@ class TestHelp:
     def test_help_names_all_there_is(self):
         text = run("--help").stdout
         options = "model source sink rate-hz duration-s baseline counts-per-newton contact-on-counts contact-off-counts"
-        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "budget-us", "recalibrate")]
+        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "taps", "budget-us", "recalibrate")]
         for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "npz:FILE", "models", "reset"):
             assert word in text
 

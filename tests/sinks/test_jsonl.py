@@ -78,6 +78,8 @@ class TestJsonLines:
             "taps_dropped": None,
             "mismatch": None,
             "tap_mismatch": None,
+            "pose": None,
+            "poses": None,
             "reused_from": None,
             "run_time_us": 123.5,
             "latency_us": None,

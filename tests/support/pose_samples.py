@@ -18,7 +18,7 @@ from edge.inference.contract import (
 )
 
 WEIGHTS = np.array([0.5, 0.25, 0.0625, 2.0, 0.125], dtype=np.float32)
-"""Of dx, dy, turn and the errors: each number of a pose has its own, so that none can be lost or exchanged."""
+"""Weights of dx, dy, turn and the errors, all different, so that a number that is lost or exchanged shows."""
 
 
 def make_posed_contract(**changes) -> Contract:

@@ -4,8 +4,9 @@ import numpy as np
 from edge_samples import FakeModel, make_pad_contract
 
 from edge.inference.contract import Contract
-from edge.inference.familiarity import Check
+from edge.inference.familiarity import PLACE_MM, Check, pair_width
 from edge.inference.forward_model import FEATURES, GRID, KPA, ForwardModel
+from edge.inference.pose_input import POSE_WIDTH
 from edge.inference.small_network import SmallNetwork
 from edge.inference.trust import Trust
 
@@ -47,6 +48,14 @@ def make_trust(limit: float = 0.2) -> Trust:
     contact = Check(linear(48 + 1 + 2 * CONSTANTS + 1, {0: 10.0}), 10 * UNFAMILIAR)
     tap = Check(linear(2 * 48 + 4, {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
     return Trust(make_forward(limit), contact, tap)
+
+
+def make_posed_trust(farthest_mm: float) -> Trust:
+    """Return checks of a model that takes poses: an earlier tap belongs up to a distance along x."""
+    trust = make_trust()
+    width = pair_width(48, poses=True)
+    tap = Check(linear(width, {width - POSE_WIDTH - 1: 20 * PLACE_MM}), 20 * farthest_mm)
+    return Trust(trust.forward, trust.contact, tap)
 
 
 def make_trusted_contract(limit: float = 0.2, **changes) -> Contract:
