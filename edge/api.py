@@ -31,12 +31,14 @@ from edge.perception.runtime import Model, Runtime
 from edge.perception.wrench import Wrench
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands
+from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.pump import pump
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
+from edge.pose_sources.registry import PoseSource, open_poses
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
@@ -53,6 +55,8 @@ from firmware_bridge.errors import (
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP
 from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap, layout_c
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
@@ -92,6 +96,9 @@ __all__ = [
     "NoDeviceError",
     "Note",
     "Pad",
+    "PadPose",
+    "PoseQueue",
+    "PoseSource",
     "RecordingError",
     "Result",
     "Runtime",
@@ -107,6 +114,7 @@ __all__ = [
     "SourceKind",
     "Statistics",
     "Stream",
+    "TimedPose",
     "UsageError",
     "WindowError",
     "Wrench",
@@ -119,6 +127,7 @@ __all__ = [
     "load_baselines",
     "load_model",
     "load_sensor_file",
+    "open_poses",
     "open_recording",
     "open_runtime",
     "open_sink",
