@@ -32,12 +32,14 @@ from edge.perception.runtime import Runtime
 from edge.perception.wrench import Wrench
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands
+from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.pump import pump
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, references, settled, with_recorded
+from edge.pose_sources.open_poses import PoseSource, open_poses
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
@@ -95,6 +97,8 @@ __all__ = [
     "Note",
     "Pad",
     "PadPose",
+    "PoseQueue",
+    "PoseSource",
     "RecordingError",
     "Result",
     "Runtime",
@@ -123,6 +127,7 @@ __all__ = [
     "load_baselines",
     "load_model",
     "load_sensor_file",
+    "open_poses",
     "open_recording",
     "open_runtime",
     "open_sink",

@@ -33,6 +33,7 @@ from edge.api import (
     demo_recording,
     load_baselines,
     load_model,
+    open_poses,
     open_runtime,
     open_sink,
     pump,
@@ -131,6 +132,10 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 sinks.append(fan)
             if view is not None:
                 sinks += view.sinks
+            for text in options.poses:
+                closing.callback(open_poses(text, commands.poses).close)
+            if options.poses and not getattr(model.contract, "takes_poses", False):
+                commands.poses.warn("model", f"model {model.name} takes no poses: they are only counted and recorded")
             if options.realtime:  # last, so that it does not affect what the page and the sinks have started
                 from edge.cli.realtime import realtime
 
