@@ -27,7 +27,7 @@ from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS,
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
 from edge.perception.gain_learning import load_contact_model
-from edge.perception.result import Result
+from edge.perception.result import NextTap, Result
 from edge.perception.runtime import Runtime
 from edge.perception.wrench import Wrench
 from edge.pipeline.baseline_capture import take_baselines
@@ -93,6 +93,7 @@ __all__ = [
     "Model",
     "ModelError",
     "ModelMap",
+    "NextTap",
     "NoDeviceError",
     "Note",
     "Pad",

@@ -148,9 +148,7 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
 def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return what a pad's operator is applied to: means of the pattern's cells, then the drag x, y in KPA."""
     inputs = np.empty(_INPUTS, dtype=np.float32)
-    np.matmul(
-        _pooling(pattern.shape[0]) @ pattern, _pooling(pattern.shape[1]).T, out=inputs[:_CELLS].reshape(GRID, GRID)
-    )
+    np.matmul(pooling(pattern.shape[0]) @ pattern, pooling(pattern.shape[1]).T, out=inputs[:_CELLS].reshape(GRID, GRID))
     np.multiply(traction[:2].reshape(-1), np.float32(1 / KPA), out=inputs[_CELLS:])
     return inputs
 
@@ -162,12 +160,12 @@ def condensed(inputs: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 @lru_cache
-def _pooling(length: int) -> NDArray[np.float32]:
-    """Return the matrix (GRID, length) of means over equal parts of a side."""
-    edges = np.linspace(0, length, GRID + 1)
+def pooling(length: int, cells: int = GRID) -> NDArray[np.float32]:
+    """Return the matrix (cells, length) of means over equal parts of a side."""
+    edges = np.linspace(0, length, cells + 1)
     places = np.arange(length)
     share = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
-    return (share.clip(0) / (length / GRID)).astype(np.float32)
+    return (share.clip(0) / (length / cells)).astype(np.float32)
 
 
 @lru_cache

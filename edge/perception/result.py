@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,24 @@ State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
 Estimate = Literal["network", "smooth"]
+
+
+class NextTap(NamedTuple):
+    """Proposal for the next tap.
+
+    Attributes:
+        dx_mm: place of the pad along x in the newest tap's axes.
+        dy_mm: the same along y.
+        turn_deg: turn of the pad from the newest tap, from x to y.
+        error_lost: share of the pattern's RMS error that a tap there is expected to take away.
+        target: the same pose in the object's plane.
+    """
+
+    dx_mm: float
+    dy_mm: float
+    turn_deg: float
+    error_lost: float
+    target: PadPose | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +97,7 @@ class Result:
     reused_from: int | None = None
     expected_rmse_mm: float | None = None
     another_tap: bool | None = None
+    next_tap: NextTap | None = None
     mismatch: float | None = None
     tap_mismatch: tuple[float, ...] | None = None
     trusted: bool | None = None

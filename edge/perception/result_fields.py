@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
 from edge.perception.pattern_check import REASONS, dropped_taps
-from edge.perception.result import Result, mask_bits
+from edge.perception.result import NextTap, Result, mask_bits
 from edge.perception.wrench import Wrench
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.scans.scan import Scan, VendorReading
@@ -106,6 +106,15 @@ def _pose(pose: PadPose) -> dict[str, float]:
     return dict(zip(_POSE_KEYS, map(round, _pose_numbers(pose), repeat(4)), strict=True))
 
 
+def _next_tap_numbers(proposed: NextTap) -> tuple[float, ...]:
+    return (proposed.dx_mm, proposed.dy_mm, proposed.turn_deg, proposed.error_lost)
+
+
+def _next_tap(proposed: NextTap) -> dict[str, Any]:
+    numbers = dict(zip(_NEXT_TAP_KEYS, map(round, _next_tap_numbers(proposed), repeat(3)), strict=True))
+    return numbers | {"target": None if proposed.target is None else _pose(proposed.target)}
+
+
 def _poses(poses: NDArray[np.float32]) -> list[list[float]]:
     return [list(map(round, row, repeat(4))) for row in poses.tolist()]
 
@@ -119,6 +128,8 @@ _WRENCH_PARTS: Final = (
 )
 _POSE_KEYS: Final = ("x_mm", "y_mm", "turn_deg", "error_mm", "error_deg")
 _POSE_PARTS: Final = tuple(f"pose_{key}" for key in _POSE_KEYS)
+_NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_lost")
+_NEXT_TAP_PARTS: Final = tuple(f"next_tap_{key}" for key in _NEXT_TAP_KEYS)
 _CENTRE_PARTS: Final = ("centre_of_pressure_x_mm", "centre_of_pressure_y_mm")
 
 # fmt: off
@@ -161,6 +172,10 @@ FIELDS: Final = (
           decimals=5, byte=152),
     Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of it; unknown "
           "where the model takes no further one", out=_RECORD_NPZ, byte=72),
+    Field("next_tap", _REAL, "next_tap", "from the end of a tap to the next one: where to touch next, dx, dy in mm and "
+          "turn in degrees from the newest tap's pad, and the share of the RMS error expected to be lost there; "
+          "records hold `target` too, the same pose in the object's plane; unknown without poses",
+          make=_next_tap_numbers, parts=_NEXT_TAP_PARTS, json=_next_tap),
     Field("wrench", _REAL, "wrench", "force x, y, z on the pad in N, torque about x, y, z in N mm: see "
           "[Wrench](formats.md#wrench)", make=_force_and_torque, parts=_WRENCH_PARTS, json=_wrench, out=_RECORD_NPZ,
           byte=512),

@@ -15,6 +15,7 @@ from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import Event, EventKind, Untimed
 from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
+from edge.perception.next_tap import NextTapFinder, TapAdvice
 from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_input import Due
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
@@ -96,6 +97,9 @@ class Runtime:
         self._contacts = contacts if options.learn else None
         self._geometry, self._scan_shape = geometry, geometry.scan_shape
         self._describe, self._trust = Describer(contract, geometry), contract.read_trust()
+        self._finder: NextTapFinder | None = None
+        if contract.takes_poses and self._trust is not None:
+            self._finder = NextTapFinder(self._trust.forward, contract.reach_mm)
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad, self._measured = pad, measured
@@ -254,6 +258,7 @@ class Runtime:
                 window = tap.window[list(slots)]
             made_by = (self._model.name, tap.tap, tuple(slots), taps_used, filled, watch.most_repeats >= REPEATS)
             due = Due(sensor, window, slots, poses, tap.tap, made_by)
+        advice = sensor.advice
         result = Result(
             scan,
             self._source,
@@ -263,6 +268,7 @@ class Runtime:
             taps_used=taps_used,
             window=None if due is None else due.window[:taps_used],
             poses=None if due is None else due.poses,
+            next_tap=None if advice is None else advice.proposal(contact=tap.contact, remembered=bool(tap.peaks)),
             force_counts=force_counts,
             force_n=force_n,
             gains_certainty=sensor.gains_certainty,
@@ -334,6 +340,8 @@ class Runtime:
             sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
             sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
             results[index] = made
+            if sensor.advice is not None:
+                sensor.advice.see(made)
             if sensor.follower is not None and sensor.follower.see(made, touch.window[0]):
                 sensor.learn(contract)
 
@@ -356,6 +364,8 @@ class Runtime:
         sensor.pad = self._pad.get(name) if isinstance(self._pad, Mapping) else self._pad
         if self._trust is not None:
             sensor.check = PatternCheck(self._trust, self._model.contract)
+        if self._finder is not None:
+            sensor.advice = TapAdvice(self._finder, self._taps)
         sensor.take_pad(self._model.contract)
         if self._model.contract.takes_poses:
             sensor.poses = TapPoses(self._model.contract, self._options.taps or 1, sensor.report)

@@ -12,6 +12,7 @@ from edge.perception.change_gate import LastReading, TapsThatMatter
 from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
 from edge.perception.event import EventKind, Note, Untimed
 from edge.perception.gain_following import GainFollower
+from edge.perception.next_tap import TapAdvice
 from edge.perception.pattern_check import PatternCheck
 from edge.perception.result import Result, WrenchOrigin
 from edge.perception.tap_poses import TapPoses
@@ -40,6 +41,7 @@ class Sensor:
         pad: what is known of it.
         pad_row: the same as the model takes it.
         poses: chooses the taps of a model that takes poses; None for other models.
+        advice: proposes where to touch next; None for models that take no poses, or have no forward model.
         check: decides whether its patterns are to be believed; None where the model has no checks.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
         gains_certainty: of the gains that are available, see firmware_bridge.scans.pad_constants.Pad; None without.
@@ -62,6 +64,7 @@ class Sensor:
         self.taps = taps
         self.taps_that_matter = TapsThatMatter()
         self.poses: TapPoses | None = None
+        self.advice: TapAdvice | None = None
         self.last_reading = LastReading(geometry.scan_shape)
         self.last: Result | None = None
         # Plain attributes, since properties would make a scan at rest take a twentieth longer.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
 from edge.perception.event import Event
-from edge.perception.result import Result
+from edge.perception.result import NextTap, Result
 from edge.pipeline.scan_rate import Rate
 from edge.pipeline.sink import Sink
 from firmware_bridge.silence import SHOWN_SILENT_S
@@ -130,6 +130,8 @@ class StatusSink(Sink):
             words.append(f"{result.area_mm2:.0f} mm2")
         if result.interval_mm is not None:
             words.append(f"+-{result.interval_mm:.3f} mm")
+        if result.next_tap is not None:
+            words.append(_next_tap_text(result.next_tap))
         if result.reused_from is not None:
             words.append("unchanged")
         elif result.run_time_us is not None:
@@ -138,3 +140,10 @@ class StatusSink(Sink):
         if rate_hz is not None:
             words.append(f"{rate_hz:.0f} Hz")
         return " ".join(words)
+
+
+def _next_tap_text(proposed: NextTap) -> str:
+    """Return where to touch next in a user's words, as the pad's axes are drawn."""
+    ways = ((proposed.dx_mm, "left", "right"), (proposed.dy_mm, "up", "down"))
+    moves = [f"{abs(mm):.1f} mm {less if mm < 0 else more}" for mm, less, more in ways if mm]
+    return f"next tap {' '.join(moves)} ({-100 * proposed.error_lost:.0f} % error)"

@@ -72,6 +72,7 @@ class TestJsonLines:
             "interval_mm": None,
             "expected_rmse_mm": None,
             "another_tap": None,
+            "next_tap": None,
             "trusted": None,
             "untrusted_reason": None,
             "estimate": "network",

@@ -11,6 +11,7 @@ from edge_samples import BASELINE, FakeModel, make_scan
 from sink_samples import RUN, Terminal, make_results, make_sure_results
 
 from edge.perception.event import Event
+from edge.perception.result import NextTap
 from edge.perception.runtime import Runtime
 from edge.sinks.event_printer import MessageSink
 from edge.sinks.status_line import StatusSink
@@ -107,6 +108,15 @@ class TestStatus:
         ):
             sink.write(replace(result, trusted=trusted, untrusted_reason=reason), RUN)
             assert sink.line().startswith(words)
+
+    def test_where_to_touch_next_is_shown_from_the_end_of_a_tap(self):
+        sink = self.make()
+        result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan())
+        assert "next tap" not in str(sink.write(result, RUN) or sink.line())
+        sink.write(replace(result, next_tap=NextTap(-2.35, 2.35, 0.0, 0.149)), RUN)
+        assert " next tap 2.4 mm left 2.4 mm down (-15 % error)" in sink.line()
+        sink.write(replace(result, next_tap=NextTap(2.35, 0.0, 0.0, 0.05)), RUN)
+        assert " next tap 2.4 mm right (-5 % error)" in sink.line()
 
     def test_a_note_while_zeroing_is_shown(self):
         sink = self.make()

@@ -51,6 +51,18 @@ function cross(context, width, height, rows, cols, taxel) {
   });
 }
 
+/** Draw where to touch next: an arrow from the pad's centre to its next place, and its outline there. */
+function outlinePad(context, ink, width, height, pxPerMm, next) {
+  const [dx, dy] = [next.dx_mm * pxPerMm, next.dy_mm * pxPerMm];
+  arrow(context, ink, width / 2, height / 2, dx, dy);
+  context.save();
+  context.translate(width / 2 + dx, height / 2 + dy);
+  context.rotate((next.turn_deg / 180) * Math.PI);
+  context.setLineDash([6, 4]);
+  haloed(context, ink, 1.5, () => context.rect(-width / 2, -height / 2, width, height));
+  context.restore();
+}
+
 function thumb(tap) {
   const item = document.createElement("li");
   const canvas = item.appendChild(document.createElement("canvas"));

@@ -3,6 +3,7 @@
 const NUMBERS = {
   Contact: [
     ["force", "force", "big"], ["area", "area", "big"], ["centre", "centroid_mm"], ["taps used", "taps_used"], ["another tap", "another_tap"],
+    ["next tap", "next_tap"],
   ],
   Wrench: [
     ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure centre", "centre_of_pressure_mm"],
@@ -30,6 +31,14 @@ function trustTexts({ state, trusted, untrusted_reason: reason, mismatch, tap_mi
   };
 }
 
+/** Return where to touch next, in words for the pad as it is drawn. */
+function nextTapText(next) {
+  if (!next) return "\u2013";
+  const ways = [[next.dx_mm, "left", "right"], [next.dy_mm, "up", "down"]].filter(([mm]) => mm !== 0);
+  const moves = ways.map(([mm, less, more]) => `${amount(Math.abs(mm), 1, "mm")} ${mm < 0 ? less : more}`);
+  return `${moves.join(", ")}: ${percent(next.error_lost)} less error`;
+}
+
 function wrenchTexts({ wrench, wrench_origin: origin }) {
   const list = (values, decimals, unit) => (values ? `${values.map((value) => number(value, decimals)).join(", ")}${THIN}${unit}` : "\u2013");
   return {
@@ -54,6 +63,7 @@ function numberTexts(sensor) {
     ...trustTexts(made, hello.checks),
     taps_used: made.taps_used ? `${made.taps_used} of ${hello.taps}` : "\u2013",
     another_tap: made.another_tap === true ? "would help" : made.another_tap === false ? "would not help" : "\u2013",
+    next_tap: nextTapText(result.next_tap),
     interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
     expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
     gains_certainty: known(result.gains_certainty) ? `${number(100 * result.gains_certainty, 0)}${THIN}% certain` : "not known",

@@ -278,6 +278,8 @@ class Sensor {
       haloed(context, ink, 1.5, () => context.arc(x, y, 5, 0, 2 * Math.PI));
       arrow(context, ink, x, y, fx * length, fy * length);
     }
+    const next = this.pattern === null || this.away() || !page.link.up ? null : this.result?.next_tap;
+    if (next) outlinePad(context, ink, width, height, width / widthMm, next);
     if (this.cursor !== null) {
       const [row, col] = this.cursor;
       haloed(context, ink, 2, () => context.rect((col * width) / cols, (row * height) / rows, width / cols, height / rows));

@@ -1,0 +1,238 @@
+"""Where to touch next: what taps leave uncertain decides, and each proposal is made once."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, PERIOD_NS, make_scan
+from pose_samples import PosedModel, make_posed_contract
+from trust_samples import make_forward, make_posed_trust
+
+from edge.inference.bundled import find_model
+from edge.inference.onnx_session import ModelSession
+from edge.perception.contact_options import RuntimeOptions
+from edge.perception.next_tap import NextTapFinder, TapAdvice
+from edge.perception.result import NextTap
+from edge.perception.runtime import Runtime
+from edge.sinks.json_encoding import record
+from edge.sinks.registry import open_sink
+from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.poses.pad_pose import PadPose
+
+HALF_MM = USPA44.pitch_mm / 2
+EVEN = np.full((40, 40), 0.02, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def forward():
+    trust = ModelSession(find_model("stsr-small")).contract.read_trust()
+    assert trust is not None
+    return trust.forward
+
+
+@pytest.fixture(scope="module")
+def finder(forward):
+    return NextTapFinder(forward, 6.0)
+
+
+def propose(finder, poses, deviation=EVEN) -> NextTap:
+    proposed = finder(poses, deviation)
+    assert proposed is not None
+    return proposed
+
+
+def taps(*places):
+    return np.array([(x * HALF_MM, y * HALF_MM, 0.0, 0.2, 1.0) for x, y in places])
+
+
+def test_shifts_by_half_a_pitch_are_proposed_until_the_grid_is_twice_as_fine(finder):
+    places = [(0, 0)]
+    for _ in range(3):
+        proposed = propose(finder, taps(*places))
+        places.append((round(proposed.dx_mm / HALF_MM), round(proposed.dy_mm / HALF_MM)))
+        assert proposed.turn_deg == 0
+    assert {(x % 2, y % 2) for x, y in places} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+
+
+def test_each_further_tap_is_expected_to_gain_less(finder):
+    first = propose(finder, taps((0, 0))).error_lost
+    later = propose(finder, taps((0, 0), (1, 1), (1, 0), (0, 1), (-1, -1))).error_lost
+    assert 0 < later < first / 2 and first < 0.3
+
+
+@pytest.mark.parametrize(("side", "axis", "sign"), [("right", 0, 1), ("left", 0, -1), ("down", 1, 1), ("up", 1, -1)])
+def test_a_tap_is_proposed_towards_what_is_uncertain(finder, side, axis, sign):
+    deviation = EVEN.copy()
+    rows, cols = {
+        "right": (slice(None), slice(28, None)),
+        "left": (slice(None), slice(12)),
+        "down": (slice(28, None), slice(None)),
+        "up": (slice(12), slice(None)),
+    }[side]
+    deviation[rows, cols] *= 8
+    # Its opposite places are as informative but for the deviation.
+    proposed = propose(finder, taps((0, 0)), deviation)
+    assert sign * (proposed.dx_mm, proposed.dy_mm)[axis] > 0
+
+
+def test_a_turned_earlier_tap_counts_where_it_was(finder):
+    """Seen from the newest tap at a quarter turn, an earlier one is at the same place whatever its own turn."""
+    here = propose(finder, taps((0, 0), (1, 1)))
+    turned = taps((0, 0), (1, 1))
+    turned[1, 2] = 180.0
+    assert (propose(finder, turned).dx_mm, propose(finder, turned).dy_mm) != (HALF_MM, HALF_MM)
+    assert (here.dx_mm, here.dy_mm) != (HALF_MM, HALF_MM)
+
+
+def test_no_tap_is_proposed_from_which_an_earlier_one_is_out_of_reach(forward):
+    near = NextTapFinder(forward, 3.4)
+    proposed = propose(near, taps((0, 0), (-1, 0)))
+    assert np.hypot(proposed.dx_mm + HALF_MM, proposed.dy_mm) <= 3.4
+    assert NextTapFinder(forward, 2.0)(taps((0, 0)), EVEN) is None
+
+
+def made(force_counts=100.0, **changes) -> Any:
+    values = {"pose": PadPose(10, 20, 90), "poses": taps((0, 0)), "deviation": EVEN, "trusted": True, "taps_used": 1}
+    return SimpleNamespace(**values | {"force_counts": force_counts} | changes)
+
+
+def after(advice):
+    return advice.proposal(contact=False, remembered=True)
+
+
+def proposed_after(advice) -> NextTap:
+    proposed = after(advice)
+    assert proposed is not None
+    return proposed
+
+
+def test_a_proposal_is_made_when_a_tap_ends_and_kept_until_the_next_one(finder):
+    advice = TapAdvice(finder, taps=7)
+    assert after(advice) is None
+    advice.see(made())
+    assert advice.proposal(contact=True, remembered=True) is None
+    proposed = after(advice)
+    assert proposed is not None and after(advice) is proposed
+    assert advice.proposal(contact=True, remembered=True) is None
+    assert after(advice) is None, "a tap without a pattern proposes nothing"
+    advice.see(made())
+    assert after(advice) is not None
+    assert advice.proposal(contact=False, remembered=False) is None
+    assert after(advice) is None, "forgotten taps are no reason to touch again"
+
+
+def test_the_strongest_pattern_of_a_tap_is_the_one_that_counts(finder):
+    right, left = EVEN.copy(), EVEN.copy()
+    right[:, 28:] *= 8
+    left[:, :12] *= 8
+    advice = TapAdvice(finder, taps=7)
+    for force_counts, deviation in ((50.0, left), (200.0, right), (80.0, left)):
+        advice.see(made(force_counts, deviation=deviation))
+    assert proposed_after(advice).dx_mm > 0
+    advice.proposal(contact=True, remembered=True)
+    advice.see(made(60.0, deviation=left))
+    assert proposed_after(advice).dx_mm < 0, "a lighter tap counts no less, once it is the newest"
+
+
+def test_the_target_is_the_proposal_in_the_objects_plane(finder):
+    advice = TapAdvice(finder, taps=7)
+    advice.see(made())
+    proposed = proposed_after(advice)
+    target = proposed.target
+    assert target is not None
+    seen = target.seen_from(PadPose(10, 20, 90))
+    assert (seen.x_mm, seen.y_mm, seen.turn_deg) == pytest.approx((proposed.dx_mm, proposed.dy_mm, 0), abs=1e-9)
+    assert (target.x_mm, target.y_mm) == pytest.approx((10 - proposed.dy_mm, 20 + proposed.dx_mm))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"pose": None}, {"poses": None}, {"deviation": None}, {"trusted": False}, {"taps_used": 7}]
+)
+def test_nothing_is_proposed_without_what_it_needs(finder, changes):
+    advice = TapAdvice(finder, taps=7)
+    advice.see(made(**changes))
+    assert after(advice) is None
+
+
+class TestRuntime:
+    PRESS = 3000
+
+    def make(self, tmp_path, **changes):
+        pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
+        trust = replace(make_posed_trust(100.0), forward=make_forward(1e6)).to_json()  # all is believed
+        settings = {"pad_inputs": pad_inputs, "takes_gains": True, "traction_scale": 2, "trust": trust}
+        contract = make_posed_contract(**settings | {"interval_factor": 1.6} | changes)
+        self.number = 0
+        self.runtime = Runtime(
+            PosedModel(contract),
+            source="emulated",
+            baselines={"4": BASELINE},
+            options=RuntimeOptions(every_tap=True, idle_reset_s=0.2),
+        )
+
+    def push(self, press=0.0):
+        result = self.runtime.push(make_scan(self.number, press_counts=press))
+        self.number += 1
+        return result
+
+    def tap(self, pose=None):
+        """Press and release at a pose; return the results in contact, and the first one after it."""
+        if pose is not None:
+            self.runtime.pose(pose, (self.number + 1) * PERIOD_NS - 1000, holds=True)
+        pressed = [self.push(self.PRESS / 2), self.push(self.PRESS), self.push(self.PRESS / 2)]
+        return pressed, self.push()
+
+    def test_a_robot_that_follows_the_proposals_touches_no_place_twice(self, tmp_path):
+        self.make(tmp_path)
+        pose, places = PadPose(5, -3, 30), set()
+        for _ in range(4):
+            pressed, released = self.tap(pose)
+            assert all(result.next_tap is None for result in pressed)
+            proposed = released.next_tap
+            assert proposed is not None and proposed.target is not None
+            seen = pose.seen_from(PadPose(5, -3, 30))
+            places.add((round(seen.x_mm / HALF_MM, 6), round(seen.y_mm / HALF_MM, 6)))
+            pose = proposed.target
+        assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
+
+    def test_it_stays_until_the_next_tap_or_until_the_taps_are_forgotten(self, tmp_path):
+        self.make(tmp_path)
+        _, released = self.tap(PadPose(0, 0))
+        assert self.push().next_tap is released.next_tap is not None
+        assert self.push(self.PRESS).next_tap is None
+        self.tap(PadPose(1, 0))
+        assert self.push().next_tap is not None
+        later = [self.push() for _ in range(30)]
+        assert later[-1].next_tap is None
+
+    def test_without_poses_and_by_other_models_nothing_is_proposed(self, tmp_path):
+        self.make(tmp_path)
+        assert self.tap()[1].next_tap is None
+        self.make(tmp_path, trust={}, pad_inputs=(), takes_gains=False)
+        assert self.tap(PadPose(0, 0))[1].next_tap is None
+
+    def test_every_output_holds_it(self, tmp_path):
+        self.make(tmp_path)
+        pressed, released = self.tap(PadPose(5, -3, 90))
+        proposed = released.next_tap
+        assert proposed is not None
+        in_record = record(released, {})["next_tap"]
+        assert in_record["dx_mm"] == pytest.approx(proposed.dx_mm) and in_record["turn_deg"] == 0
+        assert 0 < in_record["error_lost"] == pytest.approx(proposed.error_lost, abs=1e-3)
+        assert in_record["target"]["x_mm"] == pytest.approx(5 - proposed.dy_mm, abs=1e-3)
+        assert record(pressed[1], {})["next_tap"] is None
+        contract = self.runtime._model.contract
+        sink = open_sink(f"npz:{tmp_path / 'out.npz'}", contract=contract)
+        for result in (pressed[1], released):
+            sink.write(result, {})
+        sink.close()
+        held = np.load(tmp_path / "out.npz")["next_tap"]
+        assert np.isnan(held[0]).all()
+        assert held[1] == pytest.approx(proposed[:4], abs=1e-6)
+        sink = open_sink(f"jsonl:{tmp_path / 'out.jsonl'}", contract=contract)
+        sink.write(released, {})
+        sink.close()
+        assert json.loads((tmp_path / "out.jsonl").read_text())["next_tap"] == in_record
