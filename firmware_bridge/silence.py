@@ -22,6 +22,9 @@ SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Age at which a reading from the vendor's server belongs to a silent sensor, in [ns]."""
 TAXEL_SILENT_SCANS: Final = 50
 """Scans without a taxel after which its loss is reported, and zeroing goes on without it."""
+POSES_SILENT_NS: Final = SENSOR_SILENT_NS
+"""Time without a pose, after one that does not hold, after which its source is reported silent, in [ns]. Poses are
+interpolated over less, so by then some scans were without one."""
 LATEST_SCAN_S: Final = 2.0
 """Age of the last scan at the end of its watch above which the doctor reports a sensor, in [s]."""
 

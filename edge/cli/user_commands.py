@@ -12,10 +12,8 @@ from edge.pipeline.commands import ZERO, Commands, read_stdin
 def user_commands() -> Iterator[Commands]:
     """Yield the queue of commands from lines on stdin, or from keys if it is a terminal, and from SIGUSR1."""
     commands = Commands()
-    with zero_on_signal(commands):
-        read_stdin(commands)
-        with terminal_keys(commands):
-            yield commands
+    with zero_on_signal(commands), read_stdin(commands), terminal_keys(commands):
+        yield commands
 
 
 @contextlib.contextmanager

@@ -11,7 +11,8 @@ from firmware_bridge.links.base import Notice, NoticeKind
 
 ZeroingKind = Literal["zeroing", "zeroed", "in_contact", "given_up", "rest_level"]
 TrustKind = Literal["tap_dropped", "suspected", "cleared", "gains_learned"]
-EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, "sink", "reset", "refused"]
+PoseSourceKind = Literal["poses_silent", "poses_back", "poses_trouble"]
+EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, PoseSourceKind, "sink", "reset", "refused"]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
 NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]
@@ -30,7 +31,8 @@ class Event:
 
             Kinds of a link, as in `Notice`, or of one sensor while others go on: "lost", "silent", "back", "trouble",
             "well". Kind of a recording that is played or made: "note". Kind of a sink: "sink", it was given up, or
-            nobody reads it.
+            nobody reads it. Kinds of a source of poses: "poses_silent", it stopped; "poses_back"; "poses_trouble",
+            poses are refused, or their times are off.
 
             Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing

@@ -9,6 +9,7 @@ from edge.pipeline.scan_reader import Source
 from edge.terminal.progress_bar import Progress
 from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
+from firmware_bridge.links.base import Notice
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
@@ -62,7 +63,7 @@ def take_baselines(
                 raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor shows what is wrong")
             for one in taken:
                 if not isinstance(one, Scan):
-                    if one.kind in ("lost", "silent"):
+                    if isinstance(one, Notice) and one.kind in ("lost", "silent"):
                         estimators.clear()  # the sensor may read differently after the gap
                     continue
                 name = one.sensor

@@ -1,19 +1,25 @@
-"""Commands to a run in one queue, from keys, signals, viewers and JSON lines on stdin such as {"cmd": "reset"}."""
+"""Commands to a run in one queue, and poses in another: from keys, signals, viewers and JSON lines on stdin.
+
+A line is such as {"cmd": "reset"}, or {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
+"""
 
 import json
 import os
 import select
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Final, Literal, Protocol
 
+from edge.pipeline.pose_queue import PoseQueue
 from firmware_bridge.scans.scan import is_sensor_name
 
-READ_BYTES: Final = 4096
+READ_BYTES: Final = 1 << 16
+"""Bytes of one read: all that a pipe holds, some 500 poses."""
 LONGEST_LINE_BYTES: Final = 4096
 WAITING: Final = 64
 """Commands that may wait until the loop takes them."""
@@ -47,6 +53,7 @@ class Commands:
         refused: messages that were no command, or came when too many waited.
         record: begins or ends a recording; nothing is recorded without.
         signalled: asked for by a signal, which may come at any moment, also while another is put; twice is once.
+        poses: poses of pads, which wait in a queue of their own: a stream of them must not hold up a command.
     """
 
     def __init__(self) -> None:
@@ -54,6 +61,7 @@ class Commands:
         self.refused = 0
         self.record: Callable[[bool], object] = lambda on: None
         self.signalled: set[Command] = set()
+        self.poses = PoseQueue()
         self._lock = threading.Lock()
         self._waiting: SimpleQueue[Command] = SimpleQueue()
         self._producers: list[Callable[[], object]] = []
@@ -114,27 +122,52 @@ def obey(commands: Commands, runtime: Controlled) -> None:
 
 
 class CommandLines:
-    """Producer of commands from lines of a file descriptor; it never waits."""
+    """Producer of commands from lines of a file descriptor; `read` never waits.
+
+    A thread of its own reads as well, as soon as data come: a pose without a time has that of its arrival, and the loop
+    may be waiting for a scan.
+    """
 
     def __init__(self, commands: Commands, descriptor: int) -> None:
         self._commands = commands
         self._descriptor = descriptor
         self._open = True
         self._partial = b""
+        self._lock = threading.Lock()
+        self._woken, self._waking = os.pipe()
+        # Started here, since a thread that the loop starts later would inherit the loop's processor.
+        self._thread = threading.Thread(target=self._follow, name="command-lines", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread; the descriptor stays open."""
+        if self._thread.is_alive():
+            os.write(self._waking, b"!")
+            self._thread.join()
+        for end in (self._woken, self._waking):
+            os.close(end)
 
     def read(self) -> None:
         """Put the commands that came since the last call."""
-        if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
-            return
-        try:
-            data = os.read(self._descriptor, READ_BYTES)
-        except OSError:  # the other end is gone, which stops commands but not the run
-            data = b""
-        self._open = bool(data)
-        *lines, partial = (self._partial + (data or b"\n")).split(b"\n")
-        self._partial = partial[: LONGEST_LINE_BYTES + 1]
-        for line in lines:
-            self._parse(line)
+        with self._lock:
+            if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
+                return
+            try:
+                data = os.read(self._descriptor, READ_BYTES)
+            except OSError:  # the other end is gone, which stops commands but not the run
+                data = b""
+            self._open = bool(data)
+            *lines, partial = (self._partial + (data or b"\n")).split(b"\n")
+            self._partial = partial[: LONGEST_LINE_BYTES + 1]
+            for line in lines:
+                self._parse(line)
+
+    def _follow(self) -> None:
+        with suppress(OSError, ValueError):  # it was closed, which ends commands but not the run
+            while self._open:
+                if self._woken in select.select([self._descriptor, self._woken], [], [])[0]:
+                    return
+                self.read()
 
     def _parse(self, line: bytes) -> None:
         if not line.strip():
@@ -143,6 +176,9 @@ class CommandLines:
             parsed = json.loads(line) if len(line) <= LONGEST_LINE_BYTES else None
         except (ValueError, RecursionError):
             parsed = None
+        if isinstance(parsed, dict) and parsed.get("cmd") == "pose":
+            self._commands.poses.put_fields(parsed, time.monotonic_ns())
+            return
         command = runtime_command(parsed) if isinstance(parsed, dict) else None
         if command is None:
             self._commands.refuse()
@@ -164,12 +200,19 @@ def runtime_command(parsed: Mapping[str, Any]) -> Command | None:
     return Command("zero", sensor, force)
 
 
-def read_stdin(commands: Commands) -> None:
+@contextmanager
+def read_stdin(commands: Commands) -> Iterator[None]:
     """Take lines of stdin as commands, unless there is no stdin or it is a terminal, which has keys.
 
     Only on POSIX can a pipe be polled for data.
     """
-    if os.name != "posix" or sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
-        return
-    with suppress(OSError):  # a replaced stdin is not a file of the system
-        commands.ask(CommandLines(commands, sys.stdin.fileno()).read)
+    lines: CommandLines | None = None
+    if os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
+        with suppress(OSError):  # a replaced stdin is not a file of the system
+            lines = CommandLines(commands, sys.stdin.fileno())
+            commands.ask(lines.read)
+    try:
+        yield
+    finally:
+        if lines is not None:
+            lines.close()

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from firmware_bridge.links.base import Link, Notice
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
@@ -24,7 +25,7 @@ SHORTEST_POLL_S: Final = 0.001
 """Shortest time that the system's poll can wait, which counts in milliseconds."""
 _WAKES: Final = 64
 
-HandOver = Callable[[Sequence[Notice], Sequence[Scan]], None]
+HandOver = Callable[[Sequence[Notice | TimedPose], Sequence[Scan]], None]
 
 
 @dataclass(slots=True)
@@ -48,7 +49,7 @@ class LinkReader:
 
         Args:
             links: open.
-            hand_over: takes the notices of one link and then its scans; called from several threads.
+            hand_over: takes the notices and poses of one link and then its scans; called from several threads.
             on_end: called when all is handed over, just before `reading` is done.
         """
         self._hand_over = hand_over
@@ -147,7 +148,7 @@ class LinkReader:
         try:
             scans = link.read(timeout_s)
         finally:  # its notices come also before its end
-            notices = link.notices()
+            notices = [*link.notices(), *link.poses()]
             if notices or scans:
                 self._hand_over(notices, scans)
 

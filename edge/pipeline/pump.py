@@ -12,6 +12,7 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
+from firmware_bridge.poses.timed_pose import TimedPose
 
 _UNWRITTEN: Final = attrgetter("unwritten")
 
@@ -57,11 +58,15 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
         for sink in sinks:
             sink.tell(event, known)
 
+    def pose(poses: Sequence[TimedPose]) -> None:
+        for sink in sinks:
+            sink.pose(poses)
+
     def wait() -> None:
         for sink in sinks:
             sink.wait()
 
-    stream = Stream(source, runtime, on_event=tell, on_wait=wait, statistics=statistics, **settings)
+    stream = Stream(source, runtime, on_event=tell, on_poses=pose, on_wait=wait, statistics=statistics, **settings)
     with uncollected():
         try:
             for result in stream:

@@ -12,11 +12,14 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
 from edge.pipeline.gain_keeper import GainKeeper
+from edge.pipeline.pose_intake import PoseIntake
+from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.silence import Silence
 from edge.validation import check_positive
 from firmware_bridge.links.base import Notice
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
@@ -39,6 +42,7 @@ class Stream:
         runtime: Runtime,
         *,
         on_event: Callable[[Event], object] = lambda event: None,
+        on_poses: Callable[[Sequence[TimedPose]], object] = lambda poses: None,
         on_wait: Callable[[], object] = lambda: None,
         stop: threading.Event | None = None,
         duration_s: float | None = None,
@@ -53,6 +57,7 @@ class Stream:
             source: open.
             runtime: makes the results.
             on_event: called with each event, in its place between results.
+            on_poses: called with the poses that the runtime has taken, before the results that are made with them.
             on_wait: called several times a second while no scan comes.
             stop: ends the stream after the scans in hand.
             duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
@@ -71,12 +76,16 @@ class Stream:
         self._source = source
         self._runtime = runtime
         self._on_event = on_event
+        self._on_poses = on_poses
         self._on_wait = on_wait
         self._stop = threading.Event() if stop is None else stop
         self._duration_s = duration_s
         self._commands = commands
+        queue = PoseQueue() if commands is None else commands.poses
+        self._intake = PoseIntake(runtime, queue, recorded=source.patient)
         self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
         self._deadlines: dict[str, Deadline] = {}
+        self._now_ns = 0
         self._clock_s = clock_s
         self._clock_ns = clock_ns
         path = None if source.kind == "replay" else source.sensor_file.path
@@ -92,6 +101,9 @@ class Stream:
         counters["overruns"] = statistics.overruns
         counters["late"] = statistics.late
         counters["missed"] = statistics.missed
+        counters["poses"] = statistics.poses
+        counters["poses_refused"] = statistics.poses_refused
+        counters["poses_dropped"] = statistics.poses_dropped
         return counters
 
     def __iter__(self) -> Iterator[Result]:
@@ -122,10 +134,13 @@ class Stream:
             if self._commands is not None:
                 obey(self._commands, self._runtime)
                 self.statistics.commands_refused = self._commands.refused
+            self._take_poses(taken)
             scans: list[Scan] = []
             for one in taken:
                 if isinstance(one, Scan):
                     scans.append(one)
+                    continue
+                if isinstance(one, TimedPose):
                     continue
                 yield from self._results(scans)
                 self._heed(one)
@@ -136,8 +151,25 @@ class Stream:
             if not taken:
                 self._on_wait()
 
-    def _taken(self) -> Iterator[list[Scan | Notice]]:
-        """Yield the scans and notices of the source, until it ends, `stop` is set, or the time is over.
+    def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
+        """Pass poses on to the runtime: those from outside, and those of the source."""
+        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
+        first_ns = min(times_ns, default=None)
+        if not self._source.patient:
+            self._now_ns = self._clock_ns()
+        elif first_ns is not None:
+            self._now_ns = first_ns
+        intake, statistics = self._intake, self.statistics
+        poses = intake.take([one for one in taken if isinstance(one, TimedPose)], first_ns, self._now_ns)
+        statistics.poses, statistics.poses_refused = intake.used, intake.refused
+        statistics.poses_dropped = intake.dropped
+        if poses:
+            self._on_poses(poses)
+        for event in intake.look(self._now_ns):
+            self._tell(event)
+
+    def _taken(self) -> Iterator[list[Scan | Notice | TimedPose]]:
+        """Yield the scans, notices and poses of the source, until it ends, `stop` is set, or the time is over.
 
         A patient source's time is that of its scans.
         """

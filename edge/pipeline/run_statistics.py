@@ -63,6 +63,9 @@ class Statistics:
         run_time_us: histogram of the inference's run time.
         latency_us: histogram of the time from scan to pattern.
         commands_refused: lines on stdin, and messages of viewers, that were not commands.
+        poses: poses that the runtime has taken.
+        poses_refused: poses that could not be taken.
+        poses_dropped: poses that came faster than the loop took them.
         model_patterns: number of patterns made by each model.
         sink_trouble: trouble of the sinks at the end; None while all is well.
     """
@@ -84,6 +87,9 @@ class Statistics:
         self.run_time_us = Histogram()
         self.latency_us = Histogram()
         self.commands_refused = 0
+        self.poses = 0
+        self.poses_refused = 0
+        self.poses_dropped = 0
         self.model_patterns: dict[str, int] = {}
         self.sink_trouble: str | None = None
         self._spans: dict[str, _Span] = {}
@@ -161,6 +167,12 @@ class Statistics:
             for name, result in sorted(self._zeroed.items())
             if result.baseline is not None
         ]
+        received = self.poses + self.poses_refused + self.poses_dropped
+        if received:
+            lines.append(
+                f"poses: {received} received, {self.poses} used, {self.poses_refused} refused, "
+                f"{self.poses_dropped} dropped"
+            )
         if self.unwritten:
             lines.append(f"records left out for slow readers: {self.unwritten}")
         if self.sink_trouble:

@@ -12,6 +12,7 @@ from edge.pipeline.link_reader import LinkReader
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile
 
@@ -67,7 +68,7 @@ class Source:
         self._links = links
         self._last_ns = 0
         self._opened = self._closed = False
-        self._waiting: list[Scan | Notice] = []
+        self._waiting: list[Scan | Notice | TimedPose] = []
         self._lock = threading.Lock()
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
@@ -130,7 +131,7 @@ class Source:
         offset_ns = self.unix_offset_ns
         return time.time() if offset_ns is None else (self._last_ns + offset_ns) / 1e9
 
-    def take(self, timeout_s: float) -> list[Scan | Notice] | None:
+    def take(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
         """Return all that waits, in order, after waiting at most `timeout_s` for it; None when no more will come.
 
         Raises:
@@ -158,15 +159,15 @@ class Source:
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement")
 
-    def _take_next(self, timeout_s: float) -> list[Scan | Notice] | None:
+    def _take_next(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
         (link,) = self._links
         if link.ended:
             return None
         scans = link.read(timeout_s)
         self._last_ns = scans[-1].time_ns if scans else self._last_ns
-        return [*link.notices(), *scans]
+        return [*link.notices(), *link.poses(), *scans]
 
-    def _put(self, notices: Sequence[Notice], scans: Sequence[Scan]) -> None:
+    def _put(self, notices: Sequence[Notice | TimedPose], scans: Sequence[Scan]) -> None:
         with self._lock:
             if not self._waiting:
                 self._bell.put(None)

@@ -1,10 +1,11 @@
 """Interface of every sink; a new sink is one file with this interface and its form in `edge.sinks.registry`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from edge.perception.event import Event
 from edge.perception.result import Result
+from firmware_bridge.poses.timed_pose import TimedPose
 
 
 class Sink(Protocol):
@@ -35,6 +36,14 @@ class Sink(Protocol):
 
         Raises:
             SinkError: it cannot be written.
+            SinkClosedError: its reader has gone.
+        """
+
+    def pose(self, poses: Sequence[TimedPose]) -> None:
+        """Take poses of pads, before the results that are made with them at hand.
+
+        Raises:
+            SinkError: they cannot be written.
             SinkClosedError: its reader has gone.
         """
 

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter, methodcaller
 from typing import Final
 
@@ -10,6 +10,7 @@ from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
+from firmware_bridge.poses.timed_pose import TimedPose
 
 LOOK_NS: Final = 500_000_000
 """Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
@@ -59,6 +60,10 @@ class Fan(Sink):
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Pass on one event; raises as `write` does."""
         self._each(methodcaller("tell", event, counters), counters)
+
+    def pose(self, poses: Sequence[TimedPose]) -> None:
+        """Pass on poses; raises as `write` does."""
+        self._each(methodcaller("pose", poses), self._counters)
 
     def wait(self) -> None:
         """Pass on that no scan came; raises as `write` does."""

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -31,13 +31,16 @@ from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.forced_end import finishing
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.pose_messages import POSE, encode_pose
 from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
 from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import Baseline
 
 EVENTS_TOPIC: Final = "/events"
+POSES_TOPIC: Final = "/poses"
 _PROFILE: Final = "ros2"
 
 
@@ -143,6 +146,17 @@ class McapSink(Sink):
             for event in result.events:
                 self._log(event)
             self._file.look()  # after the last message, so that a due chunk does not end in mid-scan
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def pose(self, poses: Sequence[TimedPose]) -> None:
+        """Add poses."""
+        if not self._has_room():
+            return
+        try:
+            for one in poses:
+                unix_ns = one.time_ns + self._offset_ns
+                self._add("", POSES_TOPIC, POSE, unix_ns, encode_pose(one, unix_ns))
         except OSError as error:
             raise self._failure(error) from error
 

@@ -12,6 +12,7 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Mapping, Sequence
+from io import FileIO
 from pathlib import Path
 from typing import Final
 
@@ -24,9 +25,12 @@ from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
 from edge.pipeline.sink import Sink
+from edge.sinks.npz_poses import ROWS as POSE_ROWS
+from edge.sinks.npz_poses import add_pose_arrays, pose_rows
 from edge.terminal.forced_end import finishing
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 
 LAYOUT: Final = "layout.json"
@@ -67,6 +71,7 @@ class NpzSink(Sink):
         self._scans = 0
         self._failed = False
         self._origin = origin
+        self._poses: FileIO | None = None
         shapes = {
             "": (),
             "scan": scan_shape,
@@ -106,15 +111,25 @@ class NpzSink(Sink):
         row = [*self._columns.of(result), self._origin or result.source]
         data = b"".join(_row_bytes(*cell, value) for cell, value in zip(self._cells, row, strict=True))
         try:
-            while data:  # a disk that fills takes a part of it, and refuses the rest
-                data = data[self._rows.write(data) :]
+            _write_whole(self._rows, data)
         except OSError as error:
             raise self._failure(error) from error
         self._scans += 1
 
+    def pose(self, poses: Sequence[TimedPose]) -> None:
+        """Add one row for each pose."""
+        try:
+            if self._poses is None:
+                self._poses = (parts_dir(self._path) / POSE_ROWS).open("wb", buffering=0)
+            _write_whole(self._poses, pose_rows(poses))
+        except OSError as error:
+            raise self._failure(error) from error
+
     def close(self) -> None:
         """Make arrays of the rows. Without a single scan nothing is written."""
         self._rows.close()
+        if self._poses is not None:
+            self._poses.close()
         if self._failed:
             return
         if self._scans:
@@ -175,6 +190,7 @@ def gather(path: Path) -> int:
                         chunk = column[start : start + CHUNK_SCANS].tobytes()
                         entry.write(chunk)
                         bar.advance(len(chunk))
+            add_pose_arrays(archive, parts / POSE_ROWS)
         with draft.open("rb") as file:
             os.fsync(file.fileno())  # otherwise a power cut could leave an empty .npz, and no rows
         draft.replace(path)
@@ -186,6 +202,11 @@ def gather(path: Path) -> int:
         reason = error.strerror or error
         raise SinkError(f"cannot gather {parts}: {reason}; the parts are kept: {_remedy(path)}") from error
     return scans
+
+
+def _write_whole(file: FileIO, data: bytes) -> None:
+    while data:  # a disk that fills takes a part of it, and refuses the rest
+        data = data[file.write(data) :]
 
 
 def _read_layout(parts: Path) -> dict[str, tuple[str, list[int]]]:

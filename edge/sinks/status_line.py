@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
+from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.scan_rate import Rate
 from edge.pipeline.sink import Sink
@@ -35,6 +36,7 @@ class StatusSink(Sink):
         self._last_scan_s = clock_s()
         self._received_s: dict[str, float] = {}
         self._last_shown_s: float | None = None
+        self._without_poses: set[str | None] = set()
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
@@ -45,6 +47,13 @@ class StatusSink(Sink):
         self._counters = counters
         self._last_scan_s = self._received_s[result.scan.sensor] = self._clock_s()
         self._refresh()
+
+    def tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        """Keep which sensors' poses have stopped."""
+        if event.kind == "poses_silent":
+            self._without_poses.add(event.sensor)
+        elif event.kind == "poses_back":
+            self._without_poses.discard(event.sensor)
 
     def wait(self) -> None:
         """Show the time without a scan."""
@@ -79,14 +88,20 @@ class StatusSink(Sink):
             parts.append(f"no scan for {silence_s:.0f} s")
         parts += [self._sensor_text(name) for name in sorted(self._latest)]
         count = self._counters.get
-        losses = {
+        if self._without_poses:
+            of = ",".join(sorted(name or "" for name in self._without_poses))
+            parts.append(f"NO POSES {of}".rstrip())
+        counts = {
             "dropped": count("dropped", 0),
             "overrun": count("overruns", 0),
             # Of those torn at the source, noise makes one scan in forty of a healthy sensor: not an alarm.
             "torn": count("torn_wire", 0),
             "unwritten": count("unwritten", 0),
+            "poses": count("poses", 0),
+            "poses refused": count("poses_refused", 0),
+            "poses dropped": count("poses_dropped", 0),
         }
-        parts += [f"{number} {name}" for name, number in losses.items() if number]
+        parts += [f"{number} {name}" for name, number in counts.items() if number]
         zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
         parts += [result.baseline_text() for result in zeroed]
         return " | ".join(parts)

@@ -1,7 +1,7 @@
 """Recorder that begins and ends a recording while the run goes on."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from threading import get_native_id
@@ -11,6 +11,7 @@ from edge.errors import SinkError
 from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
+from firmware_bridge.poses.timed_pose import TimedPose
 
 FORM: Final = "mcap"
 """Form of the sink that is recorded into, and the ending of its files."""
@@ -78,6 +79,10 @@ class Recorder(Sink):
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Record an event, if a recording is open."""
         self._do(lambda sink: sink.tell(event, counters))
+
+    def pose(self, poses: Sequence[TimedPose]) -> None:
+        """Record poses, if a recording is open."""
+        self._do(lambda sink: sink.pose(poses))
 
     def wait(self) -> None:
         """Pass on that no scan came."""

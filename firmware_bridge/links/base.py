@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
@@ -97,6 +98,10 @@ class Link(Protocol):
 
     def notices(self) -> list[Notice]:
         """Return the notices since the last call, all from before the scans that the last `read` returned."""
+        return []
+
+    def poses(self) -> list[TimedPose]:
+        """Return the poses since the last call, all to be used for the scans that the last `read` returned."""
         return []
 
     def counters(self) -> dict[str, int]:

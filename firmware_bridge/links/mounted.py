@@ -6,6 +6,7 @@ from types import MappingProxyType
 from typing import Self
 
 from firmware_bridge.links.base import Link, Notice, SerialLine, SourceKind, Wait
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
@@ -73,6 +74,13 @@ class MountedLink(Link):
             notice._replace(sensors=f"{self._prefix}{notice.sensors}", text=f"{self._prefix_text}{notice.text}")
             for notice in self.wrapped.notices()
         ]
+
+    def poses(self) -> list[TimedPose]:
+        """Return the poses of the wrapped link; those of all its sensors stay those of all."""
+        poses = self.wrapped.poses()
+        if not self._prefix:
+            return poses
+        return [one if one.sensor is None else replace(one, sensor=f"{self._prefix}{one.sensor}") for one in poses]
 
     def counters(self) -> dict[str, int]:
         """Return the counters of the wrapped link."""

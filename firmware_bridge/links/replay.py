@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.links.replay_poses import PoseLane, timed_by_rows
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import LAST_TIME_NS, Recording, Track
 from firmware_bridge.scans.mounting import Mounting
@@ -72,6 +74,7 @@ class ReplayLink(Link):
             if recording.mountings
             for track in recording.tracks
         }
+        self._notes: list[str] = []
         self._clock = clock
         self._sleep = sleep
         lanes = [
@@ -84,6 +87,12 @@ class ReplayLink(Link):
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
         self._series = [ScanSeries(track.sensor, track.geometry) for track in self._tracks]
+        self._pose_lanes = [
+            lane
+            for number in range(len(self.recordings))
+            if (lane := self._pose_lane(number, lanes, rate_hz)) is not None
+        ]
+        self._poses: list[TimedPose] = []
         dues = (_lane(lane, due_times_ns) for lane, (_, due_times_ns) in enumerate(lanes))
         self._timeline = heapq.merge(*dues, key=lambda due: due.due_ns)
         self._next: _Due | None = next(self._timeline, None)
@@ -91,7 +100,7 @@ class ReplayLink(Link):
         if not paced:
             self._start_ns = _first_ns(self.recordings[0]) or 0
             self.unix_offset_ns = self.recordings[0].unix_offset_ns
-        self._notes = [note for recording in self.recordings for note in recording.notes]
+        self._notes += [note for recording in self.recordings for note in recording.notes]
         self._counts: dict[str, int] = dict.fromkeys(("scans", "torn_wire", "torn_source", "repeated"), 0)
 
     def __enter__(self) -> Self:
@@ -114,6 +123,8 @@ class ReplayLink(Link):
             most = math.inf
         scans: list[Scan] = []
         while self._next is not None and len(scans) < most and self._start_ns + self._next.due_ns <= now_ns:
+            for lane in self._pose_lanes:
+                self._poses += lane.up_to(self._next.due_ns, self._start_ns)
             scans.append(self._close(self._next))
             self._next = next(self._timeline, None)
         self.ended = self._next is None
@@ -124,9 +135,33 @@ class ReplayLink(Link):
         notes, self._notes = self._notes, []
         return [Notice(self._start_ns, "note", note) for note in notes]
 
+    def poses(self) -> list[TimedPose]:
+        """Return the poses that the scans of the last `read` were made with, as in the recording, each once."""
+        poses, self._poses = self._poses, []
+        return poses
+
     def counters(self) -> dict[str, int]:
         """Return the counts of scans, and of the torn and repeated ones among them, as in the recording."""
         return dict(self._counts)
+
+    def _pose_lane(
+        self, number: int, lanes: Sequence[tuple[Track, NDArray[np.int64]]], rate_hz: float | None
+    ) -> PoseLane | None:
+        """Return the poses of a recording, None where it has none whose times hold."""
+        recording = self.recordings[number]
+        poses, first_ns = recording.poses, _first_ns(recording)
+        if poses is None or not len(poses):
+            return None
+        sensors = [track.sensor for track in recording.tracks] if len(self.recordings) > 1 else ()
+        if poses.by_row:
+            due_times_ns = next(due_times_ns for track, due_times_ns in lanes if track is recording.tracks[0])
+            return PoseLane(timed_by_rows(poses, due_times_ns), 0, sensors)
+        if rate_hz is not None or first_ns is None:
+            self._notes.append(
+                f"{recording.path}: its {len(poses)} poses are left out, since --rate-hz replaces the times"
+            )
+            return None
+        return PoseLane(poses, first_ns, sensors)
 
     def _close(self, due: _Due) -> Scan:
         time_ns = self._start_ns + due.due_ns

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
+from firmware_bridge.recording.csv_poses import CsvPoses
+from firmware_bridge.recording.npz_poses import NPZ_POSES, npz_poses
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
@@ -79,15 +81,26 @@ def _load_csv(path: Path) -> Recording:
     header = next(rows, None)
     if header is None:
         _refuse(path, 1, "an empty file", "a header and rows of counts")
-    pad = _pad_of_header(path, header)
+    poses = CsvPoses([name.strip() for name in header])
+    counts_end = len(header) - poses.columns
+    pad = _pad_of_header(path, header[:counts_end])
     values = array("i")  # a list of rows would take ten times the memory of the file
     for line, row in enumerate(rows, 2):
-        values.extend(_count_row(path, line, row, len(header)))
+        if len(row) != len(header):
+            _refuse(path, line, f"{len(row)} columns", f"{len(header)}")
+        values.extend(_count(path, line, cell.strip()) for cell in row[:counts_end])
+        wrong = poses.add(line - 2, row[counts_end:])
+        if wrong is not None:
+            _refuse(path, line, f"'{wrong[:20]}'", "a number in each column of a pose, or none in all of them")
     if not values:
         _refuse(path, 2, "the end of the file", "a row of counts")
     taxels = np.frombuffer(values, dtype=np.int32).reshape(-1, pad.rows, pad.cols, len(AXES))
     counts = np.ascontiguousarray(taxels.transpose(0, 3, 1, 2))
-    return Recording(path, (Track(path.stem, counts, time_ns=None),), _meta_rate_hz(path.with_name(_META_NAME)))
+    rate_hz = _meta_rate_hz(path.with_name(_META_NAME))
+    try:
+        return Recording(path, (Track(path.stem, counts, time_ns=None),), rate_hz, poses=poses.poses())
+    except ValueError as error:
+        raise RecordingError(f"{path}: its poses: {error}") from error
 
 
 def _csv_rows(path: Path) -> Iterator[list[str]]:
@@ -139,12 +152,6 @@ def _pad_of_header(path: Path, header: list[str]) -> SensorGeometry:
 
 def _header_text(header: tuple[str, ...]) -> str:
     return f"{', '.join(header[:4])}, ..., {header[-1]}"
-
-
-def _count_row(path: Path, line: int, row: list[str], columns: int) -> list[int]:
-    if len(row) != columns:
-        _refuse(path, line, f"{len(row)} columns", f"{columns}")
-    return [_count(path, line, cell.strip()) for cell in row]
 
 
 def _count(path: Path, line: int, cell: str) -> int:
@@ -199,7 +206,11 @@ def _load_npz(path: Path) -> Recording:
         for mine in [arrays["sensor"] == sensor]
     ]
     return Recording(
-        path, tuple(tracks), _npz_rate_hz(path, arrays.get("rate_hz")), origin=_npz_origin(path, arrays, len(counts))
+        path,
+        tuple(tracks),
+        _npz_rate_hz(path, arrays.get("rate_hz")),
+        origin=_npz_origin(path, arrays, len(counts)),
+        poses=npz_poses(path, arrays),
     )
 
 
@@ -250,7 +261,7 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
 
 def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, "rate_hz"), MOST_NPZ_BYTES)
+        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz"), MOST_NPZ_BYTES)
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
     for name in _NPZ_REQUIRED:

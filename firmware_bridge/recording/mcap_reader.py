@@ -25,7 +25,10 @@ from mcap.writer import MCAP0_MAGIC
 
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, SensorGeometry
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
+from firmware_bridge.recording.pose_columns import PoseRows
+from firmware_bridge.recording.pose_messages import POSE, decode_pose
 from firmware_bridge.recording.scan_messages import SCAN_NAME, baseline_type, decode_baseline, decode_scan, scan_type
 from firmware_bridge.recording.tracks import (
     GEOMETRY_METADATA,
@@ -48,6 +51,7 @@ MOST_KEPT_BYTES: Final = 1 << 31
 """Most bytes of the scans in memory: a day of one sensor at 100 Hz."""
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
+_POSE_BYTES: Final = 64
 MOST_SHOWN_TOPICS: Final = 10
 LONGEST_SHOWN: Final = 60
 _RECORD: Final = struct.Struct("<BQ")
@@ -116,6 +120,7 @@ class _Reading:
         self._geometry = USPA44  # for files that name no geometry
         self._offset_ns: int | None = None
         self._kept_bytes = 0
+        self._poses = PoseRows()
         self._notes: list[str] = []
         self._origin: Literal["device", "emulated"] | None = None
 
@@ -141,7 +146,7 @@ class _Reading:
 
     def _take_schema(self, schema: Schema) -> None:
         taxels = self._geometry.taxel_count
-        known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels))}.get(schema.name)
+        known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels), POSE)}.get(schema.name)
         if known is not None and (schema.encoding, schema.data) != ("ros2msg", known.definition.encode()):
             raise RecordingError(f"{self._path}: its {known.name} is of another release of edge-sr than this one")
         self._schemas[schema.id] = known
@@ -191,6 +196,8 @@ class _Reading:
         try:
             if topic.kind.name == SCAN_NAME:
                 self._take_scan(data[_MESSAGE.size :], log_ns)
+            elif topic.kind is POSE:
+                self._take_pose(decode_pose(data[_MESSAGE.size :]))
             else:
                 self._take_baseline(decode_baseline(data[_MESSAGE.size :], self._geometry))
         except CdrError as error:
@@ -224,6 +231,14 @@ class _Reading:
         lane.device_times_ns.append(scan.device_time_ns)
         lane.renewed.append(scan.renewed)
 
+    def _take_pose(self, timed: TimedPose) -> None:
+        self._kept_bytes += _POSE_BYTES
+        if self._kept_bytes > MOST_KEPT_BYTES:
+            raise RecordingError(f"{self._path}: more poses than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
+        self._poses.add(timed)
+        if self._poses.sensors > MOST_SENSORS + 1:
+            raise RecordingError(f"{self._path}: poses of more than {MOST_SENSORS} sensors")
+
     def _take_baseline(self, baseline: Baseline) -> None:
         sensor = baseline.sensor
         before = self._latest.get(sensor)
@@ -253,7 +268,15 @@ class _Reading:
         mountings = {name: one for name, one in self._mountings.items() if name in self._lanes}
         baselines = {name: one for name, one in self._baselines.items() if name in self._lanes}
         return Recording(
-            self._path, tracks, None, baselines, mountings, self._offset_ns, tuple(self._notes), self._origin
+            self._path,
+            tracks,
+            None,
+            baselines,
+            mountings,
+            self._offset_ns,
+            tuple(self._notes),
+            self._origin,
+            self._poses.columns(),
         )
 
     def _instead(self) -> str:

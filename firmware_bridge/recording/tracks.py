@@ -13,6 +13,7 @@ from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.schedule import NS_PER_S
 
 if TYPE_CHECKING:
+    from firmware_bridge.recording.pose_columns import PoseColumns
     from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
@@ -80,6 +81,7 @@ class Recording:
         notes: remarks for the user who plays it.
         origin: "device" or "emulated", the origin of its scans, however often they were played and recorded again;
             None if the file does not state it.
+        poses: poses of the pads; None without.
     """
 
     path: Path
@@ -90,6 +92,7 @@ class Recording:
     unix_offset_ns: int | None = None
     notes: tuple[str, ...] = ()
     origin: Literal["device", "emulated"] | None = None
+    poses: "PoseColumns | None" = None
 
 
 def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:

@@ -8,24 +8,29 @@ import pytest
 from edge.cli.user_commands import user_commands, zero_on_signal
 from edge.pipeline.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, CommandLines, Commands, obey, read_stdin
 
+OPEN = []
+
 
 def lines_of(descriptor):
     commands = Commands()
     lines = CommandLines(commands, descriptor)
+    OPEN.append(lines)
     commands.ask(lines.read)
     return lines, commands
 
 
 def polled_stdin():
     commands = Commands()
-    read_stdin(commands)
-    return commands.poll()
+    with read_stdin(commands):
+        return commands.poll()
 
 
 @pytest.fixture
 def pipe():
     ends = list(os.pipe())
     yield ends
+    while OPEN:
+        OPEN.pop().close()
     for end in ends:
         try:
             os.close(end)

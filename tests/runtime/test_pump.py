@@ -9,6 +9,7 @@ from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_sca
 from edge.errors import SinkClosedError
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET
+from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.pump import pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
@@ -188,6 +189,7 @@ class Script:
 
     def __init__(self, at) -> None:
         self.refused = 3
+        self.poses = PoseQueue()
         self._at = at
         self._polls = itertools.count()
 

@@ -108,11 +108,11 @@ def slcan_seeds() -> list[bytes]:
 def commands(data: bytes) -> None:
     """Read anything on stdin: commands are those that exist, and no more than the lines that hold one."""
     read_end, write_end = os.pipe()
+    os.write(write_end, data)
+    os.close(write_end)
+    asked = Commands()
+    lines = CommandLines(asked, read_end)
     try:
-        os.write(write_end, data)
-        os.close(write_end)
-        asked = Commands()
-        lines = CommandLines(asked, read_end)
         asked.ask(lines.read)
         got = [command for _ in range(len(data) // 4096 + 2) for command in asked.poll()]
         for command in got:
@@ -123,6 +123,7 @@ def commands(data: bytes) -> None:
         assert len(got) <= data.count(b"reset") + data.count(b"zero") + data.count(b"\\u")
         assert len(lines._partial) <= LONGEST_LINE_BYTES + 1
     finally:
+        lines.close()
         os.close(read_end)
 
 

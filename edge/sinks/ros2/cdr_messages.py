@@ -70,6 +70,7 @@ _WARN, _ERROR, _INFO = 30, 40, 20
 _LEVELS: Final[Mapping[EventKind, int]] = {
     **dict.fromkeys(("lost", "sink"), _ERROR),
     **dict.fromkeys(("silent", "trouble", "refused", "in_contact", "given_up", "rest_level"), _WARN),
+    **dict.fromkeys(("poses_silent", "poses_trouble"), _WARN),
 }
 
 

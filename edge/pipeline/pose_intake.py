@@ -1,0 +1,124 @@
+"""Way of poses into the runtime, with their counts, and detection of a source of them that falls silent."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
+
+from edge.perception.event import Event
+from edge.pipeline.pose_fields import PoseError
+from edge.pipeline.pose_queue import PoseQueue
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.silence import POSES_SILENT_NS
+
+REPEATED_NS: Final = 10_000_000_000
+"""Time after which the same reason is reported again, in [ns]: a stream of bad poses must not flood."""
+
+
+class Posed(Protocol):
+    """Runtime as seen by poses."""
+
+    def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
+        """Take a pose; False if one at the same time or later was taken before."""
+        ...
+
+
+@dataclass(slots=True)
+class _Course:
+    """Poses of one sensor: when the last one was taken, in [ns], whether it holds, and whether silence is reported."""
+
+    last_ns: int
+    holds: bool
+    silent: bool = False
+
+
+class PoseIntake:
+    """Intake of poses, in the thread of the loop, between two scans.
+
+    Attributes:
+        used: poses that the runtime has taken.
+        refused: poses that could not be taken.
+        dropped: poses that nobody took in time.
+    """
+
+    def __init__(self, runtime: Posed, queue: PoseQueue, *, recorded: bool = False) -> None:
+        """Begin without a pose.
+
+        Args:
+            runtime: takes the poses.
+            queue: of the poses that come from outside.
+            recorded: scans are of another time than now, so that no pose of now belongs to them.
+        """
+        self.used = 0
+        self._runtime = runtime
+        self._queue = queue
+        self._recorded = recorded
+        self._courses: dict[str | None, _Course] = {}
+        self._reported_ns: dict[str, int] = {}
+        self._events: list[Event] = []
+
+    @property
+    def refused(self) -> int:  # noqa: D102 - above
+        return self._queue.refused
+
+    @property
+    def dropped(self) -> int:  # noqa: D102 - above
+        return self._queue.dropped
+
+    def take(self, recorded: Sequence[TimedPose], first_scan_ns: int | None, now_ns: int) -> list[TimedPose]:
+        """Pass on the poses that wait, and return those that the runtime has taken.
+
+        Args:
+            recorded: poses of the source of the scans.
+            first_scan_ns: time of the first scan that comes after them; None if none has come yet.
+            now_ns: time now, or of the newest scan of a recording.
+        """
+        waiting = self._queue.take()
+        if self._recorded:
+            for _ in waiting:
+                self._queue.refuse(
+                    PoseError("recorded", "its scans are of a recording, which has poses of its own: add --paced")
+                )
+            waiting = []
+        taken: list[TimedPose] = []
+        for timed in (*recorded, *waiting):
+            if self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
+                taken.append(replace(timed, used_from_ns=now_ns if first_scan_ns is None else first_scan_ns))
+            else:
+                earlier = f"that of the pose{_of(timed.sensor)} before"
+                text = f"its time, {timed.time_ns} ns, is not after {earlier}: send them in order"
+                self._queue.refuse(PoseError("order", text))
+        self.used += len(taken)
+        for timed in taken:
+            self._follow(timed, now_ns)
+        return taken
+
+    def look(self, now_ns: int) -> list[Event]:
+        """Return events: of poses that stopped or came back since the last call, and of poses that are refused."""
+        for sensor, course in self._courses.items():
+            away_ns = now_ns - course.last_ns
+            if not (course.silent or course.holds) and away_ns > POSES_SILENT_NS:
+                course.silent = True
+                text = (
+                    f"no pose{_of(sensor)} for {away_ns / 1e9:.1f} s, so patterns are of one tap: check what sends "
+                    'them; a pad at rest needs no more of them after one with "holds": true'
+                )
+                self._events.append(Event(now_ns, "poses_silent", sensor, text))
+        for reason, text in self._queue.take_reasons().items():
+            if now_ns - self._reported_ns.get(reason, now_ns - REPEATED_NS) >= REPEATED_NS:
+                self._reported_ns[reason] = now_ns
+                self._events.append(Event(now_ns, "poses_trouble", None, text))
+        events, self._events = self._events, []
+        return events
+
+    def _follow(self, timed: TimedPose, now_ns: int) -> None:
+        before = self._courses.get(timed.sensor)
+        self._courses[timed.sensor] = _Course(now_ns, timed.holds)
+        if before is not None and before.silent:
+            away_s = (now_ns - before.last_ns) / 1e9
+            text = f"poses{_of(timed.sensor)} are back after {away_s:.1f} s"
+            self._events.append(Event(now_ns, "poses_back", timed.sensor, text))
+
+
+def _of(sensor: str | None) -> str:
+    return "" if sensor is None else f" of sensor {sensor}"

@@ -1,0 +1,278 @@
+"""Poses in recordings: written by the sinks, read back, and played to the runtime at the scans that they served."""
+
+import numpy as np
+import pytest
+from bridge_samples import make_counts, write_recording
+from cli_samples import base_options, files, run, start
+from edge_samples import BASELINE, FakeModel, make_scan
+from mcap_samples import OFFSET_NS, messages_of
+
+from edge import api
+from edge.perception.runtime import Runtime
+from edge.pipeline.result_stream import Stream
+from edge.sinks.mcap import McapSink
+from edge.sinks.npz import NpzSink, gather, parts_dir
+from firmware_bridge.errors import CdrError, RecordingError
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.pose_messages import POSE, decode_pose, encode_pose
+
+__all__ = ["files"]
+STEP_NS = 10_000_000
+POSES = [
+    # Time, place and sensor; and the scan that was first made with it at hand, which may be earlier than its own time.
+    (TimedPose(PadPose(1.0, 2.0, 3.0, 0.4, 0.5), 500_000_000, None, True), 0),
+    (TimedPose(PadPose(-1.5, 0.25, -170.0, 0.0, 0.0), 1_012_000_000, "4", False), 2),
+    (TimedPose(PadPose(7.0, 8.0, 9.0, 0.1, 2.0), 1_019_000_000, "4", True), 2),
+    (TimedPose(PadPose(4.0, 5.0, 6.0, 0.1, 2.0), 1_021_000_000, None, False), 4),
+]
+SINKS = ("mcap", "npz")
+
+
+class PosedRuntime(Runtime):
+    """Runtime that also lists its poses and scans in the order in which they come."""
+
+    def __init__(self):
+        super().__init__(FakeModel(), source="replay", baselines={"4": BASELINE})
+        self.seen = []
+
+    def pose(self, pose, time_ns, sensor=None, *, holds=False):
+        self.seen.append(TimedPose(pose, time_ns, sensor, holds))
+        return super().pose(pose, time_ns, sensor, holds=holds)
+
+    def push_together(self, scans):
+        self.seen += [scan.time_ns for scan, _ in scans]
+        return super().push_together(scans)
+
+
+def make_scans(count=6):
+    return [make_scan(number, time_ns=10**9 + number * STEP_NS, press_counts=3000, noise=3) for number in range(count)]
+
+
+def open_for(path):
+    contract = FakeModel().contract
+    if path.suffix == ".mcap":
+        return McapSink(path, contract, unix_offset_ns=OFFSET_NS)
+    return NpzSink(path, (3, 4, 4), contract.pattern_shape)
+
+
+def record(path, poses=POSES, *, close=True):
+    """Record scans and poses as a run would."""
+    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+    sink = open_for(path)
+    for number, scan in enumerate(make_scans()):
+        mine = [TimedPose(p.pose, p.time_ns, p.sensor, p.holds, scan.time_ns) for p, first in poses if first == number]
+        if mine:
+            sink.pose(mine)
+        sink.write(runtime.push(scan), {})
+    if close:
+        sink.close()
+    return path
+
+
+def played(path):
+    runtime = PosedRuntime()
+    with api.open_recording(path) as source:
+        stream = Stream(source, runtime)
+        assert len(list(stream)) > 0
+    return runtime.seen, stream.statistics
+
+
+def expected_order():
+    order = []
+    for number, scan in enumerate(make_scans()):
+        order += [pose for pose, first in POSES if first == number]
+        order.append(scan.time_ns)
+    return order
+
+
+@pytest.mark.parametrize("kind", SINKS)
+def test_poses_are_played_at_the_scans_that_they_served(tmp_path, kind):
+    seen, statistics = played(record(tmp_path / f"posed.{kind}"))
+    assert seen == expected_order()
+    assert (statistics.poses, statistics.poses_refused) == (len(POSES), 0)
+
+
+@pytest.mark.parametrize("kind", SINKS)
+def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path, kind):
+    first = record(tmp_path / f"first.{kind}")
+    again = tmp_path / f"again.{kind}"
+    runtime = PosedRuntime()
+    with api.open_recording(first) as source:
+        sink = open_for(again)
+        api.pump(source, runtime, [sink], api.Statistics())
+        sink.close()
+    assert played(again)[0] == played(first)[0] == expected_order()
+
+
+@pytest.mark.parametrize("kind", SINKS)
+def test_a_recording_without_poses_has_none_and_stays_as_it_was(tmp_path, kind):
+    path = record(tmp_path / f"plain.{kind}", [])
+    assert load_recording(path).poses is None
+    if kind == "npz":
+        with np.load(path) as arrays:
+            assert not [name for name in arrays.files if name.startswith("pose")]
+    else:
+        assert "/poses" not in messages_of(path)
+
+
+def test_the_public_readers_find_the_poses(tmp_path):
+    with np.load(record(tmp_path / "posed.npz")) as arrays:
+        assert arrays["pose_time_ns"].tolist() == [pose.time_ns for pose, _ in POSES]
+        assert arrays["pose"].tolist() == [
+            [p.pose.x_mm, p.pose.y_mm, p.pose.turn_deg, p.pose.error_mm, p.pose.error_deg] for p, _ in POSES
+        ]
+        assert arrays["pose_sensor"].tolist() == [pose.sensor or "" for pose, _ in POSES]
+        assert arrays["pose_holds"].tolist() == [pose.holds for pose, _ in POSES]
+    messages = messages_of(record(tmp_path / "posed.mcap"))["/poses"]
+    assert [log_ns - OFFSET_NS for log_ns, _ in messages] == [pose.time_ns for pose, _ in POSES]
+    assert [decode_pose(data).pose for _, data in messages] == [pose.pose for pose, _ in POSES]
+
+
+def test_rows_that_a_crash_left_hold_the_poses(tmp_path):
+    path = tmp_path / "killed.npz"
+    record(path, close=False)
+    with (parts_dir(path) / "poses").open("ab") as rows:
+        rows.write(b"half a row")
+    gather(path)
+    assert played(path)[0] == expected_order()
+
+
+def test_poses_of_another_program_come_in_time_to_be_interpolated(tmp_path):
+    scans = make_scans(40)
+    times_ns = np.array([scan.time_ns for scan in scans])
+    pose_times_ns = np.arange(10**9 - 5_000_000, 10**9 + 400_000_000, 33_000_000)
+    values = np.zeros((len(pose_times_ns), 5))
+    values[:, 0] = (pose_times_ns - 10**9) / 1e9 * 20  # 20 mm/s
+    np.savez(
+        tmp_path / "other.npz",
+        format=np.array("tactile-recording"),
+        version=np.array(1),
+        sensor=np.array(["4"] * 40),
+        scan=np.arange(40),
+        time_ns=times_ns,
+        counts=np.stack([scan.counts for scan in scans]),
+        pose_time_ns=pose_times_ns,
+        pose=values,
+    )
+    places, runtime = [], PosedRuntime()
+    with api.open_recording(tmp_path / "other.npz") as source:
+        for result in Stream(source, runtime):
+            track = runtime._tracks[None]
+            places.append((result.scan.time_ns, track.at(result.scan.time_ns).x_mm))
+    assert len(places) == 40
+    for time_ns, x_mm in places:
+        assert x_mm == pytest.approx((time_ns - 10**9) / 1e9 * 20)
+
+
+def test_a_paced_replay_moves_the_poses_with_the_scans(tmp_path):
+    link = ReplayLink([record(tmp_path / "posed.mcap")], clock=lambda: 77 * 10**9, sleep=lambda time_s: None)
+    link._clock = iter([70 * 10**9, *[77 * 10**9] * 9]).__next__
+    with link:
+        scans = link.read(1.0)
+        poses = link.poses()
+    assert [scan.time_ns - 70 * 10**9 for scan in scans] == [number * STEP_NS for number in range(6)]
+    assert [one.time_ns - 69 * 10**9 for one in poses] == [pose.time_ns for pose, _ in POSES]
+    assert link.poses() == []
+
+
+def test_a_rate_of_its_own_leaves_the_poses_out_and_reports_it(tmp_path):
+    link = ReplayLink([record(tmp_path / "posed.npz")], 50.0)
+    assert "its 4 poses are left out" in link.notices()[0].text
+
+
+class TestCsv:
+    def write(self, path, cells, columns="pose_x_mm,pose_y_mm,pose_turn_deg"):
+        write_recording(path, make_counts(len(cells)), rate_hz=50)
+        lines = path.read_text().splitlines()
+        path.write_text("".join(f"{line},{more}\n" for line, more in zip(lines, [columns, *cells], strict=True)))
+        return path
+
+    def poses(self, path):
+        with ReplayLink([path], paced=False) as link:
+            return [(scan.number, link.poses()) for _ in range(3) for scan in link.read(0.0)]
+
+    def test_each_row_has_its_pose_or_none(self, tmp_path):
+        got = self.poses(self.write(tmp_path / "finger.csv", ["1,2,3", ",,", "-4.5, 5e-1,0"]))
+        assert got == [
+            (0, [TimedPose(PadPose(1, 2, 3), 0, used_from_ns=0)]),
+            (1, []),
+            (2, [TimedPose(PadPose(-4.5, 0.5, 0), 40_000_000, used_from_ns=40_000_000)]),
+        ]
+
+    def test_the_turn_may_be_left_out(self, tmp_path):
+        got = self.poses(self.write(tmp_path / "finger.csv", ["1,2", "3,4", ","], "pose_x_mm,pose_y_mm"))
+        assert [[(p.pose.x_mm, p.pose.turn_deg) for p in poses] for _, poses in got] == [[(1, 0)], [(3, 0)], []]
+
+    def test_two_files_together_keep_their_poses_apart(self, tmp_path):
+        paths = [self.write(tmp_path / f"{name}.csv", [f"{x},0,0"] * 3) for name, x in (("left", 1), ("right", 2))]
+        with ReplayLink(paths, paced=False) as link:
+            poses = [one for _ in range(6) for _ in link.read(0.0) for one in link.poses()]
+        assert {(one.sensor, one.pose.x_mm) for one in poses} == {("left", 1.0), ("right", 2.0)}
+        assert len(poses) == 6
+
+    @pytest.mark.parametrize("cells", ["1,,3", "1,x,3", "nan,0,0", "inf,0,0", "1e7,0,0"])
+    def test_a_cell_that_is_no_pose_is_refused(self, tmp_path, cells):
+        with pytest.raises(RecordingError, match=r"finger.csv"):
+            load_recording(self.write(tmp_path / "finger.csv", ["1,2,3", cells]))
+
+
+class TestHostile:
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"pose": np.zeros((2, 4))},
+            {"pose": np.full((2, 5), np.nan)},
+            {"pose": np.full((2, 5), -1.0)},
+            {"pose": np.array([["a"] * 5] * 2)},
+            {"pose_time_ns": np.array([-1, 2])},
+            {"pose_time_ns": np.array([0, 2**63], np.uint64)},
+            {"pose_time_ns": np.array([0, 1, 2])},
+            {"pose_sensor": np.array(["4", "\x1b"])},
+            {"pose_sensor": np.array([4, 5])},
+            {"pose_holds": np.array([0, 1])},
+            {"pose_used_from_ns": np.array([-2, 0])},
+            {"pose": None},
+            {"pose_time_ns": None},
+        ],
+    )
+    def test_arrays_that_cannot_be_are_refused_with_one_line(self, tmp_path, change):
+        with np.load(record(tmp_path / "posed.npz", POSES[:2])) as found:
+            arrays = {name: found[name] for name in found.files} | change
+        np.savez(tmp_path / "bad.npz", **{name: one for name, one in arrays.items() if one is not None})
+        with pytest.raises(RecordingError, match="array 'pose") as caught:
+            load_recording(tmp_path / "bad.npz")
+        assert str(caught.value).isprintable()
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            *({"x_mm": np.nan}, {"error_mm": -1.0}, {"holds": 2}, {"time_ns": -1}, {"used_from_ns": -2}),
+            *({"sensor": "\x1b"}, {"sensor": "4" * 65}),
+        ],
+    )
+    def test_a_message_that_cannot_be_is_refused(self, change):
+        fields = POSE.decode(encode_pose(POSES[0][0], OFFSET_NS))
+        with pytest.raises(CdrError):
+            decode_pose(POSE.encode({**fields, **change}))
+
+
+def test_a_program_records_the_poses_of_stdin_and_plays_them(files, tmp_path):
+    import subprocess
+
+    out = tmp_path / "run.mcap"
+    options = ["--source", f"replay:{files / 'rest.npz'}", "--sink", f"mcap:{out}", "--sink", "jsonl:-"]
+    with start(*base_options(files), *options, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stdout is not None
+        process.stdout.readline()  # it runs
+        for number in range(5):
+            process.stdin.write(f'{{"cmd": "pose", "x_mm": {number}, "y_mm": 1, "holds": true}}\n')
+            process.stdin.flush()
+        process.stdout.read()
+        assert process.wait() == 0
+    messages = messages_of(out)["/poses"]
+    assert [decode_pose(data).pose.x_mm for _, data in messages] == [0, 1, 2, 3, 4]
+    done = run("replay", out, "--model", files / "tiny.onnx")
+    assert done.returncode == 0 and "poses: 5 received, 5 used" in done.stderr

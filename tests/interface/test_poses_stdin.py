@@ -1,0 +1,253 @@
+"""Poses on stdin: lines, the bounded queue, the way into a real runtime, and a whole `edge-sr`."""
+
+import json
+import os
+import subprocess
+import threading
+import time
+
+import pytest
+from cli_samples import base_options, files, records, start, wait_for, write_recording
+from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
+
+from edge.perception.runtime import Runtime
+from edge.pipeline.commands import RESET, CommandLines, Commands
+from edge.pipeline.pose_fields import FURTHEST_AHEAD_NS, PoseError, pose_of_fields
+from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
+from edge.pipeline.pose_queue import WAITING_POSES, PoseQueue
+from edge.pipeline.pump import pump
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import Source
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.silence import POSES_SILENT_NS
+
+__all__ = ["files"]
+WHOLE = (
+    '{"cmd": "pose", "x_mm": 1.5, "y_mm": 0, "turn_deg": 5, "error_mm": 0.2, "error_deg": 1, "sensor": "4", '
+    '"time_ns": 123, "holds": true}'
+)
+NOW_NS = 10**12
+
+
+class TestFields:
+    def test_all_fields_are_taken(self):
+        expected = TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), 123, "4", True)
+        assert pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
+
+    def test_place_alone_is_enough(self):
+        expected = TimedPose(PadPose(1.0, -2.0), NOW_NS)
+        assert pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == expected
+
+    @pytest.mark.parametrize(
+        ("fields", "words"),
+        [
+            ({"y_mm": 0}, "x_mm is missing"),
+            ({"x_mm": 0, "y_mm": "1"}, "y_mm is '1'"),
+            ({"x_mm": 0, "y_mm": True}, "y_mm is True"),
+            ({"x_mm": float("nan"), "y_mm": 0}, "x_mm is nan"),
+            ({"x_mm": 10**400, "y_mm": 0}, "x_mm is 1000"),
+            ({"x_mm": 0, "y_mm": 0, "error_mm": -1}, "error_mm is -1"),
+            ({"x_mm": 0, "y_mm": 0, "turn": 3}, "it has 'turn'"),
+            ({"x_mm": 0, "y_mm": 0, "sensor": 4}, "sensor is 4"),
+            ({"x_mm": 0, "y_mm": 0, "sensor": "\x1b[2J"}, "sensor is"),
+            ({"x_mm": 0, "y_mm": 0, "holds": 1}, "holds is 1"),
+            ({"x_mm": 0, "y_mm": 0, "time_ns": 1.5}, "time_ns is 1.5"),
+            ({"x_mm": 0, "y_mm": 0, "time_ns": -1}, "time_ns is -1"),
+            ({"x_mm": 0, "y_mm": 0, "time_ns": 1_700_000_000 * 10**9}, "s ahead of now"),
+            ({"cmd": "zero", "x_mm": 0, "y_mm": 0}, "cmd is 'zero'"),
+        ],
+    )
+    def test_a_field_that_is_wrong_is_named(self, fields, words):
+        with pytest.raises(PoseError, match=words.replace("[", r"\[")) as caught:
+            pose_of_fields(fields, NOW_NS)
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+
+    def test_a_pose_may_lie_a_little_ahead(self):
+        assert pose_of_fields({"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + FURTHEST_AHEAD_NS}, NOW_NS)
+
+
+class TestLines:
+    def test_poses_and_commands_part_and_bad_lines_stop_nothing(self):
+        read_end, write_end = os.pipe()
+        commands = Commands()
+        lines = CommandLines(commands, read_end)
+        commands.ask(lines.read)
+        os.write(write_end, f'{WHOLE}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{WHOLE}\n'.encode())
+        assert commands.poll() == [RESET]
+        assert [one.time_ns for one in commands.poses.take()] == [123, 123]
+        assert (commands.refused, commands.poses.refused) == (1, 1)
+        assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
+        os.close(write_end)
+        lines.close()
+        os.close(read_end)
+
+    def test_the_time_of_arrival_is_that_of_the_line_while_the_loop_waits(self):
+        read_end, write_end = os.pipe()
+        commands = Commands()
+        lines = CommandLines(commands, read_end)
+        before_ns = time.monotonic_ns()
+        os.write(write_end, b'{"cmd": "pose", "x_mm": 1, "y_mm": 2}\n')
+        wait_for(lambda: len(commands.poses._waiting) == 1)  # nobody polls: its own thread reads
+        after_ns = time.monotonic_ns()
+        (pose,) = commands.poses.take()
+        assert before_ns <= pose.time_ns <= after_ns
+        lines.close()
+        os.close(write_end)
+        os.close(read_end)
+
+
+class TestQueue:
+    def test_it_is_bounded_and_the_oldest_are_dropped(self):
+        queue = PoseQueue()
+        for number in range(WAITING_POSES + 10):
+            queue.put(TimedPose(PadPose(0, 0), number))
+        assert [one.time_ns for one in queue.take()] == list(range(10, WAITING_POSES + 10))
+        assert queue.dropped == 10 and queue.take() == []
+
+    def test_poses_of_many_threads_are_each_taken_or_counted(self):
+        queue, taken = PoseQueue(), []
+
+        def put(name):
+            for number in range(2000):
+                queue.put(TimedPose(PadPose(0, 0), number, name))
+                queue.put_fields({}, 0)
+
+        threads = [threading.Thread(target=put, args=(name,)) for name in "abc"]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            taken += queue.take()
+        taken += queue.take()
+        assert len(taken) + queue.dropped == queue.refused == 6000
+        for name in "abc":
+            mine = [one.time_ns for one in taken if one.sensor == name]
+            assert mine == sorted(mine)
+
+
+def make_runtime():
+    return Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+
+
+def pose(time_ns, x_mm=0.0, sensor=None, holds=False):
+    return TimedPose(PadPose(x_mm, 0.0), time_ns, sensor, holds)
+
+
+class TestIntake:
+    def test_the_runtime_gets_them_and_the_first_scan_after_them_is_kept(self):
+        runtime, queue = make_runtime(), PoseQueue()
+        intake = PoseIntake(runtime, queue)
+        for one in (pose(5, 1.0), pose(7, 2.0, "4")):
+            queue.put(one)
+        assert [one.used_from_ns for one in intake.take([pose(6, 3.0, "6")], 20, 30)] == [20, 20, 20]
+        queue.put(pose(8, 4.0))
+        assert [one.used_from_ns for one in intake.take([], None, 40)] == [40]
+        tracks = runtime._tracks
+        assert {name: len(track) for name, track in tracks.items()} == {None: 2, "4": 1, "6": 1}
+        assert tracks["4"].at(7).x_mm == 2.0
+        assert (intake.used, intake.refused, intake.dropped) == (4, 0, 0)
+
+    def test_a_pose_out_of_order_is_refused_with_one_line_for_many(self):
+        queue = PoseQueue()
+        intake = PoseIntake(make_runtime(), queue)
+        for time_ns in (50, 40, 30, 60):
+            queue.put(pose(time_ns))
+        assert [one.time_ns for one in intake.take([], None, 100)] == [50, 60]
+        (event,) = intake.look(100)
+        assert event.kind == "poses_trouble" and "40 ns, is not after" in event.text
+        queue.put(pose(1))
+        intake.take([], None, 200)
+        assert intake.look(200) == [] and intake.refused == 3
+        queue.put(pose(2))
+        intake.take([], None, 300)
+        events = [event for event in intake.look(100 + REPEATED_NS) if event.kind == "poses_trouble"]
+        assert len(events) == 1, "it is reported again after a while"
+
+    def test_a_source_that_falls_silent_is_reported_once_and_when_it_is_back(self):
+        queue = PoseQueue()
+        intake = PoseIntake(make_runtime(), queue)
+        assert intake.look(10**12) == [], "without any pose there is nothing to miss"
+        for number, sensor in enumerate((None, "4")):
+            queue.put(pose(number + 1, sensor=sensor))
+        intake.take([], None, 0)
+        assert intake.look(POSES_SILENT_NS) == []
+        queue.put(pose(3, sensor="4"))
+        intake.take([], None, POSES_SILENT_NS)
+        (event,) = intake.look(POSES_SILENT_NS + 1)
+        assert (event.kind, event.sensor) == ("poses_silent", None) and "one tap" in event.text
+        assert intake.look(POSES_SILENT_NS + 2) == []
+        queue.put(pose(4))
+        intake.take([], None, POSES_SILENT_NS + 10**8)
+        (event,) = intake.look(POSES_SILENT_NS + 10**8)
+        assert (event.kind, event.text) == ("poses_back", "poses are back after 0.6 s")
+
+    def test_a_pose_that_holds_is_followed_by_silence_of_any_length(self):
+        queue = PoseQueue()
+        intake = PoseIntake(make_runtime(), queue)
+        queue.put(pose(1, holds=True))
+        intake.take([], None, 1)
+        assert intake.look(10**15) == []
+
+    def test_poses_of_now_are_refused_for_scans_of_another_time(self):
+        queue = PoseQueue()
+        intake = PoseIntake(make_runtime(), queue, recorded=True)
+        queue.put(pose(9))
+        assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
+        assert intake.refused == 1 and "recording" in intake.look(6)[0].text
+
+
+class PoseSink(ListSink):
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def pose(self, poses):
+        self.seen += [("pose", one.pose.x_mm) for one in poses]
+
+    def write(self, result, counters):
+        super().write(result, counters)
+        self.seen.append(("scan", result.scan.number))
+
+
+def test_poses_come_to_the_sinks_before_the_scans_that_they_serve():
+    commands, sink, statistics = Commands(), PoseSink(), Statistics()
+    commands.poses.put(pose(1, 7.0))
+    link = FakeLink([[make_scan(0)], [make_scan(1)]])
+    with Source(link) as source:
+        pump(source, make_runtime(), [sink], statistics, commands=commands)
+    assert sink.seen == [("pose", 7.0), ("scan", 0), ("scan", 1)]
+    assert (statistics.poses, statistics.poses_refused, statistics.poses_dropped) == (1, 0, 0)
+    assert sink.counters[-1]["poses"] == 1
+    assert "poses: 1 received, 1 used, 0 refused, 0 dropped" in statistics.summary(source="fake")
+
+
+def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
+    """A robot at 1000 poses/s that dies: every scan gets its record all the same, and one event reports it."""
+    recording = write_recording(files / "long.npz", ([0] * 5 + [3000] * 5) * 30)
+    options = [*base_options(files), "--source", f"replay:{recording}", "--sink", "jsonl:-"]
+    with start(*options, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stdout is not None
+        out = []
+        reader = threading.Thread(target=lambda: out.extend(process.stdout))
+        reader.start()
+        wait_for(lambda: out)
+        sent = 0
+        process.stdin.write('{"cmd": "pose", "x_mm": "left"}\n' * 50)
+        while sent < 1000:
+            process.stdin.write(
+                "".join(f'{{"cmd": "pose", "x_mm": {number}, "y_mm": 0}}\n' for number in range(sent, sent + 10))
+            )
+            process.stdin.flush()
+            sent += 10
+            time.sleep(0.008)
+        reader.join()
+        err = process.stderr.read()
+        assert process.wait() == 0
+    lines = records("".join(out))
+    events = [line["event"] for line in lines if line["state"] == "event"]
+    assert events.count("poses_silent") == 1 and events.count("poses_trouble") == 1
+    scans = [line for line in lines if line["state"] != "event"]
+    assert [line["scan"] for line in scans] == list(range(300))
+    assert f"poses: {sent + 50} received, {sent} used, 50 refused, 0 dropped" in err
+    assert err.count("x_mm is 'left'") == 1
+    assert scans[-1]["counters"]["poses"] == sent
