@@ -33,7 +33,7 @@ from train.surfaces.random_figures import glyph
 WANTED_MM: Final = 0.5
 FIGURES: Final = ("C", "F", "P", "S", "T", "U", "glyph:920001", "glyph:920002")
 THIN_MM: Final = 4.0
-STROKES: Final = {"as scaled, about 10 mm": None, f"thinned to {THIN_MM:g} mm": THIN_MM}
+STROKES: Final = {"as scaled, about 10 mm": None, f"thinned to about {THIN_MM:g} mm": THIN_MM}
 PADS: Final = {"nominal": 0.0, "drawn": 1.0}
 _SEED: Final = 500
 
@@ -74,13 +74,13 @@ def run(bench: Workbench, folder: Path) -> Path:
         "robot states is off by .2 mm and 1 deg (standard deviation), drawn once for each lane, since such an error "
         "does not average out. The outline is that of the contact layer at .5; its error is the root of the mean "
         "square of the distances from it to the figure's outline and back, where covered, without any alignment. "
-        "Beside it the plain mean of all patterns at their poses, cut at half of its top. "
+        "Compared with the plain mean of all patterns at their poses, cut at half of its top. "
         f"Wanted: {WANTED_MM:g} mm. Means with the 95 % interval by slide; times are of one thread, in [ms] a scan."
     )
     report.show(_summary(cases), f"{model.name}, outline in [mm].")
     report.keep([case.row for case in cases])
     report.show([case.row for case in cases], "Each slide.")
-    with report.figure(size=(12, 6)) as plot:
+    with report.figure(size=(12, 3.8)) as plot:
         shown = [case for case in cases if case.pad == "nominal"]
         for number, case in enumerate(shown):
             axes = plot.add_subplot(2, -(-len(shown) // 2), number + 1)

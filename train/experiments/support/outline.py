@@ -61,7 +61,7 @@ def naive_map(
     patterns: Sequence[NDArray[np.float32] | None], poses: Sequence[PadPose], grid: Grid
 ) -> NDArray[np.float64]:
     """Return the plain mean of all patterns, each put at its pose, as a share whose .5 is half of the mean's top."""
-    sums, counts = np.zeros(grid.count**2), np.zeros(grid.count**2)
+    sums, counts = np.zeros(grid.pixels**2), np.zeros(grid.pixels**2)
     for pattern, pose in zip(patterns, poses, strict=True):
         if pattern is None:
             continue
@@ -70,7 +70,7 @@ def naive_map(
             sums[under.pixels] += under.read(pattern[..., None])[:, 0]
             counts[under.pixels] += 1
     mean = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
-    return (mean / np.nanmax(mean)).reshape(grid.count, grid.count)
+    return (mean / np.nanmax(mean)).reshape(grid.pixels, grid.pixels)
 
 
 def _along(line: BaseGeometry) -> NDArray[np.float64]:

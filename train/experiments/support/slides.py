@@ -53,20 +53,30 @@ class Slide:
 
 
 def scaled(outline: BaseGeometry, stroke_mm: float | None = None, size_mm: float = FIGURE_MM) -> BaseGeometry:
-    """Scale a figure to a longest side, centred, and if asked thin its strokes to a width."""
+    """Scale a figure to a longest side, centred with y down, and if asked thin its strokes to a mean width."""
+    down = _fitted(affinity.scale(outline, 1, -1, origin=(0, 0)), size_mm)
+    if stroke_mm is None or _stroke_mm(down) <= stroke_mm:
+        return down
+    least_mm, most_mm = 0.0, shapely.length(shapely.maximum_inscribed_circle([down]))[0]
+    for _ in range(20):  # by bisection, since what is eroded is scaled up again
+        middle_mm = (least_mm + most_mm) / 2
+        thin = down.buffer(-middle_mm, join_style="mitre")
+        if thin.is_empty or _stroke_mm(_fitted(thin, size_mm)) < stroke_mm:
+            most_mm = middle_mm
+        else:
+            least_mm = middle_mm
+    return _fitted(down.buffer(-least_mm, join_style="mitre"), size_mm)
+
+
+def _fitted(outline: BaseGeometry, size_mm: float) -> BaseGeometry:
     left, low, right, high = outline.bounds
-    factor = size_mm / max(right - left, high - low)
-    centre = ((left + right) / 2, (low + high) / 2)
-    big = affinity.translate(affinity.scale(outline, factor, -factor, origin=centre), -centre[0], -centre[1])
-    if stroke_mm is None:
-        return big
-    # The widest disc that fits is as wide as the strokes.
-    widest_mm = 2 * float(shapely.length(shapely.maximum_inscribed_circle([big]))[0])
-    thin = big.buffer(-(widest_mm - stroke_mm) / 2, join_style="mitre")
-    left, low, right, high = thin.bounds
-    factor = size_mm / max(right - left, high - low)
-    grown = affinity.scale(thin, factor, factor, origin=((left + right) / 2, (low + high) / 2))
-    return affinity.translate(grown, -(left + right) / 2, -(low + high) / 2)
+    x_mm, y_mm, factor = (left + right) / 2, (low + high) / 2, size_mm / max(right - left, high - low)
+    return affinity.translate(affinity.scale(outline, factor, factor, origin=(x_mm, y_mm)), -x_mm, -y_mm)
+
+
+def _stroke_mm(outline: BaseGeometry) -> float:
+    """Return the mean width of strokes, of which each has two long sides."""
+    return 2 * outline.area / outline.length
 
 
 def slide(outline: BaseGeometry, seed: int, *, spread: float = 1.0, lanes_mm: Sequence[float] = LANES_MM) -> Slide:
