@@ -16,12 +16,12 @@ class Grid(NamedTuple):
     """Pixels of a map.
 
     Attributes:
-        count: pixels along a side.
+        pixels: along a side.
         px_per_mm: pixels per [mm].
         centre_mm: place of the map's centre in the object's plane.
     """
 
-    count: int
+    pixels: int
     px_per_mm: float
     centre_mm: tuple[float, float]
 
@@ -89,7 +89,7 @@ def footprint(grid: Grid, pose: PadPose, shape: tuple[int, ...], pixel_mm: float
         return None
     row, col = np.divmod(inside, len(x_mm))
     return Footprint(
-        (row + first_row) * grid.count + (col + first_col),
+        (row + first_row) * grid.pixels + (col + first_col),
         rows.ravel()[inside] + np.float32((height - 1) / 2),
         cols.ravel()[inside] + np.float32((width - 1) / 2),
     )
@@ -97,11 +97,11 @@ def footprint(grid: Grid, pose: PadPose, shape: tuple[int, ...], pixel_mm: float
 
 def _reached(grid: Grid, centre_mm: float, reach_mm: float) -> tuple[int, NDArray[np.float32]] | None:
     """Return the first of the map's lines within reach, and the distance of each from a centre, in [mm]."""
-    at = centre_mm * grid.px_per_mm + (grid.count - 1) / 2
+    at = centre_mm * grid.px_per_mm + (grid.pixels - 1) / 2
     reach = reach_mm * grid.px_per_mm
-    if not -reach <= at <= grid.count + reach:  # before it is made an integer: a pose may be a kilometre away
+    if not -reach <= at <= grid.pixels + reach:  # before it is made an integer: a pose may be a kilometre away
         return None
-    first, last = max(0, int(np.ceil(at - reach))), min(grid.count - 1, int(np.floor(at + reach)))
+    first, last = max(0, int(np.ceil(at - reach))), min(grid.pixels - 1, int(np.floor(at + reach)))
     if first > last:
         return None
     return first, ((np.arange(first, last + 1) - at) / grid.px_per_mm).astype(np.float32)
