@@ -22,6 +22,8 @@ from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, Si
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
+from edge.mapping.object_map import MapLayers, ObjectMap
+from edge.mapping.sink import MapSink
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
@@ -53,6 +55,8 @@ from firmware_bridge.errors import (
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP
 from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap, layout_c
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
@@ -85,13 +89,17 @@ __all__ = [
     "Event",
     "Fan",
     "LinkLostError",
+    "MapLayers",
+    "MapSink",
     "MessageError",
     "Model",
     "ModelError",
     "ModelMap",
     "NoDeviceError",
     "Note",
+    "ObjectMap",
     "Pad",
+    "PadPose",
     "RecordingError",
     "Result",
     "Runtime",
@@ -107,6 +115,7 @@ __all__ = [
     "SourceKind",
     "Statistics",
     "Stream",
+    "TimedPose",
     "UsageError",
     "WindowError",
     "Wrench",

@@ -8,7 +8,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from edge.api import (
     DEMO_LOOP,
@@ -31,6 +31,7 @@ from edge.api import (
 from edge.cli.run_options import (
     baseline_parser,
     devices_parser,
+    map_parser,
     models_parser,
     record_parser,
     replay_parser,
@@ -39,6 +40,9 @@ from edge.cli.run_options import (
 )
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
+
+if TYPE_CHECKING:
+    from edge.mapping.sink import MapSink
 
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
@@ -104,13 +108,24 @@ def _run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _follow(options: argparse.Namespace, statistics: Statistics | None = None) -> None:
+def _map(arguments: Sequence[str]) -> int:
+    options = understood(map_parser(), arguments)
+    from edge.cli.new_map import new_map
+
+    with new_map(options) as mapping:
+        _follow(options, mapping=mapping)
+    return 0
+
+
+def _follow(
+    options: argparse.Namespace, statistics: Statistics | None = None, mapping: "MapSink | None" = None
+) -> None:
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate requires --budget-us")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
     from edge.cli.run_command import run
 
-    run(options, source, statistics)
+    run(options, source, statistics, mapping)
 
 
 def _record(arguments: Sequence[str]) -> int:
@@ -225,6 +240,7 @@ COMMANDS: Final = {
     "demo": _demo,
     "record": _record,
     "replay": _replay,
+    "map": _map,
     "models": _models,
     "baseline": _baseline,
     "bench": _bench,

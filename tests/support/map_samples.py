@@ -59,5 +59,5 @@ def raster(turns=(0.0,), step_mm=4.0, half_mm=24.0):
 
 def pixels_mm(grid):
     """Return x and y of a map's pixels."""
-    along = (np.arange(grid.count) - (grid.count - 1) / 2) / grid.px_per_mm
+    along = (np.arange(grid.pixels) - (grid.pixels - 1) / 2) / grid.px_per_mm
     return np.meshgrid(along + grid.centre_mm[0], along + grid.centre_mm[1])
