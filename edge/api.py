@@ -22,7 +22,7 @@ from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, Si
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
-from edge.mapping.object_map import MapLayers, ObjectMap
+from edge.mapping.object_map import ObjectMap
 from edge.mapping.sink import MapSink
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
@@ -68,8 +68,7 @@ if TYPE_CHECKING:
     from edge.inference.onnx_session import ModelSession
     from firmware_bridge.links.discovery import Found
 
-# Modules that only some callers need, above all onnxruntime, are imported on use: start-up time and memory are
-# promised.
+# Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
 
 __all__ = [
     "DEFAULT_MODEL",
@@ -89,7 +88,6 @@ __all__ = [
     "Event",
     "Fan",
     "LinkLostError",
-    "MapLayers",
     "MapSink",
     "MessageError",
     "Model",
@@ -206,8 +204,6 @@ def choose_model(
     tell: Callable[[str], object] = lambda line: None,
 ) -> "ModelSession | None":
     """Load the most accurate model whose run time on this machine is within a budget, as `edge-sr --budget-us` does.
-
-    Run times are measured here and kept for later starts.
 
     Args:
         model: the best model that may be used: a file, or the name of a bundled one.

@@ -8,7 +8,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from edge.api import (
     DEMO_LOOP,
@@ -16,6 +16,7 @@ from edge.api import (
     BridgeError,
     DeviceError,
     EdgeError,
+    MapSink,
     ModelError,
     SinkError,
     Source,
@@ -40,9 +41,6 @@ from edge.cli.run_options import (
 )
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
-
-if TYPE_CHECKING:
-    from edge.mapping.sink import MapSink
 
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
@@ -117,9 +115,7 @@ def _map(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _follow(
-    options: argparse.Namespace, statistics: Statistics | None = None, mapping: "MapSink | None" = None
-) -> None:
+def _follow(options: argparse.Namespace, statistics: Statistics | None = None, mapping: MapSink | None = None) -> None:
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate requires --budget-us")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)

@@ -24,6 +24,7 @@ from edge.api import (
     DeviceError,
     Event,
     Fan,
+    MapSink,
     Sink,
     SinkClosedError,
     Source,
@@ -44,7 +45,6 @@ from edge.terminal.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
     from edge.cli.demo_score import DemoScore
-    from edge.mapping.sink import MapSink
     from edge.view.live_view import LiveView
 
 DEMO_HZ: Final = 100.0
@@ -56,7 +56,7 @@ def run(
     options: argparse.Namespace,
     source: Source,
     statistics: Statistics | None = None,
-    mapping: "MapSink | None" = None,
+    mapping: MapSink | None = None,
 ) -> None:
     """Run `edge-sr` without a command, or a command that runs the same way.
 

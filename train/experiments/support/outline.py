@@ -70,7 +70,8 @@ def naive_map(
             sums[under.pixels] += under.read(pattern[..., None])[:, 0]
             counts[under.pixels] += 1
     mean = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
-    return (mean / np.nanmax(mean)).reshape(grid.pixels, grid.pixels)
+    top = np.nanmax(mean) if counts.any() else 1.0
+    return (mean / top).reshape(grid.pixels, grid.pixels)
 
 
 def _along(line: BaseGeometry) -> NDArray[np.float64]:
