@@ -4,11 +4,10 @@
         for result in Stream(source, open_runtime("stsr-int8", source)):
             print(result.force_counts)
 
-A source reads in a thread of its own; everything else happens in the thread that iterates, which must also be the one
-that makes the runtime. A request that cannot be met raises a BridgeError or an EdgeError with one clear line.
+A source reads in a thread of its own; everything else happens in the thread that iterates and that makes the runtime. A
+request that cannot be met raises a BridgeError or an EdgeError with one clear line.
 
-`edge-sr` opens, runs, records, replays and zeroes through this module alone. Its doctor watches and evaluates as
-`examine` does and additionally asks a person for presses; its bench and its live page use inner modules.
+`edge-sr` works through this module alone, except for its bench, its live page, and a doctor that asks for presses.
 """
 
 import math
@@ -22,8 +21,7 @@ from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, Si
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.timed_loading import unfinished_load
-from edge.mapping.object_map import ObjectMap
-from edge.mapping.sink import MapSink
+from edge.mapping.sink import MapSink, ObjectMap
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
@@ -33,12 +31,14 @@ from edge.perception.runtime import Model, Runtime
 from edge.perception.wrench import Wrench
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands
+from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.pump import pump
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
+from edge.pose_sources.registry import PoseSource, open_poses
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive, check_whole
@@ -69,7 +69,6 @@ if TYPE_CHECKING:
     from firmware_bridge.links.discovery import Found
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
-
 __all__ = [
     "DEFAULT_MODEL",
     "DEMO_LOOP",
@@ -98,6 +97,8 @@ __all__ = [
     "ObjectMap",
     "Pad",
     "PadPose",
+    "PoseQueue",
+    "PoseSource",
     "RecordingError",
     "Result",
     "Runtime",
@@ -126,6 +127,7 @@ __all__ = [
     "load_baselines",
     "load_model",
     "load_sensor_file",
+    "open_poses",
     "open_recording",
     "open_runtime",
     "open_sink",
@@ -307,16 +309,14 @@ def open_recording(
 ) -> Source:
     """Open a recording as a source, to compute its results again as `edge-sr replay` does.
 
-    Every scan gets a result however slow the loop is, with the time at which it was recorded. The mountings and
-    baselines that were in use then are used again.
+    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording.
 
     Args:
         path: .mcap, .npz or .csv.
         sensor: file that `edge-sr doctor` wrote, used instead of the recorded settings.
         zero: zero from the first 100 scans, instead of using the recorded baselines.
         paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
-        rate_hz: scans a second of each sensor, in [Hz]: where the file does not state it, or to play it faster or
-            slower.
+        rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
 
     Raises:
         RecordingError: the recording cannot be used.

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+LAST_TIME_NS: Final = 1 << 60
+"""Latest time in a recording, in [ns] (36 years): sums of two times stay below 2^63."""
 NS_PER_S: Final = 1_000_000_000
 
 Clock = Callable[[], int]

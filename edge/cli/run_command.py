@@ -34,6 +34,7 @@ from edge.api import (
     demo_recording,
     load_baselines,
     load_model,
+    open_poses,
     open_runtime,
     open_sink,
     pump,
@@ -142,6 +143,10 @@ def run(
                 sinks.append(mapping)
             if view is not None:
                 sinks += view.sinks
+            for text in options.poses:
+                closing.callback(open_poses(text, commands.poses).close)
+            if options.poses and not getattr(model.contract, "takes_poses", False):
+                commands.poses.warn("model", f"model {model.name} takes no poses: they are only counted and recorded")
             if options.realtime:  # last, so that it does not affect what the page and the sinks have started
                 from edge.cli.realtime import realtime
 

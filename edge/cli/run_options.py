@@ -13,6 +13,7 @@ from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL
 from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.pipeline.baseline_capture import FEWEST_RECORDED
+from edge.pose_sources.registry import check_poses
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS
@@ -51,6 +52,8 @@ Lines on stdin during a run:
   {"cmd": "zero"}   zero again; also
       "sensor": "4"  only this sensor
       "force": true  even in contact
+  {"cmd": "pose", "x_mm": 1, "y_mm": 0}
+                    where the pad is
 Keys on a terminal: r reset, z zero,
 Z zero even in contact. SIGUSR1: z.
 
@@ -216,7 +219,9 @@ def replay_parser() -> argparse.ArgumentParser:
     parser.add_argument("--duration-s", metavar="T", type=positive, help="stop after T seconds of the recording")
     _add_results(parser)
     _add_view(parser)
-    parser.set_defaults(source=[], id_map=None, budget_us=None, recalibrate=False, give_up_s=None, realtime=False)
+    parser.set_defaults(
+        source=[], id_map=None, budget_us=None, recalibrate=False, give_up_s=None, realtime=False, poses=[]
+    )
     return parser
 
 
@@ -230,6 +235,8 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
     for text in options.sink:
         check_sink(text)
     check_apart(options.sink)
+    for text in options.poses:
+        check_poses(text)
     runtime_options(options)
     return options
 
@@ -260,6 +267,14 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add("--recalibrate", action="store_true", help="with --budget-us: measure run times again")
     add_source(parser)
     add("--sink", metavar="S", action="append", default=[], help="output for results; may be repeated")
+    add(
+        "--poses",
+        metavar="P",
+        action="append",
+        default=[],
+        help="source of the poses of the pad: zenoh[:KEY], ros2:TOPIC or tf:PARENT:CHILD; for one sensor SENSOR=P; "
+        "may be repeated",
+    )
     add("--duration-s", metavar="T", type=positive, help="stop after T seconds")
     add(
         "--give-up-s",

@@ -1,5 +1,6 @@
 """Poses that wait for the loop: any thread puts, the oldest are dropped where the loop is too slow."""
 
+import json
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -10,6 +11,8 @@ from firmware_bridge.poses.timed_pose import TimedPose
 
 WAITING_POSES: Final = 1024
 """Poses that may wait, a second at 1000 poses/s: ten times as long as the loop ever waits for a scan."""
+LONGEST_BYTES: Final = 4096
+"""Bytes of one message: ten times those of a pose."""
 
 
 class PoseQueue:
@@ -41,6 +44,17 @@ class PoseQueue:
             self.put(pose_of_fields(fields, now_ns))
         except PoseError as error:
             self.refuse(error)
+
+    def put_json(self, text: bytes, now_ns: int, sensor: str | None = None) -> None:
+        """Put the pose in a message of JSON, of this sensor if it names none, or refuse it."""
+        try:
+            parsed = json.loads(text) if len(text) <= LONGEST_BYTES else None
+        except (ValueError, RecursionError):
+            parsed = None
+        if not isinstance(parsed, dict):
+            self.refuse(PoseError("json", f'{text[:40]!a} is not JSON such as {{"x_mm": 1.5, "y_mm": 0}}'))
+            return
+        self.put_fields({"sensor": sensor, **parsed}, now_ns)
 
     def refuse(self, error: PoseError) -> None:
         """Count a pose that cannot be taken."""

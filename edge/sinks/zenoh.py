@@ -73,13 +73,13 @@ class ZenohSink(Sink):
         self._source = source
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         try:
-            self._session = zenoh.open(_config(configuration))
+            self._session = zenoh.open(configured(configuration))
             self.zid = str(self._session.zid())
             self._events = self._publisher(f"{key}/event", _JSON)
             self._read = True  # until a result shows that there is no subscriber
             self._alive = self._session.liveliness().declare_token(f"{key}/alive/{self.zid}")
         except zenoh.ZError as error:
-            raise SinkError(f"zenoh cannot be opened: {_reason(error)}") from error
+            raise SinkError(f"zenoh cannot be opened: {reason_of(error)}") from error
         self._publishers: dict[str, tuple[zenoh.Publisher, zenoh.Publisher]] = {}
 
     @property
@@ -134,7 +134,7 @@ class ZenohSink(Sink):
         try:
             publisher.put(message, timestamp=self._session.new_timestamp())
         except self._zenoh.ZError as error:
-            raise SinkError(f"zenoh cannot send: {_reason(error)}") from error
+            raise SinkError(f"zenoh cannot send: {reason_of(error)}") from error
 
 
 def chunks(sensor: str) -> str:
@@ -163,7 +163,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
     raise UsageError(f"zenoh:{target} has {option!r} after its key: {_REMEDY}")
 
 
-def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
+def configured(configuration: dict[str, Any] | Path) -> "zenoh.Config":
     """Return zenoh's configuration, with everything off in CLOSED that the user does not turn on."""
     import zenoh
 
@@ -173,7 +173,7 @@ def _config(configuration: dict[str, Any] | Path) -> "zenoh.Config":
         try:
             config = zenoh.Config.from_file(configuration)
         except zenoh.ZError as error:
-            raise SinkError(f"{configuration} is not a zenoh configuration: {_reason(error)}") from error
+            raise SinkError(f"{configuration} is not a zenoh configuration: {reason_of(error)}") from error
         configuration = {name: CLOSED[name] for name, text in untouched.items() if config.get_json(name) == text}
     for name, value in configuration.items():
         config.insert_json5(name, json.dumps(value))
@@ -185,7 +185,7 @@ def _matched(publisher: "zenoh.Publisher") -> bool:
     return publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
     """Return zenoh's reason without the place in its source, which follows " at "."""
     text = str(error).strip().partition(f" at {os.sep}")[0]
     return text.strip().splitlines()[-1].lstrip(" =")

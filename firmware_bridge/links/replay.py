@@ -15,10 +15,10 @@ from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
 from firmware_bridge.links.replay_poses import PoseLane, timed_by_rows
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.tracks import LAST_TIME_NS, Recording, Track
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
-from firmware_bridge.schedule import NS_PER_S, Clock, Sleep, sleep_until
+from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S, Clock, Sleep, sleep_until
 
 
 class _Due(NamedTuple):

@@ -18,9 +18,9 @@ from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, Sensor
 from firmware_bridge.recording.csv_poses import CsvPoses
 from firmware_bridge.recording.npz_poses import NPZ_POSES, npz_poses
 from firmware_bridge.recording.npz_reader import read_npz
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS, MOST_SENSORS, Recording, Track, origin_of
+from firmware_bridge.recording.tracks import HIGHEST_COUNT, MOST_SENSORS, Recording, Track, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
-from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 
 if TYPE_CHECKING:
     from firmware_bridge.zeroing.baseline import Baseline

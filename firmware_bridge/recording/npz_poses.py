@@ -12,7 +12,7 @@ from firmware_bridge.recording.pose_columns import POSE_FIELDS, PoseColumns
 from firmware_bridge.recording.tracks import MOST_SENSORS
 
 NPZ_POSES: Final = ("pose_time_ns", "pose", "pose_sensor", "pose_holds", "pose_used_from_ns")
-_KINDS: Final = dict(zip(NPZ_POSES, ("iu", "fiu", "U", "b", "iu"), strict=True))
+_KINDS: Final[dict[str, str]] = dict(zip(NPZ_POSES, ("iu", "fiu", "U", "b", "iu"), strict=True))
 
 
 def npz_poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> PoseColumns | None:
@@ -26,7 +26,7 @@ def npz_poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> PoseColumns | N
         return None
     for name in NPZ_POSES[:2]:
         if name not in found:
-            raise RecordingError(f"{path}, array '{name}': missing, expected beside '{next(iter(found))}'")
+            raise RecordingError(f"{path}, array '{name}': missing, expected together with '{next(iter(found))}'")
     count = found["pose_time_ns"].size
     for name, array in found.items():
         shape = (count, len(POSE_FIELDS)) if name == "pose" else (count,)
@@ -48,7 +48,7 @@ def npz_poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> PoseColumns | N
             _whole(found.get("pose_used_from_ns", np.full(count, -1))),
         )
     except ValueError as error:
-        raise RecordingError(f"{path}, array 'pose' or one beside it: {error}") from error
+        raise RecordingError(f"{path}, array 'pose' or another of the poses: {error}") from error
 
 
 def _whole(array: NDArray[Any]) -> NDArray[np.int64]:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.poses.pad_pose import MOST_DEG, MOST_MM, PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
-from firmware_bridge.recording.tracks import LAST_TIME_NS
 from firmware_bridge.scans.scan import is_sensor_name
+from firmware_bridge.schedule import LAST_TIME_NS
 
 POSE_FIELDS: Final = ("x_mm", "y_mm", "turn_deg", "error_mm", "error_deg")
 _LIMITS: Final = ((-MOST_MM, MOST_MM), (-MOST_MM, MOST_MM), (-MOST_DEG, MOST_DEG), (0.0, MOST_MM), (0.0, MOST_DEG))

@@ -7,8 +7,8 @@ from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.recording.pose_columns import POSE_FIELDS
-from firmware_bridge.recording.tracks import LAST_TIME_NS
 from firmware_bridge.scans.scan import is_sensor_name
+from firmware_bridge.schedule import LAST_TIME_NS
 
 POSE_NAME: Final = "tactile_edge_sr/msg/PadPose"
 POSE: Final = MessageType(

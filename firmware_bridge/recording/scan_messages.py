@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import CdrError
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, LAST_TIME_NS
+from firmware_bridge.recording.tracks import HIGHEST_COUNT
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
-from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
 
 SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"

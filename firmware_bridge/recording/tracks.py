@@ -26,8 +26,6 @@ SOURCE_METADATA: Final = "source"
 HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64
 """Most sensors of a recording; one wire can have sixteen."""
-LAST_TIME_NS: Final = 1 << 60
-"""Latest time, in [ns] (36 years): sums of two times stay below 2^63."""
 
 
 @dataclass(frozen=True, slots=True)

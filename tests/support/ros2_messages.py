@@ -3,10 +3,11 @@
 import hashlib
 import json
 import struct
+from functools import cache
 
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import byte, float64, int32, sequence, uint8, uint32
+from cyclonedds.idl.types import array, byte, float64, int32, sequence, uint8, uint32
 
 DEFINITIONS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
@@ -17,6 +18,15 @@ DEFINITIONS = {
     "geometry_msgs/msg/Vector3": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/msg/Wrench": "Vector3 force\nVector3 torque",
     "geometry_msgs/msg/WrenchStamped": "std_msgs/Header header\nWrench wrench",
+    "geometry_msgs/msg/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/msg/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/msg/Pose": "Point position\nQuaternion orientation",
+    "geometry_msgs/msg/PoseStamped": "std_msgs/Header header\nPose pose",
+    "geometry_msgs/msg/PoseWithCovariance": "Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "std_msgs/Header header\nPoseWithCovariance pose",
+    "geometry_msgs/msg/Transform": "Vector3 translation\nQuaternion rotation",
+    "geometry_msgs/msg/TransformStamped": "std_msgs/Header header\nstring child_frame_id\nTransform transform",
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "diagnostic_msgs/msg/KeyValue": "string key\nstring value",
     "diagnostic_msgs/msg/DiagnosticStatus": "byte level\nstring name\nstring message\nstring hardware_id\n"
     "KeyValue[] values",
@@ -29,11 +39,15 @@ NESTED, UNBOUNDED = 1, 144
 
 
 def fields(name):
-    """Return name, type and True for a sequence, of each field; a type of the same package may stand without it."""
+    """Return name, type, and True for a sequence or the length of an array, of each field.
+
+    A type of the same package may stand without it.
+    """
     found = []
     for line in DEFINITIONS[name].splitlines():
         kind, field = line.split()
-        kind, many = kind.removesuffix("[]"), kind.endswith("[]")
+        kind, bracket, length = kind.removesuffix("]").partition("[")
+        many = int(length) if length else bool(bracket)
         if kind not in IDL:
             package, _, message = kind.rpartition("/")
             kind = f"{package or name.split('/')[0]}/msg/{message}"
@@ -41,14 +55,26 @@ def fields(name):
     return found
 
 
+@cache
 def dds_type(name):
     """Return the DDS type of a message, named as by rmw_cyclonedds."""
     package, _, message = name.split("/")
     members = {}
     for field, kind, many in fields(name):
         single = IDL[kind] if kind in IDL else dds_type(kind)
-        members[field] = sequence[single] if many else single
+        members[field] = sequence[single] if many is True else array[single, many] if many else single
     return final(make_idl_struct(message, f"{package}.msg.dds_.{message}_", members))
+
+
+def built(name, message):
+    """Return a message, of nested dicts and lists by the names of its fields, as an instance of its DDS type."""
+    values = {}
+    for field, kind, many in fields(name):
+        value = message[field]
+        if kind not in IDL:
+            value = [built(kind, one) for one in value] if many else built(kind, value)
+        values[field] = value
+    return dds_type(name)(**values)
 
 
 def type_hash(name):
@@ -100,7 +126,7 @@ def decode(name, data):
 
     def message(one):
         return {
-            field: [single(kind) for _ in range(take("I"))] if many else single(kind)
+            field: [single(kind) for _ in range(take("I") if many is True else many)] if many else single(kind)
             for field, kind, many in fields(one)
         }
 

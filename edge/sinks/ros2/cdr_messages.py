@@ -25,14 +25,14 @@ IMAGE: Final = MessageType(
     "uint8[] data",
     STD_HEADER,
 )
-_VECTOR3: Final = MessageType("geometry_msgs/msg/Vector3", "float64 x\nfloat64 y\nfloat64 z")
+VECTOR3: Final = MessageType("geometry_msgs/msg/Vector3", "float64 x\nfloat64 y\nfloat64 z")
 _WRENCH: Final = MessageType(
-    "geometry_msgs/msg/Wrench", "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque", _VECTOR3
+    "geometry_msgs/msg/Wrench", "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque", VECTOR3
 )
 WRENCH_STAMPED: Final = MessageType(
     "geometry_msgs/msg/WrenchStamped",
     "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
-    *(STD_HEADER, _WRENCH, _VECTOR3),
+    *(STD_HEADER, _WRENCH, VECTOR3),
 )
 LOG: Final = MessageType(
     "rcl_interfaces/msg/Log",

@@ -28,6 +28,7 @@ def dds_type(kind: MessageType) -> type[IdlStruct]:
     made: Any = make_idl_struct(name, f"{package}.msg.dds_.{name}_", members, dataclassify=False)
     made.__init__ = _hold
     made.serialize = _held  # called by a writer in place of its own encoder
+    made.deserialize = made.deserialize_key = classmethod(_received)  # and by a reader
     return final(made)
 
 
@@ -39,9 +40,15 @@ def _held(self: Any, **_: object) -> bytes:
     return self.encoded
 
 
+def _received(cls: Any, data: bytes, **_: object) -> Any:
+    return cls(data)
+
+
 def _member(field: Field) -> Any:
     if field.message is not None:
         single = dds_type(field.message)
     else:
         single = str if field.kind == "string" else getattr(types, field.kind)
+    if field.length:
+        return types.array[single, field.length]
     return single if field.length is None else types.sequence[single]

@@ -1,0 +1,289 @@
+"""Poses over zenoh and ROS 2, from publishers in processes of their own, up to the tracks of a real runtime."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+from cli_samples import base_options, files, records, start
+from edge_samples import BASELINE, ROOT, FakeModel
+
+from edge.errors import UsageError
+from edge.perception.runtime import Runtime
+from edge.pipeline.pose_intake import PoseIntake
+from edge.pipeline.pose_queue import PoseQueue
+from edge.pose_sources.registry import check_poses, open_poses
+from firmware_bridge.poses.pad_pose import PadPose
+
+__all__ = ["files"]
+PATIENCE_S = 20
+DOWN = {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}
+
+
+class TestForms:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("zenoh", (None, "zenoh", "pose")),
+            ("zenoh:arm/pose?connect=tcp/10.0.0.5:7447", (None, "zenoh", "arm/pose?connect=tcp/10.0.0.5:7447")),
+            ("ros2:/arm/pose", (None, "ros2", "arm/pose")),
+            ("tf:base_link:tool0", (None, "tf", "base_link:tool0")),
+            ("4=ros2:pose", ("4", "ros2", "pose")),
+            ("left/4=tf:a:b", ("left/4", "tf", "a:b")),
+        ],
+    )
+    def test_what_exists(self, text, expected):
+        assert check_poses(text) == expected
+
+    @pytest.mark.parametrize(
+        "text",
+        ["", "ros2", "ros2:", "ros2:/9x", "tf", "tf:a", "tf:a:b:c", "tf:a:", "tf::b", "tf:a b:c", "zenoh:a*", "mqtt:x"],
+    )
+    def test_what_does_not(self, text):
+        with pytest.raises(UsageError) as caught:
+            check_poses(text)
+        assert "\n" not in str(caught.value)
+
+    def test_a_program_refuses_it_in_one_line(self):
+        done = subprocess.run(
+            [sys.executable, "-m", "edge.cli.main", "--poses", "mqtt:x"], cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 2 and "no source of poses 'mqtt:x'" in done.stderr and done.stderr.count("\n") == 1
+
+
+def until(queue, satisfied, act=lambda: None):
+    """Act until the poses that came suffice, and return all of them."""
+    poses, end_s = [], time.monotonic() + PATIENCE_S
+    while not satisfied(poses):
+        assert time.monotonic() < end_s, f"{len(poses)} poses came"
+        act()
+        time.sleep(0.01)
+        poses += queue.take()
+    return poses
+
+
+def used(poses):
+    """Return the tracks of a runtime that took these poses."""
+    queue, runtime = PoseQueue(), Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+    intake = PoseIntake(runtime, queue)
+    for one in poses:
+        queue.put(one)
+    assert len(intake.take([], None, time.monotonic_ns())) == len(poses)
+    return runtime._tracks
+
+
+class TestZenoh:
+    PUBLISH = """
+import json, sys, zenoh
+config = zenoh.Config()
+config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    print("ready", flush=True)
+    for line in sys.stdin:
+        key, text = json.loads(line)
+        session.put(key, text)
+"""
+
+    @pytest.fixture
+    def publisher(self):
+        pytest.importorskip("zenoh")
+        from zenoh_samples import ENVIRONMENT, free_endpoint
+
+        endpoint = free_endpoint()
+        with subprocess.Popen(
+            [sys.executable, "-c", self.PUBLISH, endpoint],
+            env=ENVIRONMENT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as process:
+            assert process.stdin is not None and process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+
+            def put(key, text):
+                process.stdin.write(json.dumps([key, text]) + "\n")
+                process.stdin.flush()
+
+            yield endpoint, put
+            process.stdin.close()
+
+    def test_poses_of_another_process_come_to_the_runtime(self, publisher):
+        endpoint, put = publisher
+        queue = PoseQueue()
+        source = open_poses(f"4=zenoh:arm/pose?connect={endpoint}", queue)
+        numbers = iter(range(10**6))
+        place = lambda: put("arm/pose", json.dumps({"x_mm": next(numbers), "y_mm": -2, "turn_deg": 3}))  # noqa: E731
+        before_ns = time.monotonic_ns()
+        poses = until(queue, lambda poses: len(poses) >= 5, place)
+        after_ns = time.monotonic_ns()
+        assert all(before_ns < one.time_ns < after_ns for one in poses)
+        assert {one.sensor for one in poses} == {"4"}
+        assert used(poses)["4"].at(poses[-1].time_ns) == PadPose(poses[-1].pose.x_mm, -2, 3)
+        put("arm/pose", json.dumps({"cmd": "pose", "sensor": "left/6", "x_mm": -1, "y_mm": 0, "holds": True}))
+        own = until(queue, lambda poses: any(one.sensor == "left/6" for one in poses))[-1]
+        assert own.holds and own.pose == PadPose(-1, 0)
+        source.close()
+
+    def test_it_steers_nothing_else_and_bad_messages_stop_nothing(self, publisher):
+        endpoint, put = publisher
+        queue = PoseQueue()
+        source = open_poses(f"zenoh:pose?connect={endpoint}", queue)
+        until(queue, len, lambda: put("pose", '{"x_mm": 0, "y_mm": 0}'))
+        bad = ['{"cmd": "zero"}', "nonsense", "[1]", "[" * 4000, '{"x_mm": 1}', "x" * 10_000]
+        for text in bad:
+            put("pose", text)
+        put("elsewhere", "nonsense")
+        put("pose", '{"x_mm": 77, "y_mm": 0}')
+        until(queue, lambda poses: any(one.pose.x_mm == 77 for one in poses))
+        assert queue.refused == len(bad)
+        assert {"cmd", "json", "y_mm"} <= queue.take_reasons().keys()
+        source.close()
+
+
+class TestRos2:
+    POSE, UNCERTAIN = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+    TRANSFORM, TF = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+
+    @pytest.fixture
+    def publish(self):
+        pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+        from ros2_samples import ENVIRONMENT
+        from test_ros2 import LISTENERS_CONFIGURATION
+
+        environment = os.environ | {
+            "CYCLONEDDS_URI": LISTENERS_CONFIGURATION,
+            "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}",
+        }
+        command = [sys.executable, str(ROOT / "tests/support/ros2_pose_writer.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
+        poses = [["arm/pose", kind, False] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
+        topics = [*poses, ["tf", self.TF, False], ["tf_static", self.TF, True]]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        with subprocess.Popen([*command, json.dumps(topics)], env=environment, text=True, **pipes) as process:
+            assert process.stdin is not None and process.stdout is not None
+            assert process.stdout.readline() == "ready\n"  # else stamps would be old when they are published
+
+            def put(topic, kind, message):
+                assert process.poll() is None
+                process.stdin.write(json.dumps([topic, kind, message]) + "\n")
+                process.stdin.flush()
+
+            yield put
+            process.stdin.close()
+
+    @pytest.fixture
+    def opened(self, monkeypatch):
+        pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+        from ros2_samples import ENVIRONMENT
+
+        for name, value in ENVIRONMENT.items():
+            monkeypatch.setenv(name, value)
+        sources, queue = [], PoseQueue()
+
+        def open_them(text):
+            sources.append(open_poses(text, queue))
+            return queue
+
+        yield open_them
+        for source in sources:
+            source.close()
+
+    def header(self, frame="base", at_ns=None):
+        sec, nanosec = divmod(time.time_ns() if at_ns is None else at_ns, 10**9)
+        return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
+
+    def pose(self, x_m, y_m):
+        return {"position": {"x": x_m, "y": y_m, "z": 0.3}, "orientation": DOWN}
+
+    def transform(self, parent, child, x_m, y_m, rotation):
+        place = {"x": x_m, "y": y_m, "z": 0.0}
+        return {
+            "header": self.header(parent),
+            "child_frame_id": child,
+            "transform": {"translation": place, "rotation": rotation},
+        }
+
+    def test_a_pose_with_its_stamp_comes_to_the_runtime(self, opened, publish):
+        queue = opened("4=ros2:/arm/pose")
+        sent = []
+
+        def act():
+            place = self.pose(0.001 * len(sent), -0.5)
+            sent.append(time.time_ns() - 20_000_000)  # measured 20 ms ago
+            publish("arm/pose", self.POSE, {"header": self.header(at_ns=sent[-1]), "pose": place})
+
+        offset_ns = time.time_ns() - time.monotonic_ns()
+
+        def in_time(one):
+            return abs(one.time_ns + offset_ns - sent[round(one.pose.x_mm)]) < 1_000_000
+
+        # The first ones may have waited for their writer, and then count as those of a clock that is behind.
+        last = until(queue, lambda poses: poses and in_time(poses[-1]), act)[-1]
+        pose = used([last])["4"].at(last.time_ns)
+        assert (pose.y_mm, pose.error_mm, pose.error_deg) == (-500.0, 0.2, 1.0)
+
+    def test_the_covariance_comes_as_errors_and_a_transform_on_the_same_topic(self, opened, publish):
+        queue = opened("ros2:arm/pose")
+        covariance = [0.0] * 36
+        covariance[0] = covariance[7] = 1e-6
+        covariance[35] = 0.0004
+
+        def act():
+            pose = {"pose": self.pose(0.001, 0.002), "covariance": covariance}
+            publish("arm/pose", self.UNCERTAIN, {"header": self.header(), "pose": pose})
+            publish("arm/pose", self.TRANSFORM, self.transform("base", "pad", 0.25, 0.5, DOWN))
+
+        poses = until(queue, lambda poses: {1.0, 250.0} <= {one.pose.x_mm for one in poses}, act)
+        errors = {one.pose.x_mm: (one.pose.error_mm, one.pose.error_deg) for one in poses}
+        assert errors[1.0] == (pytest.approx(1), pytest.approx(1.1459, abs=1e-3)) and errors[250.0] == (0.2, 1.0)
+
+    def test_frames_of_tf_are_followed_from_one_to_the_other(self, opened, publish):
+        # Published before anyone subscribes, and once.
+        publish("tf_static", self.TF, {"transforms": [self.transform("tool0", "pad", 0.01, 0.0, DOWN)]})
+        queue = opened("tf:table:pad")
+
+        def act():
+            identity = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+            chain = [
+                self.transform("base", "tool0", 0.5, 0.25, identity),
+                self.transform("base", "table", 0.25, 0.25, identity),
+            ]
+            publish("tf", self.TF, {"transforms": chain})
+
+        poses = until(queue, lambda poses: len(poses) >= 3, act)
+        pose = used(poses[-1:])[None].at(poses[-1].time_ns)
+        assert (pose.x_mm, pose.y_mm, pose.turn_deg) == (pytest.approx(260), pytest.approx(0), 0)
+
+    def test_a_tilted_pad_and_clocks_that_differ_are_reported(self, opened, publish):
+        queue = opened("ros2:arm/pose")
+        tilted = self.pose(0, 0) | {"orientation": {"x": 0.9, "y": 0.0, "z": 0.0, "w": 0.19**0.5}}
+        old_ns = time.time_ns() - 3600 * 10**9
+
+        def act():
+            publish("arm/pose", self.POSE, {"header": self.header(), "pose": tilted})
+            publish("arm/pose", self.POSE, {"header": self.header(at_ns=old_ns), "pose": self.pose(0, 0)})
+
+        poses = until(queue, lambda poses: len(poses) >= 2 and queue.refused >= 2, act)
+        now_ns = time.monotonic_ns()
+        assert all(now_ns - 25 * 10**9 < one.time_ns <= now_ns for one in poses)
+        reasons = queue.take_reasons()
+        assert "tilted" in reasons["tilt"] and "3.6e+03 s behind" in reasons["clock"]
+
+    def test_a_program_counts_them(self, opened, publish, files, monkeypatch):
+        pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+        opened("ros2:unused")  # sets the environment
+        options = [*base_options(files), "--source", "demo:loop", "--duration-s", "4", "--poses", "4=ros2:/arm/pose"]
+        with start(*options, "--sink", "jsonl:-") as process:
+            assert process.stdout is not None and process.stderr is not None
+            lines = []
+            for line in process.stdout:
+                lines.append(line)
+                pose = {"header": self.header(), "pose": self.pose(0.001 * len(lines), 0)}
+                publish("arm/pose", self.POSE, pose)
+            err = process.stderr.read()
+            assert process.wait() == 0, err
+        # The first ones may have waited for the program, and then be refused as out of order.
+        assert records(lines[-1])[0]["counters"]["poses"] > 50
+        assert " 0 dropped" in err and "takes no poses" in err
