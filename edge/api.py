@@ -4,11 +4,10 @@
         for result in Stream(source, open_runtime("stsr-int8", source)):
             print(result.force_counts)
 
-A source reads in a thread of its own; everything else happens in the thread that iterates, which must also be the one
-that makes the runtime. A request that cannot be met raises a BridgeError or an EdgeError with one clear line.
+A source reads in a thread of its own; everything else happens in the thread that iterates and that makes the runtime. A
+request that cannot be met raises a BridgeError or an EdgeError with one clear line.
 
-`edge-sr` opens, runs, records, replays and zeroes through this module alone. Its doctor watches and evaluates as
-`examine` does and additionally asks a person for presses; its bench and its live page use inner modules.
+`edge-sr` works through this module alone, except for its bench, its live page, and a doctor that asks for presses.
 """
 
 import math
@@ -23,6 +22,7 @@ from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_mo
 from edge.inference.contract import Contract
 from edge.inference.model_interface import Model
 from edge.inference.timed_loading import unfinished_load
+from edge.mapping.sink import MapSink, ObjectMap
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
@@ -68,9 +68,7 @@ if TYPE_CHECKING:
     from edge.inference.onnx_session import ModelSession
     from firmware_bridge.links.discovery import Found
 
-# Modules that only some callers need, above all onnxruntime, are imported on use: start-up time and memory are
-# promised.
-
+# Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
 __all__ = [
     "DEFAULT_MODEL",
     "DEMO_LOOP",
@@ -89,6 +87,7 @@ __all__ = [
     "Event",
     "Fan",
     "LinkLostError",
+    "MapSink",
     "MessageError",
     "Model",
     "ModelError",
@@ -96,6 +95,7 @@ __all__ = [
     "NextTap",
     "NoDeviceError",
     "Note",
+    "ObjectMap",
     "Pad",
     "PadPose",
     "PoseQueue",
@@ -208,8 +208,6 @@ def choose_model(
 ) -> "ModelSession | None":
     """Load the most accurate model whose run time on this machine is within a budget, as `edge-sr --budget-us` does.
 
-    Run times are measured here and kept for later starts.
-
     Args:
         model: the best model that may be used: a file, or the name of a bundled one.
         budget_us: longest run time of a pattern, in [us].
@@ -317,16 +315,14 @@ def open_recording(
 ) -> Source:
     """Open a recording as a source, to compute its results again as `edge-sr replay` does.
 
-    Every scan gets a result however slow the loop is, with the time at which it was recorded. The mountings and
-    baselines that were in use then are used again.
+    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording.
 
     Args:
         path: .mcap, .npz or .csv.
         sensor: file that `edge-sr doctor` wrote, used instead of the recorded settings.
         zero: zero from the first 100 scans, instead of using the recorded baselines.
         paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
-        rate_hz: scans a second of each sensor, in [Hz]: where the file does not state it, or to play it faster or
-            slower.
+        rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
 
     Raises:
         RecordingError: the recording cannot be used.

@@ -16,6 +16,7 @@ from edge.api import (
     BridgeError,
     DeviceError,
     EdgeError,
+    MapSink,
     ModelError,
     SinkError,
     Source,
@@ -31,6 +32,7 @@ from edge.api import (
 from edge.cli.run_options import (
     baseline_parser,
     devices_parser,
+    map_parser,
     models_parser,
     record_parser,
     replay_parser,
@@ -104,13 +106,22 @@ def _run(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _follow(options: argparse.Namespace, statistics: Statistics | None = None) -> None:
+def _map(arguments: Sequence[str]) -> int:
+    options = understood(map_parser(), arguments)
+    from edge.cli.new_map import new_map
+
+    with new_map(options) as mapping:
+        _follow(options, mapping=mapping)
+    return 0
+
+
+def _follow(options: argparse.Namespace, statistics: Statistics | None = None, mapping: MapSink | None = None) -> None:
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate requires --budget-us")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
     from edge.cli.run_command import run
 
-    run(options, source, statistics)
+    run(options, source, statistics, mapping)
 
 
 def _record(arguments: Sequence[str]) -> int:
@@ -225,6 +236,7 @@ COMMANDS: Final = {
     "demo": _demo,
     "record": _record,
     "replay": _replay,
+    "map": _map,
     "models": _models,
     "baseline": _baseline,
     "bench": _bench,

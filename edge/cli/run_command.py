@@ -24,6 +24,7 @@ from edge.api import (
     DeviceError,
     Event,
     Fan,
+    MapSink,
     Sink,
     SinkClosedError,
     Source,
@@ -52,13 +53,19 @@ DEMO_REST_SCANS: Final = 100
 """Scans without contact after which a repeating demo is at its first tap: 174 lie before it, 24 between taps."""
 
 
-def run(options: argparse.Namespace, source: Source, statistics: Statistics | None = None) -> None:
+def run(
+    options: argparse.Namespace,
+    source: Source,
+    statistics: Statistics | None = None,
+    mapping: MapSink | None = None,
+) -> None:
     """Run `edge-sr` without a command, or a command that runs the same way.
 
     Args:
         options: of edge.cli.run_options.run_parser.
         source: not open yet.
         statistics: filled on the way, so that they are available however the run ends.
+        mapping: takes the results into a map, which the live page shows; closed here.
 
     Raises:
         EdgeError: an option, a model or a sink cannot be used.
@@ -130,6 +137,10 @@ def run(options: argparse.Namespace, source: Source, statistics: Statistics | No
                 sinks.append(sink)
             if set(options.sink) - {"status"}:
                 sinks.append(fan)
+            if mapping is not None:
+                closing.callback(mapping.close)
+                mapping.show = None if view is None else view.show_map
+                sinks.append(mapping)
             if view is not None:
                 sinks += view.sinks
             for text in options.poses:

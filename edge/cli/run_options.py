@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL
+from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.pipeline.baseline_capture import FEWEST_RECORDED
 from edge.pose_sources.open_poses import check_poses
@@ -61,6 +62,8 @@ other commands:
                     --view endless
   edge-sr record FILE  run and record
   edge-sr replay FILE  compute again
+  edge-sr map       a map of an object
+                    larger than the pad
   edge-sr models    bundled models
   edge-sr baseline  zero into a file
   edge-sr bench     error and run time
@@ -114,12 +117,28 @@ example:
 """
 
 
+MAP_HELP: Final = """\
+Needs poses of the pad in the object's
+plane: lines on stdin, or those of a
+recording. x to the right and y down,
+as in a pattern.
+
+example:
+  my_robot_poses | edge-sr map \\
+          --out part.npz --png part.png
+A line of poses:
+  {"cmd": "pose", "x_mm": 1.5,
+   "y_mm": -20, "turn_deg": 5}
+"""
+
+
 def run_parser() -> argparse.ArgumentParser:
     """Return the parser of `edge-sr`."""
     parser = Parser(
         prog="edge-sr",
         usage="edge-sr [options]\n       edge-sr demo [options]\n"
         "       edge-sr record FILE [options]\n       edge-sr replay FILE [options]\n"
+        "       edge-sr map [options]\n"
         "       edge-sr models\n       edge-sr baseline --out FILE\n       edge-sr bench\n"
         "       edge-sr devices\n       edge-sr doctor",
         description="Reads tactile scans and\nsuper-resolves them at sensor rate.",
@@ -138,6 +157,37 @@ def record_parser() -> argparse.ArgumentParser:
         epilog=RECORD_HELP,
     )
     parser.add_argument("file", metavar="FILE", help="new file, .npz or .mcap")
+    _add_run(parser)
+    return parser
+
+
+def map_parser() -> argparse.ArgumentParser:
+    """Return the parser of `edge-sr map`: the map's size and files, and the options of `edge-sr`."""
+    parser = Parser(
+        prog="edge-sr map",
+        usage="edge-sr map [options]",
+        description="Runs like edge-sr, and fuses the\npatterns into a map of the object.",
+        epilog=MAP_HELP,
+    )
+    add = parser.add_argument
+    add("--out", metavar="FILE", type=Path, default=Path("map.npz"), help="layers of the map (default map.npz)")
+    add("--png", metavar="FILE", type=Path, help="picture of contact and height")
+    add("--size-mm", metavar="L", type=positive, default=SIZE_MM, help=f"side of the map (default {SIZE_MM:g})")
+    add(
+        "--px-per-mm",
+        metavar="N",
+        type=positive,
+        default=PX_PER_MM,
+        help=f"pixels of the map per mm (default {PX_PER_MM:g})",
+    )
+    add(
+        "--centre-mm",
+        metavar="C",
+        type=float,
+        nargs=2,
+        default=(0.0, 0.0),
+        help="x and y of its centre in the object's plane (default 0 0)",
+    )
     _add_run(parser)
     return parser
 

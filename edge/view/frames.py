@@ -4,7 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+
 from edge.inference.contract import Contract
+from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import encodable, event_record, record
@@ -48,6 +51,8 @@ class Frames:
         self._snapshot = snapshot
         self._newest = dict(snapshot.newest)
         self._packed: dict[tuple[str, int], bytes] = {}
+        self._map = snapshot.map
+        self._maps: dict[int, bytes] = {}
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -64,6 +69,21 @@ class Frames:
     def events(self, since: int) -> list[tuple[int, bytes]]:
         """Return the latest events after number `since`, with their numbers."""
         return [(sent.number, self._event(sent)) for sent in self._snapshot.events(since)]
+
+    @property
+    def map_number(self) -> int:
+        """Number of the newest state of the map; 0 where none is made."""
+        return 0 if self._map is None else self._map.number
+
+    def map(self, since: int) -> bytes:
+        """Return what has changed on the map since a state that a viewer has; 0 for none."""
+        state = self._map
+        if state is None:
+            raise ValueError("no map is made")
+        packed = self._maps.get(since)
+        if packed is None:
+            packed = self._maps[since] = _map_frame(state, since)
+        return packed
 
     def silent(self) -> dict[str, float]:
         """Return the silent sensors, and for how long each has been silent, in [s]."""
@@ -94,6 +114,24 @@ class Frames:
         taps = None if result.window is None else result.window[: result.taps_used, 2]
         maps = {"zeroed": result.zeroed, "pattern": result.pattern, "deviation": result.deviation, "taps": taps}
         return pack(header, {name: values for name, values in maps.items() if values is not None})
+
+
+def _map_frame(state: MapState, since: int) -> bytes:
+    box = state.since(since)
+    header = {
+        "kind": "map",
+        "number": state.number,
+        "pixels": state.grid.pixels,
+        "px_per_mm": state.grid.px_per_mm,
+        "centre_mm": state.grid.centre_mm,
+        "from": [0, 0] if box is None else [box.top, box.left],
+        "pads": {name: [pose.x_mm, pose.y_mm, pose.turn_deg] for name, pose in state.pads.items()},
+        "counts": state.counts,
+    }
+    if box is None:
+        return pack(header, {})
+    part = np.s_[box.top : box.bottom, box.left : box.right]
+    return pack(header, {"contact": state.contact[part], "doubted": state.doubted[part]})
 
 
 def hello(run: Run, recording: Path | None) -> bytes:

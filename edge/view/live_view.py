@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from edge.inference.contract import Contract
+from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.pipeline.commands import Commands
 from edge.pipeline.sink import Sink
@@ -96,6 +97,12 @@ class LiveView:
         self._messages = messages
         self._recorder.open_sink = open_sink
         self._server.begin(Run(name, kind, model, self._contract, secrets.token_hex(8)))
+
+    def show_map(self, state: MapState) -> None:
+        """Show a state of the map. Never waits."""
+        self._snapshot.map = state
+        if self._server.watched:
+            self._server.wake()
 
     def _failed(self, why: str) -> None:
         self._messages(Event(time.monotonic_ns(), "trouble", None, why))

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
+from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.scan_rate import Rate
@@ -79,11 +80,13 @@ class RunSnapshot:
     Attributes:
         newest: by sensor.
         first_ns: time of the run's first scan, in [ns]; None before.
+        map: newest state of the map; None where none is made.
     """
 
     def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.newest: dict[str, Newest] = {}
         self.first_ns: int | None = None
+        self.map: MapState | None = None
         self._clock_ns = clock_ns
         self._traces: dict[str, _Trace] = {}
         self._events: deque[NumberedEvent] = deque(maxlen=EVENTS)

@@ -14,9 +14,13 @@ class Viewer:
         self.paused = False
         self._seen: dict[str, int] = {}
         self._sent_number = 0
+        self._seen_map = 0
 
     def due(self, frames: Frames) -> list[bytes]:
-        """Return the frames that are new since the last call: events, and unless paused one frame a sensor."""
+        """Return the frames that are new since the last call.
+
+        These are events, and unless the viewer has paused one frame a sensor and one of the map.
+        """
         due: list[bytes] = []
         for number, frame in frames.events(self._sent_number):
             self._sent_number = number
@@ -28,4 +32,7 @@ class Viewer:
             if number > seen:
                 due.append(frames.result(sensor, seen))
                 self._seen[sensor] = number
+        if frames.map_number > self._seen_map:
+            due.append(frames.map(self._seen_map))
+            self._seen_map = frames.map_number
         return due

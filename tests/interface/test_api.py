@@ -61,7 +61,8 @@ FRONT = {
         "edge.view.live_view",
         "edge.pipeline.replay_setup",
         "edge.cli.new_recording",
-    ),  # the page, and the note about a recording
+        "edge.cli.new_map",
+    ),  # the page, and the notes about a recording and a map
     *("edge.doctor.command", "edge.bench.command"),  # commands of their own
 }
 NAN = float("nan")

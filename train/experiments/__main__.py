@@ -20,6 +20,7 @@ EXPERIMENTS: Final = {
     "families": "the shipped model on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
     "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
+    "map": "a figure larger than the pad, from slides over it",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
     "trained_out": "the paper's and compact networks, trained for many epochs",
@@ -54,7 +55,8 @@ _PAPER: Final = {
 
 def module_of(name: str) -> str:
     """Return the module of an experiment."""
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
+    module = {"map": "object_map"}.get(name, name.replace("-", "_"))  # map is a function
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{module}"
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -7,12 +7,14 @@ const painter = {
   },
   all() {
     for (const sensor of page.sensors.values()) sensor.dirty = true;
+    page.map.dirty = true;
     this.ask();
   },
   paint() {
     this.asked = 0;
     paintPage();
     for (const sensor of page.sensors.values()) if (sensor.dirty) sensor.paint();
+    if (page.map.dirty && !page.paused) page.map.paint();
   },
 };
 
@@ -25,6 +27,7 @@ const REFUSAL_S = 10; // time for which a refusal is shown, and may be forced
 const page = {
   hello: null,
   sensors: new Map(),
+  map: new MapPane(),
   state: { recording: false },
   eventNumber: 0, // number of the run's latest event that is in the log
   paused: false,
@@ -129,6 +132,9 @@ const frameHandlers = {
     if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the pause reached the program, and not again
     else sensor.take(header, maps);
   },
+  map(header, maps) {
+    page.map.take(header, maps); // also while paused, since each frame holds what has changed since the one before
+  },
   event({ note, event, sensor, number, age_s = 0 }) {
     if (number <= page.eventNumber) return; // a new connection, also a reconnect, gets the latest events again
     page.eventNumber = number ?? page.eventNumber; // the answer to this page alone has no number
@@ -185,6 +191,7 @@ function sensorOf(name) {
 function forgetRun() {
   for (const sensor of page.sensors.values()) sensor.remove();
   page.sensors.clear();
+  page.map.forget();
   page.paused = false;
   page.eventNumber = 0;
   forgetRefusal();

@@ -11,6 +11,7 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
@@ -56,8 +57,10 @@ class PushedSensor:
         raw = np.clip(_REST + np.rint(counts).astype(np.int32), 1, 65_534)
         return self._series.close(raw, self._time_ns)
 
-    def push(self, counts: NDArray[np.floating], *, infer: bool = True) -> Result:
-        """Return the result of the next scan, of zeroed counts (3, rows, cols)."""
+    def push(self, counts: NDArray[np.floating], *, infer: bool = True, pose: PadPose | None = None) -> Result:
+        """Return the result of the next scan, of zeroed counts (3, rows, cols), with the pad's pose at that time."""
+        if pose is not None:
+            self._runtime.pose(pose, self._time_ns + _PERIOD_NS)
         return self.take(self.scan(counts), infer=infer)
 
     def take(self, scan: Scan, *, infer: bool = True) -> Result:

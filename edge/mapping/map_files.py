@@ -1,0 +1,77 @@
+"""Files of a map: its layers as npz, and a picture as PNG."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.mapping.object_map import MapLayers, ObjectMap
+from edge.terminal.heatmap import colours
+
+FORMAT: Final = "tactile-object-map"
+VERSION: Final = 1
+_LEAST_PX: Final = 480
+"""Side of the picture of one layer, at least: a pixel of the map is repeated."""
+_NOTHING: Final = (255, 255, 255)
+_DOUBTED: Final = (200, 40, 30)
+_GAP_PX: Final = 8
+
+
+def save_npz(path: Path, whole: ObjectMap, **facts: str) -> None:
+    """Write the layers of a map, its place and its counts; facts are added as texts."""
+    layers = whole.layers()
+    arrays: dict[str, Any] = {name: getattr(layers, name) for name in MapLayers.__dataclass_fields__}
+    counts = {name: getattr(whole, name) for name in ("fused", "doubted", "light", "outside")}
+    arrays |= {f"{name}_patterns": np.array(count) for name, count in counts.items()}
+    arrays |= {name: np.array(text) for name, text in facts.items()}
+    arrays |= {"px_per_mm": np.array(whole.grid.px_per_mm), "centre_mm": np.array(whole.grid.centre_mm)}
+    np.savez_compressed(path, format=np.array(FORMAT), version=np.array(VERSION), **arrays)
+
+
+def check_npz(path: Path) -> None:
+    """Read a file back, as its readers will; raises ValueError or KeyError if it is not a map."""
+    with np.load(path) as data:
+        shapes = {data[name].shape for name in MapLayers.__dataclass_fields__}
+        if str(data["format"]) != FORMAT or len(shapes) != 1:
+            raise ValueError(f"{path} is not a map")
+
+
+def save_png(path: Path, whole: ObjectMap) -> None:
+    """Write the contact layer as a picture, and beside it the height from its lowest part to the map's top.
+
+    White is not covered, or in the height not touched; red was covered by patterns alone that were not believed.
+    """
+    layers = whole.layers()
+    heights_mm = layers.height_mm
+    lowest_mm = min(float(np.nanmin(heights_mm)), -1e-6) if np.isfinite(heights_mm).any() else -1.0
+    doubted = (layers.doubted > 0) & ~(layers.coverage > 0)
+    times = -(-_LEAST_PX // whole.grid.pixels)
+    panels = [_coloured(layers.contact, doubted), _coloured(1 - heights_mm / lowest_mm, doubted)]
+    large = [np.repeat(np.repeat(panel, times, axis=0), times, axis=1) for panel in panels]
+    gap = np.full((len(large[0]), _GAP_PX, 3), 255, dtype=np.uint8)
+    path.write_bytes(png(np.concatenate([large[0], gap, large[1]], axis=1)))
+
+
+def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    known = np.isfinite(shares)
+    pixels = colours(np.where(known, shares, 0)).astype(np.uint8)
+    pixels[~known] = _NOTHING
+    pixels[doubted] = _DOUBTED
+    return pixels
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """Return a PNG of pixels (H, W, 3), red, green and blue: three chunks, so that no library is needed."""
+    height, width = pixels.shape[:2]
+    # Every line begins with its filter, 0 for none.
+    lines = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits a channel, true colour
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,0 +1,101 @@
+// ---- The map of the object, larger than the pad ----
+
+const MAP_MARKS = { doubted: [200, 40, 30], nothing: [0, 0, 0, 0] };
+const PATTERN_COUNTS = [["doubted", "not believed"], ["light", "too light"], ["outside", "outside the map"], ["without_pose", "without a pose"]];
+
+class MapPane {
+  constructor() {
+    Object.assign(this, { header: null, contact: null, doubted: null, dirty: false });
+    this.root = byId("map");
+    sizes.observe(byId("map-over"));
+  }
+
+  /** Take what has changed; the first frame of a run holds the whole map. */
+  take(header, { contact, doubted }) {
+    const count = header.pixels;
+    if (this.contact === null || this.header.pixels !== count) {
+      this.contact = new Float32Array(count * count).fill(NaN);
+      this.doubted = new Float32Array(count * count);
+    }
+    this.header = header;
+    const [top, left] = header.from;
+    if (contact) {
+      const [rows, cols] = contact.shape;
+      for (let row = 0; row < rows; row++) {
+        const to = (top + row) * count + left;
+        this.contact.set(contact.values.subarray(row * cols, (row + 1) * cols), to);
+        this.doubted.set(doubted.values.subarray(row * cols, (row + 1) * cols), to);
+      }
+    }
+    this.dirty = true;
+  }
+
+  forget() {
+    Object.assign(this, { header: null, contact: null, doubted: null, dirty: true });
+  }
+
+  paint() {
+    this.dirty = false;
+    show(this.root, this.header !== null);
+    if (this.header === null) return;
+    const { pixels, px_per_mm, counts } = this.header;
+    this.paintContact(byId("map-contact"), pixels);
+    paintBar(byId("map-bar"), VIRIDIS);
+    const left = PATTERN_COUNTS.filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
+    say(byId("map-counts"), [`${counts.fused} patterns`, ...left].join(", "));
+    show(byId("map-empty"), counts.fused === 0);
+    say(byId("map-empty"), counts.without_pose > 0 ? "no poses come: send those of the pad" : "nothing touched yet");
+    this.paintPads(byId("map-over"), pixels / px_per_mm);
+  }
+
+  paintContact(canvas, count) {
+    if (canvas.width !== count) [canvas.width, canvas.height] = [count, count];
+    const context = canvas.getContext("2d");
+    const image = context.createImageData(count, count);
+    const { data } = image;
+    for (let pixel = 0, to = 0; pixel < count * count; pixel++, to += 4) {
+      if (Number.isNaN(this.contact[pixel])) {
+        data.set(this.doubted[pixel] > 0 ? [...MAP_MARKS.doubted, 255] : MAP_MARKS.nothing, to);
+        continue;
+      }
+      const at = 3 * level(this.contact[pixel], 1);
+      [data[to], data[to + 1], data[to + 2], data[to + 3]] = [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255];
+    }
+    context.putImageData(image, 0, 0);
+  }
+
+  /** Draw the outline of each pad where it is now, with a mark at the end of its x axis. */
+  paintPads(canvas, sizeMm) {
+    const [context, width, height] = blank(canvas);
+    if (width === 0 || page.hello === null) return;
+    const { rows, cols, taxel_pitch_mm: pitch } = page.hello;
+    const [halfX, halfY] = [(cols * pitch) / 2, (rows * pitch) / 2];
+    const [centreX, centreY] = this.header.centre_mm;
+    const ink = ["#fff", "#000a"];
+    for (const [x, y, turn] of Object.values(this.header.pads)) {
+      const [cosine, sine] = [Math.cos((turn * Math.PI) / 180), Math.sin((turn * Math.PI) / 180)];
+      const place = (right, down) => [
+        width / 2 + ((x - centreX + cosine * right - sine * down) / sizeMm) * width,
+        height / 2 + ((y - centreY + sine * right + cosine * down) / sizeMm) * height,
+      ];
+      haloed(context, ink, 1.5, () => {
+        context.moveTo(...place(-halfX, -halfY));
+        for (const corner of [[halfX, -halfY], [halfX, halfY], [-halfX, halfY]]) context.lineTo(...place(...corner));
+        context.closePath();
+        context.moveTo(...place(halfX, 0));
+        context.lineTo(...place(halfX - 2, 0));
+      });
+    }
+    const barMm = SCALE_BARS_MM.find((mm) => mm <= sizeMm / 3) ?? sizeMm;
+    const bar = (barMm / sizeMm) * width;
+    haloed(context, ink, 2, () => {
+      context.moveTo(10, height - 16);
+      context.lineTo(10, height - 10);
+      context.lineTo(10 + bar, height - 10);
+      context.lineTo(10 + bar, height - 16);
+    });
+    context.font = FONT;
+    context.textAlign = "center";
+    haloedText(context, ink, `${barMm}${THIN}mm`, 10 + bar / 2, height - 16);
+  }
+}
