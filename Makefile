@@ -28,11 +28,16 @@ docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 
 TAPS := data/gripped.npz data/gripped4.npz
 
-models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: under two hours on two cores
+POSED := data/gripped.npz data/taps4.npz data/taps7.npz
+
+models: $(VENV)/.dev $(TAPS) $(POSED) data/validation.npz  ## retrain and re-export the bundled models: under two hours on two cores
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
-	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m torch.distributed.run --nproc-per-node 2 -m train.fit -- checkpoints --data $(POSED) --validation data/validation.npz --network fusion-mtsr7 --name mtsr7 --start stsr --steps 20000
+	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS) data/taps4.npz data/taps7.npz
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
+	$(BIN)/python -m export.to_onnx checkpoints/mtsr7.pt --out edge/models --batch any --validation data/validation.npz --intervals $(POSED) --trust checkpoints/trust.json
+	$(BIN)/python -m export.to_onnx checkpoints/mtsr7.pt --out edge/models --batch any --validation data/validation.npz --intervals $(POSED) --trust checkpoints/trust.json --int8 $(POSED)
 	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 
@@ -57,11 +62,17 @@ reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why
 data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
 	$(BIN)/python -m train.data.make_presses $@ --count 100000 --seed 1
 
-data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each
-	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 4 --seed 2
+data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each, turned by 5 degrees
+	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 4 --schedule turns --seed 2
+
+data/taps4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind
+	$(BIN)/python -m train.data.make_presses $@ --count 30000 --taps 4 --seed 3
+
+data/taps7.npz: $(VENV)/.dev  ## the same, seven taps each
+	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 7 --seed 4
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
-	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --seed 1000001
+	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001
 
 data/seen.npz: $(VENV)/.dev  ## whole taps of the paper's protocol on its 18 surfaces, for experiments
 	$(BIN)/python -m train.generate $@ --taps 7 --seed 1
@@ -70,7 +81,7 @@ data/figures.npz: $(VENV)/.dev  ## the same on random figures
 	$(BIN)/python -m train.generate $@ --surfaces none --glyphs 4500 --polygons 4500 --taps 7 --seed 2
 
 data/test.npz: $(VENV)/.dev  ## the same on yet other pads, by which nothing is set
-	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --seed 2000001
+	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --schedule turns --seed 2000001
 
 train/data/wide-test.npz: | data/test.npz  ## the wide test set, read once by sensors of its own
 	$(BIN)/python -m train.data.frozen_presses data/test.npz $@

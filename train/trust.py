@@ -19,6 +19,7 @@ from train.data.presses import PressSet
 from train.errors import DatasetError, TrainError
 from train.learning.contact_check import fit_contact_network
 from train.learning.forward_operator import fit_forward_model
+from train.learning.posed_tap_check import fit_posed_tap_network
 from train.learning.tap_check import fit_tap_network
 
 NAME: Final = "trust.json"
@@ -28,18 +29,23 @@ _TAP_STEPS: Final = 20_000
 
 
 def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
-    """Fit forward model, check of contacts and check of earlier taps; their limits are set at export.
+    """Fit forward model, check of contacts, and checks of earlier taps by schedule and by pose; limits come at export.
 
     Raises:
-        DatasetError: no sequence has several taps.
+        DatasetError: no sequence has several taps that were only turned.
     """
-    several = presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps > 1)
-    if not several.any():
-        raise DatasetError("no sequences of several taps: add a file of 'python -m train.data.make_presses --taps 4'")
+    several = presses.pick(np.flatnonzero(presses.counts.any(axis=(2, 3, 4)).sum(axis=1) > 1))
+    turned = several.only_turned()
+    taps = turned.counts.any(axis=(2, 3, 4)).sum(axis=1)
+    turned = turned.pick(np.flatnonzero(taps == taps.max(initial=0))).with_taps(int(taps.max(initial=1)))
+    if not len(turned):
+        raise DatasetError("no sequences of turned taps: add a file of 'make_presses --taps 4 --schedule turns'")
+    steps = max(_TAP_STEPS // shorten, 1)
     return {
         "forward": fit_forward_model(presses, seed).to_json(),
         "contact": fit_contact_network(presses, seed, max(_CONTACT_STEPS // shorten, 1)).to_json(),
-        "tap": fit_tap_network(presses.pick(np.flatnonzero(several)), seed, max(_TAP_STEPS // shorten, 1)).to_json(),
+        "tap": fit_tap_network(turned, seed, steps).to_json(),
+        "posed_tap": fit_posed_tap_network(several, seed, steps).to_json(),
         "data_sha256": presses.sha256(),
     }
 

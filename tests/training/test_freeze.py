@@ -129,7 +129,8 @@ def test_presses_are_drawn_like_taps_whole_and_each_with_its_own_truth():
     assert len(np.unique(patterns.sum(axis=(1, 2)))) == len(presses)
     for reading, pattern in zip(newest, patterns, strict=True):
         (mine,) = np.flatnonzero((presses.patterns == pattern).all(axis=(1, 2)))
-        assert np.corrcoef(reading.ravel(), presses.counts[mine, 0].ravel())[0, 1] > 0.97
+        clean = presses.counts[:, 0].reshape(len(presses), -1)
+        assert np.argmax([np.corrcoef(reading.ravel(), one)[0, 1] for one in clean]) == mine
     more, _ = drawn(presses, windows=3 * len(presses))
     assert len(more) == 3 * len(presses)
     assert set(fit_classical(presses, windows=20)) == {"bilinear_gain", "bicubic_gain", "linear_map"}

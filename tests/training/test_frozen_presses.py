@@ -27,6 +27,7 @@ def a_few(n=6, taps=2) -> PressSet:
         constants=rng.uniform(-1, 1, (n, len(INPUTS))).astype(np.float32),
         counts=rng.uniform(300, 1200, (n, taps, 3, 4, 4)).astype(np.float32),
         angle_deg=np.zeros((n, taps), dtype=np.float32),
+        poses=np.zeros((n, taps, 3), dtype=np.float32),
         patterns=rng.uniform(0, 0.3, (n, 40, 40)).astype(np.float16),
         touching=np.ones((n, 40, 40), dtype=bool),
         traction_kpa=np.ones((n, 3, 8, 8), dtype=np.float16),

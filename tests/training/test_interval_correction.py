@@ -128,7 +128,7 @@ def test_conformal_intervals_hold_in_every_region_for_every_number_of_taps():
     region = regions(patterns, LEVEL, correction.near)
     spread = np.random.default_rng(0).uniform(0.1, 1, patterns.shape) * np.where(region == 1, 0.1, 1)
 
-    def run(given, _pads):
+    def run(given, _pads, _poses):
         later = torch.from_numpy(given[:, 3:].any(axis=(1, 2, 3))).float()[:, None]
         factors = correction.log_factors(torch.zeros(len(given), len(correction.centre)), later).exp().numpy()
         factor = np.take_along_axis(factors, region.reshape(len(given), -1).astype(int), axis=1)
@@ -138,7 +138,7 @@ def test_conformal_intervals_hold_in_every_region_for_every_number_of_taps():
     assert list(levels) == ["50", "80", "90", "95"]
     assert levels["90"] == pytest.approx([float(half_width_mm(1.0))] * 4, rel=0.02)
     for given in (1, 2):
-        deviation = run(apart[0].with_taps(given), None)[1]
+        deviation = run(apart[0].with_taps(given), None, None)[1]
         held = np.abs(patterns - apart[0].truth) <= half_width_mm(deviation)
         assert [held[region == number].mean() for number in range(4)] == pytest.approx([0.9] * 4, abs=0.01)
 

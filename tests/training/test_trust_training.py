@@ -194,7 +194,8 @@ class TestForward:
 class TestFile:
     def test_it_comes_back(self, path, presses):
         fitted = json.loads(path.read_text())
-        assert set(fitted) == {"forward", "contact", "tap", "data_sha256"} and fitted["data_sha256"] == presses.sha256()
+        assert set(fitted) == {"forward", "contact", "tap", "posed_tap", "data_sha256"}
+        assert fitted["data_sha256"] == presses.sha256()
         loaded = load_trust(path, presses)
         assert loaded.fitted == fitted and loaded.validation is presses
         again = trust.fit_trust(presses, seed=1, shorten=SHORTEN)
@@ -219,7 +220,7 @@ class TestFile:
             load_trust(tmp_path / "bad.json", presses)
 
     def test_presses_of_one_tap_cannot_tell_taps_apart(self):
-        with pytest.raises(DatasetError, match="no sequences of several taps"):
+        with pytest.raises(DatasetError, match="no sequences of turned taps"):
             trust.fit_trust(make_press_set(taps=1), seed=1, shorten=SHORTEN)
 
     def test_the_command_ends_in_a_line_without_its_data(self, tmp_path):

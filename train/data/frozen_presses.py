@@ -68,8 +68,12 @@ class FrozenPresses:
         return FrozenPresses(self.presses.pick(index), self.gains[index])
 
     def as_frozen_set(self) -> FrozenSet:
-        """Return the set in the form of the runtime's evaluation: one frame a tap, without pad inputs."""
-        one = self.presses
+        """Return the set in the form of the runtime's evaluation: one frame a tap, without pad inputs.
+
+        It holds no poses, and so only the sequences whose taps were turned at one place, as the schedule states.
+        """
+        one = self.presses.only_turned()
+        patterns = one.patterns.astype(np.float32)
         depth_mm = one.indentation_mm
         return FrozenSet(
             newest=one.counts[:, 0].astype(np.int16),
@@ -77,7 +81,7 @@ class FrozenPresses:
             tap=np.arange(len(one), dtype=np.int16),
             indentation_mm=depth_mm,
             force_n=one.force_n[:, 2],
-            unit_patterns=(self.patterns() / depth_mm[:, None, None]).astype(np.float16),
+            unit_patterns=(patterns / depth_mm[:, None, None]).astype(np.float16),
             touched=one.touching,
             surface=one.family,
             angle_deg=one.angle_deg[:, 0],

@@ -93,6 +93,10 @@ class PressSet:
             poses=np.pad(self.poses[:, :taps], [(0, 0), (0, more), (0, 0)]),
         )
 
+    def only_turned(self) -> "PressSet":
+        """Return the sequences whose taps are all at one place, as the paper's schedule turns the pad."""
+        return self.pick(np.flatnonzero(~self.poses[..., :2].any(axis=(1, 2))))
+
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""
         # Taps that were only turned have the hash of version 2, by which reports and contracts name their sets.

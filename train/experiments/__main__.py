@@ -20,6 +20,7 @@ EXPERIMENTS: Final = {
     "families": "the shipped model on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
     "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
+    "posed-taps": "taps from known poses: one to seven, by schedule, and with wrong poses",
     "map": "a figure larger than the pad, from slides over it",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",

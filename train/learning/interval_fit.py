@@ -76,6 +76,7 @@ class Readings:
 
 def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS, *, posed: bool = False) -> list[Readings]:
     """Return presses as sensors of their own read them, with nothing and with everything known of each sensor."""
+    presses = presses if posed or taps == 1 else presses.only_turned()
     found = []
     for number in range(times):
         frozen = freeze_presses(presses, SEED + number)

@@ -19,6 +19,7 @@ from edge.perception.runtime import Model
 from train.data.presses import PressSet
 from train.errors import CheckpointError
 from train.learning.contact_check import contact_check, drawn_readings, in_contact, limit_of
+from train.learning.posed_tap_check import posed_tap_check
 from train.learning.tap_check import tap_check
 from train.physics.pad_draws import INPUTS
 
@@ -39,13 +40,16 @@ class TrustFit:
     validation: PressSet
 
     @cached_property
-    def _checks(self) -> tuple[Check, Check]:
+    def _checks(self) -> tuple[Check, Check, Check]:
         contact = contact_check(small_network(self.fitted["contact"]), self.validation, FALSE_ALARMS / 2)
-        return contact, tap_check(small_network(self.fitted["tap"]), self.validation, FALSE_ALARMS)
+        tap = tap_check(small_network(self.fitted["tap"]), self.validation.only_turned(), FALSE_ALARMS)
+        posed = posed_tap_check(small_network(self.fitted["posed_tap"]), self.validation, FALSE_ALARMS)
+        return contact, tap, posed
 
     def of(self, model: Model) -> Trust:
         """Return forward model and checks for a model, the limit of the mismatch being that of its own patterns."""
-        contact, tap = self._checks
+        contact, tap, posed_tap = self._checks
+        tap = posed_tap if model.contract.takes_poses else tap
         forward = forward_model(self.fitted["forward"], len(model.contract.pad_inputs))
         trust = Trust(forward, contact, tap)
         return replace(
@@ -82,6 +86,7 @@ def load_trust(path: Path, validation: PressSet) -> TrustFit:
         forward_model(fitted["forward"], len(INPUTS))
         small_network(fitted["contact"])
         small_network(fitted["tap"])
+        small_network(fitted["posed_tap"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise CheckpointError(f"{path}: {reason}; make it with 'python -m train.trust {path} --data ...'") from error

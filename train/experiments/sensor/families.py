@@ -29,7 +29,7 @@ from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 
 TRAINING: Final = World(count=100_000, seed=1)
-VALIDATION: Final = World(count=1260, taps=4, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)
+VALIDATION: Final = World(count=2520, taps=7, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)
 """Settings of data/gripped.npz and data/validation.npz in the Makefile."""
 _MODEL: Final = (NOTHING, ALL)
 

@@ -52,23 +52,29 @@ def known_pads(frozen: FrozenPresses, known: str) -> list[Pad | None]:
     return [Pad(counts_per_newton=pad.counts_per_newton) for pad in pads] if known == FORCE else [*pads]
 
 
-def infer(model: ModelSession, windows: NDArray[np.float32], pads: Sequence[Pad | None]) -> Inferred:
+def infer(
+    model: ModelSession,
+    windows: NDArray[np.float32],
+    pads: Sequence[Pad | None],
+    poses: NDArray[np.float32] | None = None,
+) -> Inferred:
     """Run a model as the runtime does, window by window.
 
     Args:
         model: the session.
         windows: (n, taps, 3, rows, cols) in zeroed counts as read, with as many taps as the model takes.
         pads: constants that are available for each of the n sensors.
+        poses: (n, taps, 5) of the taps, for a model that takes them; None for the paper's schedule.
     """
     contract = model.contract
     patterns, tractions, times_s = [], [], []
-    for window, pad in zip(windows, pads, strict=True):
+    for number, (window, pad) in enumerate(zip(windows, pads, strict=True)):
         gains = None
         if contract.takes_gains and pad is not None and pad.gains is not None:
             gains = np.asarray(pad.gains, dtype=np.float32).reshape(window.shape[1:])
         row = contract.pad_row(pad)
         started_s = time.perf_counter()
-        pattern = model.run(contract.scale_window(window, gains), row)
+        pattern = model.run(contract.scale_window(window, gains), row, None if poses is None else poses[number])
         times_s.append(time.perf_counter() - started_s)
         patterns.append(pattern.copy())
         tractions.append(None if model.traction is None else model.traction.copy())
