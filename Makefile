@@ -66,10 +66,10 @@ data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each, turned by 5 degree
 	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 4 --schedule turns --seed 2
 
 data/taps4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind
-	$(BIN)/python -m train.data.make_presses $@ --count 30000 --taps 4 --seed 3
+	$(BIN)/python -m train.data.make_presses $@ --count 40000 --taps 4 --seed 3
 
 data/taps7.npz: $(VENV)/.dev  ## the same, seven taps each
-	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 7 --seed 4
+	$(BIN)/python -m train.data.make_presses $@ --count 8000 --taps 7 --seed 4
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001

@@ -58,6 +58,23 @@ def test_what_is_made_is_what_was_asked_for(small):
     assert not small.with_name("small.npz.parts").exists()
 
 
+@pytest.mark.parametrize("begun", [0.0, 1.0])
+def test_newest_taps_that_have_only_begun_are_lighter_than_earlier_ones(begun):
+    """Level faces, so that force goes with depth wherever the pad taps."""
+    world = World(
+        count=40, taps=3, per_pad=40, families={"flat": 1.0}, spread=0.0, schedule="turns", begun=begun, seed=2
+    )
+    z_counts = solve_pad(world, 0).counts[:, :, 2].sum(axis=(2, 3))
+    share = z_counts[:, 0] / z_counts[:, 1]
+    assert np.median(share) == pytest.approx(1.0 if begun == 0 else 0.65, abs=0.15)
+
+
+@pytest.mark.parametrize("name", ["spread", "begun"])
+def test_a_share_beyond_its_bounds_is_refused(name):
+    with pytest.raises(DatasetError, match=f"{name} is 1.5, expected 0 to 1"):
+        World(**{name: 1.5})
+
+
 def test_families_are_met_as_often_as_asked():
     world = World(count=40, per_pad=20, families={"flat": 3.0, "dome": 1.0}, spread=0.0, seed=2)
     made = [solve_pad(world, number) for number in range(2)]

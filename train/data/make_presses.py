@@ -116,6 +116,7 @@ def _world(options: argparse.Namespace) -> World:
         count=options.count,
         taps=options.taps,
         schedule=options.schedule,
+        begun=options.begun,
         per_pad=options.per_pad,
         families=families,
         spread=options.spread,
@@ -132,6 +133,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--taps", type=int, default=1, help="presses in each sequence (1)")
     parser.add_argument(
         "--schedule", default="mixed", help=f"poses of a sequence's presses: {', '.join(SCHEDULES)} (mixed)"
+    )
+    parser.add_argument(
+        "--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)"
     )
     parser.add_argument("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     parser.add_argument(

@@ -26,6 +26,8 @@ _STILL: Final = 0.35
 """Share of presses without any drag; half of the others are twisted as well."""
 _SLIDE_MM: Final = (0.02, 0.6)
 _TWIST_RAD: Final = 0.03
+_LEAST_BEGUN: Final = 0.2
+"""Least depth of a newest tap that has only begun, over that of the earlier ones."""
 _FRICTION: Final = (0.2, 1.2)
 """Bounds of Coulomb's coefficient: polished steel to rubber on silicone."""
 
@@ -38,6 +40,7 @@ class World:
         count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out.
         taps: presses in each sequence.
         schedule: of the taps' poses, one of train.surfaces.tap_schedules.SCHEDULES.
+        begun: share of sequences whose newest tap has only begun, while the earlier ones are as at their ends.
         per_pad: sequences of one pad.
         families: relative frequency of each family.
         spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
@@ -47,6 +50,7 @@ class World:
     count: int = 24_000
     taps: int = 1
     schedule: str = "mixed"
+    begun: float = 0.5
     per_pad: int = 24
     families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))
     spread: float = 1.0
@@ -60,8 +64,9 @@ class World:
             raise DatasetError(f"taps is {self.taps}, expected 1 to {MAX_TAPS}")
         if self.schedule not in SCHEDULES:
             raise DatasetError(f"no schedule {self.schedule!r}: expected one of {', '.join(SCHEDULES)}")
-        if not 0 <= self.spread <= 1:
-            raise DatasetError(f"spread is {self.spread}, expected 0 to 1")
+        for name in ("spread", "begun"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise DatasetError(f"{name} is {getattr(self, name)}, expected 0 to 1")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
         unknown = [name for name in self.families if name not in SHARES and not name.startswith("mesh:")]
@@ -107,17 +112,28 @@ def solve_pad(world: World, number: int) -> PressSet:
     family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
     schedule = SCHEDULES[world.schedule]
     tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
-    made = press_shapes(rng, gripped, family, tapped, number)
+    made = press_shapes(rng, gripped, family, tapped, number, world.begun)
     return made.pick((made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2)))
 
 
 def press_shapes(
-    rng: np.random.Generator, gripped: GrippedPad, family: NDArray[np.str_], tapped: list[Tapped], number: int
+    rng: np.random.Generator,
+    gripped: GrippedPad,
+    family: NDArray[np.str_],
+    tapped: list[Tapped],
+    number: int,
+    begun: float = 0.0,
 ) -> PressSet:
-    """Press shapes onto pad `number` with drawn depths, drags and friction; light presses are kept."""
+    """Press shapes onto pad `number` with drawn depths, drags and friction; light presses are kept.
+
+    In a share `begun` of the sequences the newest tap is not as deep yet as the earlier ones were at their ends.
+    """
     n, taps = len(tapped), len(tapped[0].heights_mm)
-    depth_mm = np.repeat(rng.uniform(*INDENTATION_MM, n), taps)
-    depth_mm[np.arange(n * taps) % taps > 0] *= rng.uniform(0.85, 1.15, n * (taps - 1))  # ends of taps differ
+    depths_mm = np.repeat(rng.uniform(*INDENTATION_MM, n)[:, None], taps, axis=1)
+    depths_mm[:, 1:] *= rng.uniform(0.85, 1.15, (n, taps - 1))  # ends of taps differ
+    only_begun = rng.random(n) < begun
+    depths_mm[only_begun, 1:] /= rng.uniform(_LEAST_BEGUN, 1, (int(only_begun.sum()), 1))
+    depth_mm = depths_mm.ravel()
     dragged = rng.random(n * taps) > _STILL
     way = rng.uniform(0, 2 * np.pi, n * taps)
     low, high = np.log(_SLIDE_MM)

@@ -29,7 +29,7 @@ from train.surfaces.poses import MAX_TAPS
 
 MODEL: Final = "mtsr7-int8"
 SCHEDULES: Final = ("half-pitch", "near", "turns", "slide")
-PEER_ON: Final = World(count=30_000, taps=4, seed=3)
+PEER_ON: Final = World(count=40_000, taps=4, seed=3)
 """Settings of data/taps4.npz in the Makefile, of which the peer is fitted."""
 _COUNT: Final = 420
 _SEED: Final = 2_000_003
@@ -66,6 +66,9 @@ def run(bench: Workbench, folder: Path) -> Path:
         "all kinds.",
         "families",
     )
+    light = {name: _frozen(bench, name, figures=True, begun=1.0) for name in SCHEDULES}
+    rows = [row for name, one in light.items() for row in _rows(model, peer, name, one, NOTHING, (1, 4, 7))]
+    report.table(rows, "The newest press has only begun, at a fifth of the earlier ones' depth and more.", "begun")
     report.table(
         _wrong(model, sets["near"]),
         f"{_WINDOW} taps near the newest one, whose poses are all off by so much in a random direction; stated: the "
@@ -75,12 +78,18 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def _frozen(bench: Workbench, schedule: str, *, figures: bool) -> FrozenPresses:
+def _frozen(bench: Workbench, schedule: str, *, figures: bool, begun: float = 0.0) -> FrozenPresses:
     families = dict.fromkeys(FIGURES[1:] if figures else SHARES, 1.0)
     world = World(
-        count=_COUNT, taps=MAX_TAPS, schedule=schedule, per_pad=10, families=families, seed=_SEED + (not figures)
+        count=_COUNT,
+        taps=MAX_TAPS,
+        schedule=schedule,
+        begun=begun,
+        per_pad=10,
+        families=families,
+        seed=_SEED + (not figures),
     )
-    name = f"test-{schedule}"
+    name = f"test-{schedule}" + ("-begun" if begun else "")
     if bench.quick:
         name, world = f"quick-{name}", replace(world, count=8, per_pad=4)
     bench.data_folder.mkdir(parents=True, exist_ok=True)
