@@ -72,7 +72,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(
         _wrong(model, sets["near"]),
         f"{_WINDOW} taps near the newest one, whose poses are all off by so much in a random direction; stated: the "
-        "model is told the size of the error. Without the guard that drops taps which do not belong.",
+        "model gets the size of the error. Without the guard that drops taps which do not belong.",
         "wrong poses",
     )
     return report.write()
