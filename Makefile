@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt
+NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt checkpoints/mtsr7.pt
 
 .PHONY: run test lint docs models reports reports-stale clean
 
@@ -26,18 +26,13 @@ lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
 docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-TAPS := data/gripped.npz data/gripped4.npz
+TAPS := data/gripped.npz data/gripped4.npz data/taps4.npz data/taps7.npz
 
-POSED := data/gripped.npz data/taps4.npz data/taps7.npz
-
-models: $(VENV)/.dev $(TAPS) $(POSED) data/validation.npz  ## retrain and re-export the bundled models: under two hours on two cores
+models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: some three hours on two cores
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
-	OMP_NUM_THREADS=1 $(BIN)/python -m torch.distributed.run --nproc-per-node 2 -m train.fit -- checkpoints --data $(POSED) --validation data/validation.npz --network fusion-mtsr7 --name mtsr7 --start stsr --steps 20000
-	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS) data/taps4.npz data/taps7.npz
+	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
-	$(BIN)/python -m export.to_onnx checkpoints/mtsr7.pt --out edge/models --batch any --validation data/validation.npz --intervals $(POSED) --trust checkpoints/trust.json
-	$(BIN)/python -m export.to_onnx checkpoints/mtsr7.pt --out edge/models --batch any --validation data/validation.npz --intervals $(POSED) --trust checkpoints/trust.json --int8 $(POSED)
 	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 

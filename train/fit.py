@@ -45,6 +45,7 @@ BUNDLED: Final = (
     Training(
         "mtsr2", "compact-mtsr2", Recipe(steps=1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
     ),
+    Training("mtsr7", "fusion-mtsr7", Recipe(steps=40_000, given=GIVEN[7]), start="stsr", options=_KNOWN),
 )
 
 

@@ -37,9 +37,10 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
     several = presses.pick(np.flatnonzero(presses.counts.any(axis=(2, 3, 4)).sum(axis=1) > 1))
     turned = several.only_turned()
     taps = turned.counts.any(axis=(2, 3, 4)).sum(axis=1)
-    turned = turned.pick(np.flatnonzero(taps == taps.max(initial=0))).with_taps(int(taps.max(initial=1)))
-    if not len(turned):
+    if not len(taps):
         raise DatasetError("no sequences of turned taps: add a file of 'make_presses --taps 4 --schedule turns'")
+    most = int(np.bincount(taps).argmax())  # sequences of one length, of which there are the most
+    turned = turned.pick(np.flatnonzero(taps == most)).with_taps(most)
     steps = max(_TAP_STEPS // shorten, 1)
     return {
         "forward": fit_forward_model(presses, seed).to_json(),

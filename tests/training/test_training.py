@@ -152,7 +152,7 @@ def test_bundled_networks_start_from_nothing_or_one_before_and_take_what_is_know
     for training in BUNDLED:
         assert training.start in before and training.options == {"known": KNOWN}
         before.append(training.name)
-    assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2"]
+    assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2", "mtsr7"]
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):

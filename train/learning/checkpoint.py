@@ -175,8 +175,9 @@ def batches_of(
         return WindowBatches(data.at_scale(scale), draw or Draw(), recipe.given, recipe.batch, seed)
     if scale != SCALE:
         raise DatasetError(f"patterns at x{scale} asked for, presses have them at x{SCALE}: take 'train.generate'")
-    batches = PosedBatches if posed else PressBatches
-    return batches(data, recipe.given, recipe.batch, seed)
+    if posed:
+        return PosedBatches(data, recipe.given, recipe.batch, seed)
+    return PressBatches(data.only_turned() if len(recipe.given) > 1 else data, recipe.given, recipe.batch, seed)
 
 
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:

@@ -175,6 +175,7 @@ def _samples(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return inputs of the factors (n, ...), taps (n, K - 1), and logarithms of errors over half widths (n, 4, m)."""
     rng = np.random.default_rng(seed)
+    presses = presses if net.takes_poses or net.taps == 1 else presses.only_turned()
     whole = presses.with_taps(net.taps)
     usable = np.flatnonzero(whole.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= net.taps))
     names = whole.family[usable]
