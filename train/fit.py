@@ -1,6 +1,6 @@
 """Train the bundled networks from nothing to their final error, or one network by name; in one seeded run.
 
-    python -m train.fit checkpoints --data data/gripped.npz data/gripped4.npz --validation data/validation.npz
+    python -m train.fit checkpoints --data data/gripped.npz data/taps7.npz --validation data/validation.npz
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
     python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start seed-stsr --steps 5000
 
@@ -22,7 +22,7 @@ from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
 from train.data.presses import PressSet, load_presses
-from train.errors import TrainError
+from train.errors import DatasetError, TrainError
 from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
@@ -58,7 +58,17 @@ def given_taps(taps: int) -> tuple[float, ...]:
 
 
 def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
-    """Train the bundled networks, one from another; `shorten` divides their steps, for tests."""
+    """Train the bundled networks, one from another; `shorten` divides their steps, for tests.
+
+    Raises:
+        DatasetError: no sequence has as many taps as a network takes.
+    """
+    most, needed = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), max(len(one.recipe.given) for one in BUNDLED)
+    if most < needed:  # before hours of training of those that come first
+        raise DatasetError(
+            f"the presses have at most {most} taps, the bundled networks take {needed}: add data/taps7.npz, or train "
+            "one network with --network"
+        )
     frozen = freeze_presses(validation, SEED).as_frozen_set()
     for training in BUNDLED:
         _say(_line(fit_network(_shortened(training, shorten), data, frozen, folder)))
