@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.mapping.object_map import MapLayers, ObjectMap
-from edge.terminal.heatmap import colours
 
 FORMAT: Final = "tactile-object-map"
 VERSION: Final = 1
@@ -33,7 +32,7 @@ def save_npz(path: Path, whole: ObjectMap, **facts: str) -> None:
 
 def check_npz(path: Path) -> None:
     """Read a file back, as its readers will; raises ValueError or KeyError if it is not a map."""
-    with np.load(path) as data:
+    with np.load(path, allow_pickle=False) as data:
         shapes = {data[name].shape for name in MapLayers.__dataclass_fields__}
         if str(data["format"]) != FORMAT or len(shapes) != 1:
             raise ValueError(f"{path} is not a map")
@@ -56,6 +55,8 @@ def save_png(path: Path, whole: ObjectMap) -> None:
 
 
 def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    from edge.terminal.heatmap import colours  # not loaded by a run without a picture
+
     known = np.isfinite(shares)
     pixels = colours(np.where(known, shares, 0)).astype(np.uint8)
     pixels[~known] = _NOTHING

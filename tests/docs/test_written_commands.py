@@ -68,6 +68,7 @@ LEFT_OUT = {
     r"(echo .*\| )?sudo .*": "needs root, and the machine that the adapter is plugged into",
     r"(cmake|export) .*|pip install [\w-]+": "makes, or fetches, what is of others",
     r"ros2 .*": "needs ROS",
+    r"your-robot-program \| .*": "is the reader's own; test_poses_stdin pipes poses of a program",
     r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm_reading runs it",
     r"python examples/zenoh_listen\.py .*": "goes on until it is ended; test_zenoh runs it",
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",

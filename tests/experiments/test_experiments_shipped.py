@@ -9,6 +9,7 @@ from edge_samples import make_contract, make_pad_contract, write_model
 from experiment_samples import quick_bench
 
 from edge.errors import ModelError
+from edge.inference.contract import CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import load_frozen_presses
@@ -184,7 +185,9 @@ class TestPages:
     def test_families(self, bench, tmp_path, monkeypatch):
         monkeypatch.setattr(nominal, "TEST_FIGURES", 2)
         page = families.run(bench, tmp_path).read_text()
-        assert page.startswith("# families\n") and "quick run" in page and "contract version 6" in page
+        assert (
+            page.startswith("# families\n") and "quick run" in page and f"contract version {CONTRACT_VERSION}" in page
+        )
         methods = {row["method"]: row for row in rows_of(tmp_path / "families-methods.csv")}
         assert {"model", "model, all known", "bilinear", "linear map", "nearest 8", "kriging"} <= set(methods)
         assert all(float(row["run time us"]) > 0 for row in methods.values())
