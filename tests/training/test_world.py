@@ -137,6 +137,17 @@ def test_a_users_mesh_that_has_changed_is_another_world(tmp_path):
     assert set(made.family.tolist()) == {f"mesh:{path}"}
 
 
+def test_workers_ignore_an_interruption():
+    """Else each of them prints a traceback, unless it is killed before."""
+    script = (
+        "import joblib, signal; from train.data.workers import start_workers; start_workers(2); "
+        "asked = (joblib.delayed(signal.getsignal)(signal.SIGINT) for _ in range(8)); "
+        "print(set(joblib.Parallel(n_jobs=2)(asked)) == {signal.SIG_IGN}, signal.getsignal(signal.SIGINT))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("True <built-in function default_int_handler>"), done.stdout
+
+
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
     path = tmp_path / "cut.npz"
     command = ["train.data.make_presses", str(path), "--families", "flat", "--count", "9000", "--per-pad", "1"]
