@@ -21,9 +21,11 @@ class PoseQueue:
     Attributes:
         refused: poses that could not be taken.
         dropped: poses that waited too long, behind too many others.
+        begun: True once there was a pose, or a reason to report; most runs have none, and follow none.
     """
 
     def __init__(self) -> None:
+        self.begun = False
         self.refused = 0
         self.dropped = 0
         self._lock = threading.Lock()
@@ -37,6 +39,7 @@ class PoseQueue:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append(pose)
+            self.begun = True
 
     def put_fields(self, fields: Mapping[str, Any], now_ns: int) -> None:
         """Put the pose in parsed JSON that arrived at `now_ns` [ns], or refuse it."""
@@ -60,11 +63,13 @@ class PoseQueue:
         """Count a pose that cannot be taken."""
         with self._lock:
             self.refused += 1
+            self.begun = True
             self._reasons.setdefault(error.reason, f"a pose is refused: {error}")
 
     def warn(self, reason: str, text: str) -> None:
         """Put a line on poses that are taken all the same; `reason` is a short name of it."""
         with self._lock:
+            self.begun = True
             self._reasons.setdefault(reason, text)
 
     def take(self) -> list[TimedPose]:

@@ -197,6 +197,9 @@ class Stream:
 
     def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
         """Pass poses on to the runtime: those from outside, and those of the source."""
+        recorded = [one for one in taken if isinstance(one, TimedPose)]
+        if not (recorded or self._poses.begun or self._intake.used):
+            return
         times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
         first_ns = min(times_ns, default=None)
         if not self._source.patient:
@@ -204,7 +207,7 @@ class Stream:
         elif first_ns is not None:
             self._now_ns = first_ns
         intake, statistics = self._intake, self.statistics
-        poses = intake.take([one for one in taken if isinstance(one, TimedPose)], first_ns, self._now_ns)
+        poses = intake.take(recorded, first_ns, self._now_ns)
         statistics.poses, statistics.poses_refused = intake.used, intake.refused
         statistics.poses_dropped = intake.dropped
         if poses:
