@@ -6,14 +6,14 @@ PIP := PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --dis
 
 NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt checkpoints/mtsr7.pt
 
-.PHONY: run test lint docs models reports reports-stale clean
+.PHONY: run test lint docs wheels models reports reports-stale clean
 
 run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 	$(BIN)/edge-sr demo --view
 
-test: $(VENV)/.dev  ## everything else, all tests; the soak, which mostly waits, beside the others
-	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider & soak=$$!; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak"; tests=$$?; \
+test: $(VENV)/.dev  ## everything else, all tests; three at a time on two cores, since many mostly wait, and the soak beside
+	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider tests/system/test_soak.py & soak=$$!; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not soak"; tests=$$?; \
 	wait $$soak && test $$tests = 0
 
 lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
@@ -26,13 +26,16 @@ lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
 docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-TAPS := data/gripped.npz data/gripped4.npz data/taps4.npz data/taps7.npz
+wheels: $(VENV)/.dev  ## two wheels in dist/: the runtime, with completion and man page; and training, export, bench
+	$(BIN)/python release/wheels.py
 
-models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: some three hours on two cores
+TAPS := data/gripped.npz data/gripped4.npz data/taps4.npz data/taps7.npz data/more4.npz data/more7.npz
+
+models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: some four hours on two cores
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
 	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
 	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 
@@ -66,6 +69,12 @@ data/taps4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind
 data/taps7.npz: $(VENV)/.dev  ## the same, seven taps each
 	$(BIN)/python -m train.data.make_presses $@ --count 8000 --taps 7 --seed 4
 
+data/more4.npz: $(VENV)/.dev  ## as many again
+	$(BIN)/python -m train.data.make_presses $@ --count 40000 --taps 4 --seed 5
+
+data/more7.npz: $(VENV)/.dev
+	$(BIN)/python -m train.data.make_presses $@ --count 10000 --taps 7 --seed 6
+
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001
 
@@ -76,7 +85,7 @@ data/figures.npz: $(VENV)/.dev  ## the same on random figures
 	$(BIN)/python -m train.generate $@ --surfaces none --glyphs 4500 --polygons 4500 --taps 7 --seed 2
 
 data/test.npz: $(VENV)/.dev  ## the same on yet other pads, by which nothing is set
-	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --schedule turns --seed 2000001
+	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --schedule turns --begun 0 --seed 2000001
 
 train/data/wide-test.npz: | data/test.npz  ## the wide test set, read once by sensors of its own
 	$(BIN)/python -m train.data.frozen_presses data/test.npz $@

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 
 from edge.errors import EdgeError
@@ -25,7 +26,7 @@ from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.graphs.graph import known_width, outputs, to_model
 from export.graphs.intervals import IntervalData
-from export.graphs.parity import check_parity
+from export.graphs.parity import check_parity, extreme_windows
 from export.graphs.writing import Writer
 from export.quantisation.fine_tune import FineTuning, quantised_well
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
@@ -115,6 +116,7 @@ def export(
     validation: Sequence[FrozenSet] = (),
     trust: TrustFit | None = None,
     intervals: IntervalData | None = None,
+    one_tap: str | None = None,
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
@@ -134,6 +136,7 @@ def export(
             confidence stays empty.
         trust: forward model and checks for the contract; None for none.
         intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
+        one_tap: name of the model in `folder` by which one that takes poses infers single taps; None for its own.
 
     Raises:
         CheckpointError: the checkpoint cannot be used.
@@ -147,7 +150,9 @@ def export(
     level = contract.contact_level
     if intervals is not None and contract.interval_factor is not None:
         report = {**report, "options": {**report["options"], "intervals": True}}
-    writer = Writer(folder, frozen, validation, report, trust)
+    writer = Writer(folder, frozen, validation, report, trust, one_tap)
+    if one_tap is not None and net.takes_poses:  # before minutes of tracing
+        writer.model_of_one_tap("float32" if calibration is None else "int8")
     if calibration is None:
         if intervals is not None:
             found = intervals.corrected(net, level)
@@ -157,29 +162,35 @@ def export(
         parity = check_parity(net, model, frozen, contract)
         return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
 
-    single = to_model(net, geometry)
+    traced = batch if batch == ANY_BATCH else 1  # a graph of any batch runs single windows as well
+    single = to_model(net, geometry, traced)
     check_parity(net, single, frozen, contract)
     seen = calibration_batch(calibration, contract)
-    well = quantised_well(net, geometry, seen, calibration, tuning, MOST_LOSS_DB, every=every)
+    beyond = np.concatenate([*extreme_windows(contract).values()]) if net.takes_poses else None
+    well = quantised_well(net, single, geometry, seen, calibration, tuning, MOST_LOSS_DB, every=every, beyond=beyond)
     net, in_float, integers = well.net, well.model, well.integers
     integer_net, levels = net, {}
     if intervals is not None:
         found = intervals.corrected(net, level)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-        in_float = to_model(net, geometry)
-        found = intervals.conformed(net, quantised(in_float, seen, every=every))
+        in_float = to_model(net, geometry, traced)
+        found = intervals.conformed(net, quantised(in_float, seen, every=every, beyond=beyond))
         integer_net, levels = found.net, found.interval_levels
-        integers = quantised(to_model(integer_net, geometry), seen, every=every)
+        integers = quantised(to_model(integer_net, geometry, traced), seen, every=every, beyond=beyond)
     lines: list[str] = []
     if tuning is not None and well.trained_on:
         mixed_sha256 = tuning.sha256(contract.training_sha256, calibration.sha256(), every=every)
         contract = replace(contract, training_sha256=mixed_sha256)
-        model = in_float if batch == 1 else to_model(net, geometry, batch)
+        model = in_float if batch == traced else to_model(net, geometry, batch)
         parity = check_parity(net, model, frozen, contract)
         facts = [f"parity {parity:.1e}", "float32 after fine-tuning for int8"]
         lines.append(writer.write(checkpoint.stem, model, in_float, contract, facts))
     float_error = writer.error(in_float, contract)
-    model = integers if batch == 1 else quantised(to_model(integer_net, geometry, batch), seen, every=every)
+    model = (
+        integers
+        if batch == traced
+        else quantised(to_model(integer_net, geometry, batch), seen, every=every, beyond=beyond)
+    )
     integer, convs = convolutions(model)
     contract = replace(contract, arithmetic="int8", test_error={}, confidence={}, interval_levels=levels)
     facts = [
@@ -221,6 +232,11 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument(
         "--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust"
+    )
+    parser.add_argument(
+        "--one-tap",
+        metavar="NAME",
+        help="model in --out by which networks that take poses infer single taps (default: the network itself)",
     )
     parser.add_argument(
         "--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training"
@@ -278,6 +294,7 @@ def main(arguments: list[str] | None = None) -> None:
                 validation=validation,
                 trust=trust,
                 intervals=intervals,
+                one_tap=options.one_tap,
             )
             sys.stdout.write(line + "\n")
             lines += line.splitlines()

@@ -30,6 +30,7 @@ from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
 from export.graphs.graph import outputs
+from export.graphs.joined import branches
 from export.graphs.parity import (
     EXTREME_TOLERANCE,
     LEVELS,
@@ -41,12 +42,14 @@ from export.graphs.parity import (
     extreme_windows,
     read_windows,
 )
-from export.graphs.reference import contract_in, in_float, network_of, origin_of
+from export.graphs.reference import ONE_TAP, contract_in, in_float, network_of, origin_of
 from export.to_onnx import MOST_LOSS_DB
+from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
 from train.errors import TrainError
 from train.learning.checkpoint import load_network
 from train.networks.blocks import PatternNet
+from train.networks.one_or_more import OneOrMoreNet
 
 _TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
@@ -58,7 +61,7 @@ Measured: .10 on the test set, .17 on recordings.
 INT8_EXTREME: Final = 0.75
 """On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
 FROZEN: Final = BUNDLE_DIR / "frozen.npz"
-READINGS: Final = ("test set", "recordings")
+READINGS: Final = ("test set", "one tap", "recordings")
 PASSES: Final = 1 + len(LEVELS)
 """Passes over all windows of a model: by torch, and at each level."""
 
@@ -128,6 +131,8 @@ def verify(
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
     if recordings is not None:
         groups["recordings"] = recorded_windows(recordings, contract)
+    if contract.takes_poses:  # a single tap may have a graph of its own
+        groups["one tap"] = groups["test set"][:, : len(AXES)]
     groups |= extreme_windows(contract)
     expected = {name: _run_torch(net, windows) for name, windows in groups.items()}
     on_pass()
@@ -194,6 +199,8 @@ def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints
         source = checkpoints / f"{path.stem.removesuffix(INT8_SUFFIX)}.pt"
         net, report = load_network(source)
         trained = report.get("training_sha256")
+        if branches(model) is not None:
+            net = OneOrMoreNet(load_network(checkpoints / f"{origin_of(model)[ONE_TAP]['name']}.pt")[0], net)
     else:
         source = in_float(path)
         if not source.exists():

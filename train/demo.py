@@ -1,22 +1,33 @@
-"""Recording of the demo: four taps of one surface, then a tap of another one among them, and a magnet coming near."""
+"""Recording of the demo: taps of one surface, a tap of another one among them, a magnet coming near, and a slide.
+
+The first four taps follow the paper's schedule. For each of them but the first there are options as well: taps at the
+poses that three proposals of half a pitch can lead to, of which an emulated robot plays those that are proposed.
+"""
 
 import math
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely import affinity
+from shapely.geometry.base import BaseGeometry
 
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 from train.data.dataset import between_frames
 from train.data.generation_config import SEED
 from train.physics.magnets import Magnet, dipole_mt
 from train.physics.resample import resample
-from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest
+from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest, jitter_poses
 from train.physics.simulated_sensor import FINE_SCALE, SimulatedSensor, Taps
+from train.physics.slides import FIGURE_MM, Slide, scaled, slide
 from train.surfaces.depth_image import Pose
-from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, position_mm
+from train.surfaces.paper_figures import figure
+from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, over_surface, position_mm
+from train.surfaces.tap_schedules import HALF_PITCH_MM
 
 SURFACE: Final = "S"
 FOREIGN: Final = "small circle"
@@ -38,14 +49,30 @@ MAGNET_COUNTS: Final = 900.0
 """Its largest count there, of any taxel and axis: half of that of the tap."""
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
+FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
+OPTIONS_MM: Final = HALF_PITCH_MM * np.array(
+    [(x, y) for y in range(1 - TAPS, TAPS) for x in range(1 - TAPS, TAPS)], dtype=np.float64
+)
+"""Places of the options in the first tap's axes: each tap may be proposed half a pitch from the one before."""
+LETTER: Final = "S"
+LETTER_WIDTH_MM: Final = 14.0
+"""Width of the long letter, which one lane of the pad covers."""
+LETTER_Y_MM: Final = 60.0
+"""Place of the long letter in the object's plane, so that it does not lie under the taps."""
+LETTER_PX_PER_MM: Final = 4.0
+STILL_FRAMES: Final = 30
+_SLIDE_SEED: Final = 500
+_SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
+"""The zero is a second old: no drift yet, and the pad has not moved in the earth's field."""
 
 
 def demo_recording() -> dict[str, NDArray]:
-    """Return four taps of one surface as a controller would send them, with the truth of every frame, and two scenes.
+    """Return the demo as a controller would send it, with the truth of every scored frame, and the robot's poses.
 
     The pad rests, then presses, holds and lifts four times, turned a step each time, at the held-out position. In the
-    scenes, which have no truth, another surface is tapped before the next tap of the first one; then a magnet comes
-    near the free pad, which is tapped meanwhile, and leaves.
+    scenes another surface is tapped before the next tap of the first one; then a magnet comes near the free pad, which
+    is tapped meanwhile, and leaves; then the pad slides over a long letter. Arrays `option_...` are of taps that may
+    take the place of those after the first.
     """
     sensor = SimulatedSensor()
     angles_deg = [ANGLE_DEG + step * ANGLE_STEP_DEG for step in range(1 - TAPS, 1)]
@@ -59,16 +86,22 @@ def demo_recording() -> dict[str, NDArray]:
     still = np.rint(rng.normal(0, Nuisances().noise_counts, (REST_FRAMES, *USPA44.scan_shape)))
     rest = draw_rest(rng, USPA44).round()
     magnet += rng.normal(0, Nuisances().noise_counts, magnet.shape)
-    parts = [still, *pressed, later[0], later[1], magnet.round()]
+    slid, letter = _slide()
+    after = np.rint(rng.normal(0, Nuisances().noise_counts, (STILL_FRAMES, *USPA44.scan_shape)))
+    parts = [still, *pressed, later[0], later[1], magnet.round(), slid.counts, after]
     counts = rest + np.concatenate(parts)
-    scene = np.repeat([-1] * (1 + TAPS) + [0, 0, 1], [len(part) for part in parts])
-    scene[-GAP_FRAMES:] = -1
+    scenes = [-1] * (1 + TAPS) + [FOREIGN_SCENE] * 2 + [MAGNET_SCENE, SLIDE_SCENE, -1]
+    lengths = [len(part) for part in parts]
+    scene = np.repeat(scenes, lengths)
+    begins = np.cumsum([0, *lengths])
+    scene[begins[-3] - GAP_FRAMES : begins[-3]] = -1
     shares = np.tile(_course(), (TAPS, 1))
     end_mm = taps.indentation_mm[:, -1]
     share = np.zeros(len(counts))
     share[REST_FRAMES : REST_FRAMES + shares.size] = shares.ravel()
     tap = np.zeros(len(counts), dtype=int)
     tap[REST_FRAMES : REST_FRAMES + shares.size] = np.repeat(np.arange(TAPS), TAP_FRAMES)
+    tapped = [_stated(0, 0, angles_deg[0] - angle) for angle in (*angles_deg, *later_deg[:3])]
     return {
         "format": np.array(NPZ_FORMAT),
         "version": np.array(NPZ_VERSION),
@@ -79,11 +112,73 @@ def demo_recording() -> dict[str, NDArray]:
         "counts": counts.astype(np.int32),
         "tap": np.where(share > 0, tap, -1),
         "indentation_mm": (share * end_mm[tap]).astype(np.float32),
-        "unit_patterns": (resample(taps.patterns[:, 0], FINE_SCALE, SCALE) / end_mm[:, None, None]).astype(np.float16),
+        "unit_patterns": _unit_patterns(taps),
         "surface": np.array(SURFACE),
         "angles_deg": np.array(angles_deg),
+        "tap_pose": np.array(tapped[:TAPS]),
         "scene": scene,
+        **_poses(tapped, slid, begins),
+        **_options(sensor, rest),
+        "letter": letter,
+        "letter_px_per_mm": np.array(LETTER_PX_PER_MM),
+        "letter_centre_mm": np.array((0.0, LETTER_Y_MM)),
     }
+
+
+def _stated(x_mm: float, y_mm: float, turn_deg: float) -> tuple[float, ...]:
+    """Return the numbers of a pose as the robot states it."""
+    return x_mm, y_mm, turn_deg, PLACE_ERROR_MM, TURN_ERROR_DEG
+
+
+def _poses(tapped: Sequence[tuple[float, ...]], slid: Slide, begins: NDArray[np.int64]) -> dict[str, NDArray]:
+    """Return the arrays of a recording that hold its poses: one before each tap, and one in each frame of the slide."""
+    before = begins[1 : 1 + len(tapped)] - GAP_FRAMES // 2
+    way = [_stated(pose.x_mm, pose.y_mm + LETTER_Y_MM, pose.turn_deg) for pose in slid.poses]
+    start, end = begins[-3], begins[-2]
+    frame = np.concatenate([before, np.arange(start, end), [end]])
+    holds = np.concatenate([np.ones(len(before), bool), np.zeros(len(way), bool), [True]])
+    return {
+        "pose_time_ns": (frame * 1e9 / RATE_HZ).astype(np.int64),
+        "pose": np.array([*tapped, *way, way[-1]]),
+        "pose_holds": holds,
+    }
+
+
+def _options(sensor: SimulatedSensor, rest: NDArray[np.float32]) -> dict[str, NDArray]:
+    """Return the taps that may be proposed; the pad is where the robot states, but for the usual error."""
+    first = Pose(*position_mm(TEST_POSITION), ANGLE_DEG + (1 - TAPS) * ANGLE_STEP_DEG)
+    wanted = [over_surface(first, float(x_mm), float(y_mm), 0.0) for x_mm, y_mm in OPTIONS_MM]
+    poses = jitter_poses(np.random.default_rng([SEED, 3]), wanted, Nuisances())
+    taps = sensor.tap([SURFACE] * len(poses), poses, FORCE_N)
+    course = _course()[:-GAP_FRAMES]
+    counts = between_frames(taps.counts, np.tile(course, (len(poses), 1)))
+    tap_s = len(course) / RATE_HZ
+    read = apply_nuisances(counts[None], _SENSOR, SEED, tap_s=tap_s)[0]
+    return {
+        "option_counts": (rest + read).astype(np.int32),
+        "option_pose": np.array([_stated(x_mm, y_mm, 0.0) for x_mm, y_mm in OPTIONS_MM.tolist()]),
+        "option_indentation_mm": (course * taps.indentation_mm[:, -1:]).astype(np.float32),
+        "option_unit_patterns": _unit_patterns(taps),
+    }
+
+
+def _slide() -> tuple[Slide, NDArray[np.bool_]]:
+    """Return a slide along a long letter that lies on its side, and the letter's pixels in the object's plane."""
+    lying = affinity.rotate(figure(LETTER), 90, origin=(0, 0))
+    left, low, right, high = lying.bounds
+    flat = LETTER_WIDTH_MM / FIGURE_MM * (right - left) / (high - low)
+    outline: BaseGeometry = scaled(affinity.scale(lying, 1, flat, origin=(0, 0)))
+    count = round((FIGURE_MM + USPA44.width_mm) * LETTER_PX_PER_MM)
+    middle = (np.arange(count) - (count - 1) / 2) / LETTER_PX_PER_MM
+    x_mm, y_mm = np.meshgrid(middle, middle)
+    pixels = shapely.contains_xy(outline, x_mm, y_mm)
+    return slide(outline, _SLIDE_SEED, spread=0.0, lanes_mm=(0.0,), nuisances=_SENSOR, sensor=SEED), pixels
+
+
+def _unit_patterns(taps: Taps) -> NDArray[np.float16]:
+    """Return the truth per indentation, (n, H, W)."""
+    fine = taps.patterns[:, 0] / taps.indentation_mm[:, -1, None, None]
+    return resample(fine, FINE_SCALE, SCALE).astype(np.float16)
 
 
 def _tap(sensor: SimulatedSensor, surfaces: list[str], angles_deg: Sequence[float]) -> Taps:
@@ -100,11 +195,9 @@ def _course() -> NDArray[np.float64]:
 
 def _read(taps: Taps, angles_deg: Sequence[float]) -> NDArray[np.float32]:
     """Return the readings (taps, frames, 3, rows, cols) of four taps, always by the same sensor."""
-    # The zero is a second old: no drift yet, and the pad has not moved in the earth's field.
-    nuisances = Nuisances().without("thermal_drift_counts", "earth_field_counts")
     counts = between_frames(taps.counts, np.tile(_course(), (TAPS, 1)))
     tap_s = TAP_FRAMES / RATE_HZ
-    return apply_nuisances(counts[None, ::-1], nuisances, SEED, tap_s=tap_s, angle_deg=angles_deg[::-1])[0, ::-1]
+    return apply_nuisances(counts[None, ::-1], _SENSOR, SEED, tap_s=tap_s, angle_deg=angles_deg[::-1])[0, ::-1]
 
 
 def _magnet() -> NDArray[np.float32]:

@@ -91,6 +91,14 @@ def by_surface(values: NDArray[np.float64], frozen: FrozenSet) -> dict[str, floa
     return {str(name): float(values[surface == name].mean()) for name in dict.fromkeys(frozen.surface.tolist())}
 
 
+def windows_of(frozen: FrozenSet, contract: Contract, given: int | None = None) -> NDArray[np.float32]:
+    """Return windows (n, taps, 3, rows, cols) in zeroed counts for a model, with the newest `given` taps or all.
+
+    One that takes poses takes windows of just these; for all others older taps are zero.
+    """
+    return frozen.windows(given if contract.takes_poses and given is not None else contract.taps, given)
+
+
 def infer_all(
     run: Callable[[NDArray[np.float32]], NDArray[np.float32]],
     contract: Contract,
@@ -105,5 +113,5 @@ def infer_all(
         frozen: the test set.
         given: number of taps in the window; older ones are zero.
     """
-    windows = frozen.windows(contract.taps, given)
+    windows = windows_of(frozen, contract, given)
     return np.stack([run(contract.scale_window(window)).copy() for window in windows])

@@ -5,7 +5,6 @@ return one value per pattern, shape (...). Equal maps give an infinite PSNR, an 
 both are constant or zero.
 """
 
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -100,12 +99,11 @@ def boundary_distance_mm(
     found = touched(np.asarray(pattern), level)
     if found.shape != touching.shape:
         raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
-    apart_px = _pixels_apart(*found.shape[1:])
     ours, theirs = _outlines(found), _outlines(touching)
     distance_px = np.zeros(len(found))
     for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
         if one.any() and other.any():
-            between = apart_px[np.ix_(np.flatnonzero(one), np.flatnonzero(other))]
+            between = _pixels_apart(one, other)
             distance_px[i] = (between.min(axis=0).mean() + between.min(axis=1).mean()) / 2
         elif one.any() or other.any():
             distance_px[i] = np.hypot(*found.shape[1:])
@@ -119,11 +117,10 @@ def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return touching & ~inside
 
 
-@lru_cache(maxsize=2)
-def _pixels_apart(height: int, width: int) -> NDArray[np.float32]:
-    """Return the distance between any two pixels of a map, (H W, H W), in pixels."""
-    rows, columns = np.divmod(np.arange(height * width, dtype=np.float32), width)
-    return np.hypot(rows[:, None] - rows, columns[:, None] - columns)
+def _pixels_apart(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the distance of every set pixel of a map from every one of another, in pixels."""
+    here, there = (np.argwhere(pixels).astype(np.float32) for pixels in (one, other))
+    return np.hypot(*(here[:, None] - there[None]).transpose(2, 0, 1))
 
 
 def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:

@@ -17,8 +17,8 @@ DEFAULT_MODEL: Final = "stsr-int8"
 object or the pad was not turned."""
 INT8_SUFFIX: Final = "-int8"
 """Suffix of the file name of an int8 model, next to that of the same network in float32."""
-DEMO_MODEL: Final = "mtsr4-int8"
-"""Model of the demo, whose taps are turned as it expects."""
+POSED_MODEL: Final = "mtsr7-int8"
+"""Default where poses of the pad come: it combines up to 7 taps, and gives for one alone what DEFAULT_MODEL gives."""
 
 
 def bundled_models() -> list[Path]:
@@ -42,7 +42,7 @@ def find_model(name: str | Path) -> Path:
     if int8 in {model.stem for model in bundled_models()}:
         raise ModelError(
             f"model '{name}' is in float32, which this installation lacks: take {int8}, "
-            "or install a checkout (pip install --editable .), which has all models"
+            "or install the wheel tactile-edge-sr-train as well, which has all models"
         )
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")

@@ -116,14 +116,14 @@ class Contract:
     pitch_mm: float
     arithmetic: str
     interval_factor: float | None
-    confidence: dict[str, dict[str, list[float]]]
+    confidence: dict[str, dict[str, list[float]]] = field(repr=False)
     training_sha256: str
     test_set_sha256: str
     test_error: dict[str, dict[str, float]]
     pad_inputs: tuple[tuple[str, float, float], ...] = ()
     takes_gains: bool = False
     traction_scale: int | None = None
-    trust: dict[str, Any] = field(default_factory=dict)
+    trust: dict[str, Any] = field(default_factory=dict, repr=False)
     interval_levels: dict[str, list[float]] = field(default_factory=dict)
     takes_poses: bool = False
     reach_mm: float = 0.0

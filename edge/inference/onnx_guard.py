@@ -1,7 +1,8 @@
 """Check of a model file before onnxruntime reads it: one plain graph with its own weights, of bounded size.
 
-onnxruntime follows a tensor into a side file below the model's folder, and a graph into graphs within it, which may
-run for ever. None of our models has either. The walk below covers the fields that lead to them and to the operators, of
+onnxruntime follows a tensor into a side file below the model's folder, which none of our models has, and a graph into
+graphs within it, which may run for ever. Only the two branches of an If may be such graphs, and they hold none
+themselves: one of the two is run once. The walk below covers the fields that lead to them and to the operators, of
 which only those of plain networks are allowed. It skips all else, weights among it, and refuses what it does not
 understand, since onnxruntime might read what passed unchecked.
 
@@ -28,7 +29,7 @@ _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
 ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
 Gather GatherElements Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GridSample GroupNormalization
-HardSigmoid HardSwish Identity InstanceNormalization LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
+HardSigmoid HardSwish Identity If InstanceNormalization LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
 MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg Not Or PRelu Pad Pow QLinearConv QLinearMatMul QuantizeLinear
 Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Relu Reshape Resize Round Selu Shape
 Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile Transpose Unsqueeze
@@ -36,7 +37,7 @@ Where
 """
 OPERATORS: Final = frozenset(_NAMES.split())
 """Operators that are allowed: of the exported models, of the networks that they are compared with, and of similar ones.
-No control flow, no recurrence, nothing random, no text. docs/formats.md lists them too."""
+No loop, no recurrence, nothing random, no text. docs/formats.md lists them too."""
 ONNX_DOMAINS: Final = ("", "ai.onnx")
 """Both names of the standard operators; other domains belong to a vendor or to the file itself."""
 _LONGEST_NAME: Final = 40
@@ -47,7 +48,7 @@ _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
 
 _SIDE_FILE: Final = "keeps its weights in a side file, expected one file"
-_NESTED: Final = "has graphs within its graph, expected one plain graph"
+_NESTED: Final = "has graphs within its graph, expected one plain graph, or the branches of an If"
 _BROKEN: Final = "not a model that onnxruntime can load: damaged, or not an ONNX file"
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
@@ -58,7 +59,10 @@ _LOCATION: Final = 14
 _OPERATOR: Final = 4
 _DOMAIN: Final = 7
 _TENSOR: Final[_Message] = {13: _SIDE_FILE}
-_ATTRIBUTE: Final[_Message] = {5: _TENSOR, 6: _NESTED, 10: _TENSOR, 11: _NESTED, 22: _SPARSE, 23: _SPARSE}
+_IN_BRANCH: Final[_Message] = {5: _TENSOR, 6: _NESTED, 10: _TENSOR, 11: _NESTED, 22: _SPARSE, 23: _SPARSE}
+_BRANCH_NODE: Final[_Message] = {5: _IN_BRANCH}
+_BRANCH: Final[_Message] = {1: _BRANCH_NODE, 5: _TENSOR, 15: _SPARSE}
+_ATTRIBUTE: Final[_Message] = {**_IN_BRANCH, 6: _BRANCH}
 _NODE: Final[_Message] = {5: _ATTRIBUTE}
 _GRAPH: Final[_Message] = {1: _NODE, 5: _TENSOR, 15: _SPARSE}
 _MODEL: Final[_Message] = {7: _GRAPH, 20: _NESTED, 25: _NESTED}
@@ -102,7 +106,7 @@ def check_plain(content: bytes) -> None:
     fields = nodes = 0
     while waiting:
         message, start, end = waiting.pop()
-        nodes += message is _NODE
+        nodes += message is _NODE or message is _BRANCH_NODE
         if nodes > MOST_NODES:
             raise ModelError(f"has more than {MOST_NODES} operators, expected a smaller graph")
         dims: list[int] = []
@@ -120,7 +124,7 @@ def check_plain(content: bytes) -> None:
                     raise ModelError(_SIDE_FILE)
                 if field.number == _DIMS:
                     dims += _dims(content, field)
-            if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
+            if (message is _NODE or message is _BRANCH_NODE) and field.number in (_OPERATOR, _DOMAIN):
                 _check_operator(field.number, content[field.start : field.end])
         # Four bits are the least that an element takes.
         if dims and (len(dims) > MOST_DIMS or prod(dims) > 2 * len(content)):

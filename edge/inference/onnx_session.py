@@ -3,7 +3,7 @@
 import os
 import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,15 +13,9 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright: ignore[reportAttributeAccessIssue]
 
 from edge.errors import ModelError, WindowError
+from edge.inference.bound_run import BoundRun, Outputs
 from edge.inference.contract import (
     ANY_BATCH,
-    ANY_TAPS,
-    DEVIATION_NAME,
-    INPUT_NAME,
-    OUTPUT_NAME,
-    PAD_NAME,
-    POSES_NAME,
-    TRACTION_NAME,
     Contract,
 )
 from edge.inference.onnx_guard import read_model
@@ -42,6 +36,8 @@ _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
 """Pattern of a function's file, line and signature."""
+_NEWER: Final = re.compile(r"IR version: \d+|Opset \d+(?= is under development)")
+"""Pattern of the version in the messages on a file of a later format or operator set."""
 ORT_ERRORS: Final = (
     ort_errors.EPFail,
     ort_errors.Fail,
@@ -104,13 +100,19 @@ class ModelSession:
             raise ModelError(f"{path}: {error}") from error
         except UnicodeDecodeError as error:
             raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
-        self._runs: dict[tuple[int, int], _Run] = {}
+        self._runs: dict[tuple[int, int], BoundRun] = {}
         self._options = onnxruntime.RunOptions()
+        # onnxruntime looks this entry up at every run, and where it is missing throws and catches an exception.
+        self._options.add_run_config_entry("gpu_graph_id", "-1")
         self.deviation: NDArray[np.float32] | None = None
         self.traction: NDArray[np.float32] | None = None
         self._shape = (self.contract.taps, 3, self.contract.rows, self.contract.cols)
         self._unknown_pad = self.contract.pad_row(None)
         within_limit(self._warm_up, path, stop, give_up=self._end_run)
+
+    def __repr__(self) -> str:
+        taps, shape = self.contract.taps, self.contract.pattern_shape
+        return f"<ModelSession {self.name}: {taps} tap{'s' * (taps > 1)} to {shape} {self.contract.output_unit}>"
 
     def run(
         self,
@@ -152,7 +154,8 @@ class ModelSession:
     ) -> NDArray[np.float32]:
         """Infer the patterns of several windows in one call; see `run`.
 
-        A graph of one window a run is called once for each. With poses, windows may have different numbers of taps.
+        A graph of one window a run is called once for each. With poses, windows may have different numbers of taps;
+        those of a single tap are a call of their own, because a model may have a graph of its own for them.
 
         Args:
             windows: one or more, of different sensors.
@@ -164,30 +167,17 @@ class ModelSession:
         """
         for window in windows:
             self._check_window(window)
-        count = len(windows)
-        pads = [self._unknown_pad] * count if pads is None else pads
+        pads = [self._unknown_pad] * len(windows) if pads is None else pads
         for pad in pads:
             if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
                 expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
                 raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
         if not self.contract.takes_poses and poses is not None:
             raise WindowError(f"poses are given, but model '{self.name}' takes none: leave them out")
-        run = self._run_of(count, max(map(len, windows)))
-        for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
-            if run.poses is None:
-                run.window[index] = window.reshape(run.window.shape[1:])
-            else:
-                rows = self._scheduled(window) if poses is None else poses[index]
-                _check_poses(rows, len(window))
-                run.put(index, window, rows)
-            if run.pad is not None:
-                run.pad[index] = pad
-        try:
-            for binding in run.bindings:
-                self._session.run_with_iobinding(binding, self._options)
-        except ORT_ERRORS as error:
-            raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
-        pattern, self.deviation, self.traction = run.pattern, run.deviation, run.traction
+        if not self.contract.takes_poses:
+            pattern, self.deviation, self.traction = self._called(windows, pads).outputs
+        else:
+            pattern, self.deviation, self.traction = self._with_poses(windows, pads, poses)
         if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
         if self.traction is not None and not np.isfinite(self.traction).all():
@@ -197,6 +187,57 @@ class ModelSession:
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
         return pattern
+
+    def _with_poses(
+        self,
+        windows: Sequence[NDArray[np.float32]],
+        pads: Sequence[NDArray[np.float32]],
+        poses: Sequence[NDArray[np.float32]] | None,
+    ) -> Outputs:
+        rows = [self._scheduled(window) for window in windows] if poses is None else poses
+        for window, row in zip(windows, rows, strict=True):
+            _check_poses(row, len(window))
+        present = [_present(window) for window in windows]
+        groups = [[index for index, taps in enumerate(present) if (taps == 1) is alone] for alone in (True, False)]
+        found = [
+            self._called(
+                [windows[index][: present[index]] for index in group],
+                [pads[index] for index in group],
+                [rows[index][: present[index]] for index in group],
+            ).outputs
+            for group in groups
+            if group
+        ]
+        if len(found) == 1:
+            return found[0]
+        order = np.argsort(np.concatenate(groups))
+        pattern, deviation, traction = (
+            None if any(part is None for part in parts) else np.concatenate(parts)[order]
+            for parts in zip(*found, strict=True)
+        )
+        return pattern, deviation, traction  # pyright: ignore[reportReturnType]  # every run has patterns
+
+    def _called(
+        self,
+        windows: Sequence[NDArray[np.float32]],
+        pads: Sequence[NDArray[np.float32]],
+        poses: Sequence[NDArray[np.float32]] | None = None,
+    ) -> BoundRun:
+        """Return the arrays of a run, in which the outputs of these windows are now."""
+        run = self._run_of(len(windows), max(map(len, windows)))
+        for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
+            if poses is None:
+                run.window[index] = window.reshape(run.window.shape[1:])
+            else:
+                run.put(index, window, poses[index])
+            if run.pad is not None:
+                run.pad[index] = pad
+        try:
+            for binding in run.bindings:
+                self._session.run_with_iobinding(binding, self._options)
+        except ORT_ERRORS as error:
+            raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
+        return run
 
     def _check_window(self, window: NDArray[np.float32]) -> None:
         shape, expected = window.shape, str(self._shape)
@@ -215,13 +256,13 @@ class ModelSession:
         rows[~window.any(axis=(1, 2, 3))] = 0
         return rows
 
-    def _run_of(self, count: int, taps: int) -> "_Run":
+    def _run_of(self, count: int, taps: int) -> BoundRun:
         """Return the arrays for so many windows and taps; those that were made first are given up for new ones."""
         run = self._runs.get((count, taps))
         if run is None:
             if len(self._runs) >= MOST_RUNS:
                 del self._runs[next(iter(self._runs))]
-            run = self._runs[count, taps] = _Run(self._session, self.contract, count, taps)
+            run = self._runs[count, taps] = BoundRun(self._session, self.contract, count, taps)
         return run
 
     def _warm_up(self) -> None:
@@ -233,41 +274,12 @@ class ModelSession:
         self._options.terminate = True  # checked before each operator
 
 
-class _Run:
-    """Arrays for so many windows of so many taps, and what binds them to a session."""
-
-    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int, taps: int) -> None:
-        inputs, outputs = (
-            {
-                name: np.zeros([count, *(taps if size == ANY_TAPS else size for size in shape[1:])], dtype=np.float32)
-                for name, shape in shapes.items()
-            }
-            for shapes in (contract.input_shapes, contract.output_shapes)
-        )
-        at_once = count if contract.batch == ANY_BATCH else 1
-        self.bindings = [session.io_binding() for _ in range(0, count, at_once)]
-        for index, binding in enumerate(self.bindings):
-            part = slice(index * at_once, (index + 1) * at_once)
-            for name, given in inputs.items():
-                _bind(binding.bind_input, name, given[part])
-            for name, output in outputs.items():
-                _bind(binding.bind_output, name, output[part])
-        for output in outputs.values():
-            output.setflags(write=False)
-        self.window = inputs[INPUT_NAME]
-        self.poses = inputs.get(POSES_NAME)
-        self.pad = inputs.get(PAD_NAME)
-        self.pattern = outputs[OUTPUT_NAME]
-        self.deviation = outputs.get(DEVIATION_NAME)
-        self.traction = outputs.get(TRACTION_NAME)
-
-    def put(self, index: int, window: NDArray[np.float32], poses: NDArray[np.float32]) -> None:
-        """Put in a window with poses; absent taps are zeros."""
-        if self.poses is None:
-            raise ValueError("the model takes no poses")
-        taps = len(window)
-        self.window[index, :taps], self.window[index, taps:] = window, 0
-        self.poses[index, :taps], self.poses[index, taps:] = poses, 0
+def _present(window: NDArray[np.float32]) -> int:
+    """Return the number of taps of a window up to its last one that is not all zeros, at least 1."""
+    taps = len(window)
+    while taps > 1 and not window[taps - 1].any():
+        taps -= 1
+    return taps
 
 
 def _check_poses(poses: NDArray[np.float32], taps: int) -> None:
@@ -280,10 +292,6 @@ def _check_poses(poses: NDArray[np.float32], taps: int) -> None:
         raise WindowError(
             f"the newest tap's pose is {poses[0].tolist()}, expected zeros: give poses as that tap sees them"
         )
-
-
-def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
-    bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
 
 
 def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
@@ -326,7 +334,18 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
     try:
         return within_limit(load, path, stop)
     except ORT_ERRORS as error:
-        raise ModelError(f"{path}: not a model that onnxruntime can load: {_reason(error)}") from error
+        raise ModelError(f"{path}: not a model that onnxruntime can load: {_load_reason(error)}") from error
+
+
+def _load_reason(error: Exception) -> str:
+    reason = _reason(error)
+    made = _NEWER.search(reason)
+    if made is None:
+        return reason
+    return (
+        f"it is of a newer ONNX, {' '.join(made[0].split())}, than onnxruntime {onnxruntime.__version__} reads: export "
+        "it again with python -m export.to_onnx, or install a newer onnxruntime"
+    )
 
 
 def _reason(error: Exception) -> str:

@@ -17,11 +17,15 @@ from onnx import numpy_helper
 from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import Contract
 from export.errors import ExportError
+from export.graphs.joined import branches
 from train.networks.blocks import PatternNet
+from train.networks.one_or_more import OneOrMoreNet
 from train.networks.registry import build
 from train.networks.symmetric import write_out
 
 ORIGIN_KEY: Final = "tactile.origin"
+ONE_TAP: Final = "one_tap"
+"""Key of the origin of a graph's branch for a single tap, with the name of that model."""
 
 
 def contract_in(model: onnx.ModelProto) -> Contract:
@@ -44,6 +48,7 @@ def origin(report: Mapping[str, Any]) -> dict[str, str]:
     Fine-tuning for int8 changes the weights, and so makes another network.
     """
     stated = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
+    stated |= {ONE_TAP: report[ONE_TAP]} if ONE_TAP in report else {}
     return {ORIGIN_KEY: json.dumps(stated, sort_keys=True)}
 
 
@@ -65,10 +70,21 @@ def network_of(model: onnx.ModelProto) -> PatternNet:
     Raises:
         ExportError: the graph does not identify its network, or lacks its weights.
     """
-    made = origin_of(model)
+    made, parts = origin_of(model), branches(model)
+    if parts is None:
+        return _restored(made, model.graph)
+    if ONE_TAP not in made:
+        raise ExportError(
+            f"the graph has a branch for a single tap, but '{ORIGIN_KEY}' no '{ONE_TAP}': export it again"
+        )
+    one, more = parts
+    return OneOrMoreNet(_restored(made[ONE_TAP], one), _restored(made, more)).eval()
+
+
+def _restored(made: Mapping[str, Any], graph: onnx.GraphProto) -> PatternNet:
     net = build(made["network"], made["scale"], **made["options"])
     write_out(net)
-    held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in model.graph.initializer}
+    held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in graph.initializer}
     lacking = [name for name in net.state_dict() if name not in held]
     if lacking:
         raise ExportError(

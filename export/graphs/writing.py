@@ -4,16 +4,20 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import onnx
 
 from edge.evaluation.evaluate import judge_model, mean_error
 from edge.evaluation.test_set import FrozenSet
+from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.progress_bar import tracked
-from export.graphs.reference import origin
+from export.errors import ExportError
+from export.graphs.joined import joined, with_one_tap
+from export.graphs.reference import ONE_TAP, contract_in, origin, origin_of
 from firmware_bridge.in_place import write_in_place
 from train.learning.expected_error_table import fit_confidence
 from train.learning.trust_limits import TrustFit
@@ -32,6 +36,8 @@ class Writer:
         validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
         report: of the checkpoint.
         trust: forward model and checks, for models of the pad that they were fitted for; None for none.
+        one_tap: name of the model in `folder` that infers single taps for one that takes poses; None for the network
+            itself.
     """
 
     folder: Path
@@ -39,12 +45,27 @@ class Writer:
     validation: Sequence[FrozenSet]
     report: Mapping[str, Any]
     trust: TrustFit | None = None
+    one_tap: str | None = None
 
     def error(self, single: onnx.ModelProto, contract: Contract) -> dict[str, float]:
-        """Return the mean errors of a graph of a batch of one with all taps; empty if it is not evaluated."""
+        """Return the mean errors of a graph of one window or any number, with all taps; empty if it is not judged."""
         if contract.scale != self.frozen.scale:
             return {}
-        return mean_error(judge_model(self._session("judged", single, replace(contract, batch=1)), self.frozen))
+        return mean_error(judge_model(self._session("judged", single, contract), self.frozen))
+
+    def model_of_one_tap(self, arithmetic: str) -> onnx.ModelProto:
+        """Return the model that infers single taps.
+
+        Raises:
+            ExportError: it cannot be read.
+        """
+        path = self.folder / f"{self.one_tap}{INT8_SUFFIX if arithmetic == 'int8' else ''}.onnx"
+        try:
+            return onnx.load(path)
+        except OSError as error:
+            raise ExportError(
+                f"{path}: {error.strerror}: export the model for single taps to this folder first"
+            ) from error
 
     def write(
         self, name: str, model: onnx.ModelProto, single: onnx.ModelProto, contract: Contract, facts: Sequence[str]
@@ -54,10 +75,18 @@ class Writer:
         Args:
             name: of the model.
             model: its graph.
-            single: the same graph for a batch of one.
+            single: the same graph for a batch of one or of any number.
             contract: with empty error and confidence, which are filled in.
             facts: further parts of the line.
+
+        Raises:
+            ExportError: the model of one tap is missing, or its patterns mean something else.
         """
+        stated = {**self.report, "training_sha256": contract.training_sha256}
+        if self.one_tap is not None and contract.takes_poses:
+            one = self.model_of_one_tap(contract.arithmetic)
+            stated[ONE_TAP] = origin_of(one) | {"name": self.one_tap}
+            model, contract = joined(one, model), with_one_tap(contract, contract_in(one))
         # The evaluated graph is the written one wherever the runtime can run it.
         session = self._session(name, model if contract.batch == ANY_BATCH else single, contract)
         parts = [f"x{contract.scale}"]
@@ -75,7 +104,7 @@ class Writer:
             contract.confidence.update(fit_confidence(session, fitting))
         if self.trust is not None and contract.pad_inputs and contract.traction_scale:
             contract.trust.update(self.trust.of(session).to_json())
-        content = self._bytes(model, contract)
+        content = _content(model, contract, origin(stated))
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
         write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
         return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*parts, *facts])}"
@@ -84,14 +113,13 @@ class Writer:
         with tempfile.TemporaryDirectory() as drafts:
             draft = Path(drafts) / f"{name}.onnx"
             batch = contract.batch if contract.batch == ANY_BATCH else 1
-            draft.write_bytes(self._bytes(single, replace(contract, batch=batch)))
+            draft.write_bytes(_content(single, replace(contract, batch=batch)))
             return ModelSession(draft)
 
-    def _bytes(self, model: onnx.ModelProto, contract: Contract) -> bytes:
-        """Return the file's content, the same for the same model and contract."""
-        del model.metadata_props[:]
-        for key, value in (
-            contract.to_metadata() | origin({**self.report, "training_sha256": contract.training_sha256})
-        ).items():
-            model.metadata_props.add(key=key, value=value)
-        return model.SerializeToString(deterministic=True)
+
+def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, str] = MappingProxyType({})) -> bytes:
+    """Return a file's content, the same for the same model, contract and further metadata."""
+    del model.metadata_props[:]
+    for key, value in {**contract.to_metadata(), **stated}.items():
+        model.metadata_props.add(key=key, value=value)
+    return model.SerializeToString(deterministic=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet
@@ -124,8 +125,8 @@ class Quantised:
 
     Attributes:
         net: network with the same weights, in float.
-        model: its graph in float, of a batch of one.
-        integers: its graph in int8, of a batch of one.
+        model: its graph in float.
+        integers: its graph in int8.
         trained_on: True if the weights were fine-tuned.
         said: summary of the fine-tuning and its gain; empty without fine-tuning.
     """
@@ -139,6 +140,7 @@ class Quantised:
 
 def quantised_well(
     net: PatternNet,
+    model: onnx.ModelProto,
     geometry: SensorGeometry,
     seen: Batch,
     sequences: Sequences | PressSet,
@@ -146,6 +148,7 @@ def quantised_well(
     most_loss_db: float,
     *,
     every: bool = False,
+    beyond: NDArray[np.float32] | None = None,
 ) -> Quantised:
     """Quantise a network; fine-tune it where int8 costs more than `most_loss_db` in validation, or always.
 
@@ -153,19 +156,22 @@ def quantised_well(
 
     Args:
         net: without batch normalisation, see `export.quantisation.rounding.folded`.
+        model: its graph in float.
         geometry: of the sensor.
         seen: of which ranges are taken, see `export.quantisation.int8.quantised`.
         sequences: training taps.
         tuning: settings of the fine-tuning, or None for no fine-tuning.
         most_loss_db: largest accepted loss by int8, in [dB].
         every: quantise all convolutions.
+        beyond: windows that widen the ranges, see `export.quantisation.int8.quantised`.
 
     Raises:
         ExportError: no node of the graph can be quantised.
         DivergedError: the learning rate is too high.
     """
-    model = to_model(net, geometry)
-    plain = Quantised(net, model, quantised(model, seen, every=every))
+    length = model.graph.input[0].type.tensor_type.shape.dim[0]
+    batch = length.dim_param or length.dim_value
+    plain = Quantised(net, model, quantised(model, seen, every=every, beyond=beyond))
     if tuning is None:
         return plain
     validation = tuning.validation
@@ -175,14 +181,14 @@ def quantised_well(
         return plain
     recipe = tuning.recipe(net.taps)
     other = fine_tuned(net, model, plain.integers, sequences, recipe, tuning.seed)
-    integers = quantised(to_model(other, geometry), seen, every=every)
+    integers = quantised(to_model(other, geometry, batch), seen, every=every, beyond=beyond)
     now_db = in_float_db - graph_psnr_db(integers, net.taps, validation)
     comparison = f"fine-tuned {tuning.steps} steps: before {before_db:.3f} dB lost in validation, now {now_db:.3f}"
     if now_db >= before_db:
         return replace(plain, said=f"{comparison}, so not used")
     other = recalibrated(other, integers, validation)
-    model = to_model(other, geometry)
-    return Quantised(other, model, quantised(model, seen, every=every), trained_on=True, said=comparison)
+    model = to_model(other, geometry, batch)
+    return Quantised(other, model, quantised(model, seen, every=every, beyond=beyond), trained_on=True, said=comparison)
 
 
 def graph_psnr_db(model: onnx.ModelProto, taps: int, validation: FrozenSet) -> float:

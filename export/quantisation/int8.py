@@ -1,15 +1,14 @@
 """Graphs in 8-bit integers: unsigned activations, signed weights with a scale for each channel, float in and out.
 
-Only layers that take most of the time are quantised: the convolutions of the largest grid except for those of the
-outputs. Those of smaller grids, which read the taxels, stay in float: they take a tenth of the time, and no later layer
-recovers their losses (docs/log.md).
+Ranges are percentiles over training taps. For a network that takes poses they are widened to what windows beyond any
+touch give: its layers exchange values between taps, which such windows take far out of every range.
 """
 
 import contextlib
 import io
 import logging
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -19,12 +18,16 @@ import onnx
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from onnx import NodeProto
+from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
 from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
+from edge.inference.pose_input import scheduled_rows
 from export.errors import ExportError
+from export.graphs.joined import branches
+from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, takes_poses
+from export.quantisation.rounding import MOST_VALUE
 from firmware_bridge.pad_geometry import AXES
 from train.data.batch import Batch
 from train.data.batches import Draw
@@ -32,16 +35,13 @@ from train.data.dataset import Sequences
 from train.data.presses import PressSet
 from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
+from train.surfaces.poses import ANGLE_STEP_DEG
 
 _PERCENTILE: Final = 99.999
 """Percentage of a layer's values within its range; larger values are cut.
 
 With the whole range the bundled models lose .03 to .07 dB more, because a few large values make all steps coarser.
 """
-_PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
-"""Operations that are quantised if any or all of their inputs are."""
-
-
 _CALIBRATED_ON: Final = 512
 _FEWEST: Final = 32
 _SET_FORCE_N: Final = (0.3, 8.0)
@@ -84,13 +84,16 @@ class _Inputs(CalibrationDataReader):
         return next(self._left, None)
 
 
-def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> onnx.ModelProto:
+def quantised(
+    model: onnx.ModelProto, seen: Batch, *, every: bool = False, beyond: NDArray[np.float32] | None = None
+) -> onnx.ModelProto:
     """Return the graph with quantise and dequantise nodes around all nodes that may be quantised.
 
     Args:
         model: in float.
         seen: batch from which the ranges are measured, light contacts included.
         every: quantise all convolutions, not only the expensive ones.
+        beyond: windows (n, 3K, rows, cols) that widen the ranges to their own; None for none.
 
     Raises:
         ExportError: no node of the graph may be quantised.
@@ -98,45 +101,69 @@ def quantised(model: onnx.ModelProto, seen: Batch, *, every: bool = False) -> on
     nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
     if not nodes:
         raise ExportError("no convolution of the graph may be quantised: export it without --int8")
-    inputs = {INPUT_NAME: seen.window.numpy()}
-    if seen.poses is not None:
-        inputs[INPUT_NAME] = seen.window.unflatten(1, (-1, len(AXES))).numpy()
-        inputs[POSES_NAME] = seen.poses.numpy()
-    if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
-        inputs[PAD_NAME] = seen.pad.numpy()
+    touches = _Inputs(_inputs(model, seen), batch)
+    if beyond is None:
+        return _quantised(model, nodes, touches)
+    poses = torch.from_numpy(scheduled_rows(beyond.shape[1] // len(AXES), ANGLE_STEP_DEG))
+    windows = torch.from_numpy(beyond)
+    pads = None if seen.pad is None else seen.pad.new_zeros(len(beyond), seen.pad.shape[1])
+    far = replace(seen, window=windows, pad=pads, poses=poses.expand(len(beyond), -1, -1).contiguous())
+    whole = _quantised(model, nodes, _Inputs(_inputs(model, far), batch), CalibrationMethod.MinMax)
+    ranges = rounded_ranges(_quantised(model, nodes, touches))
+    for name, (low, high) in rounded_ranges(whole).items():
+        ranges[name] = (min(low, ranges[name][0]), max(high, ranges[name][1]))
+    return _quantised(model, nodes, _Inputs(_inputs(model, far), batch), CalibrationMethod.MinMax, ranges)
+
+
+def _quantised(
+    model: onnx.ModelProto,
+    nodes: list[str],
+    windows: CalibrationDataReader,
+    method: CalibrationMethod = CalibrationMethod.Percentile,
+    ranges: dict[str, tuple[np.float32, np.float32]] | None = None,
+) -> onnx.ModelProto:
+    """Return the graph with some nodes quantised, with the ranges that windows give or those that are given."""
+    given = {name: [{"rmin": low, "rmax": high}] for name, (low, high) in (ranges or {}).items()}
     with tempfile.TemporaryDirectory() as drafts, _quiet():
         path = Path(drafts) / "int8.onnx"
         quantize_static(
             onnx.ModelProto.FromString(model.SerializeToString()),
             path,
-            _Inputs(inputs, batch),
+            windows,
             quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             per_channel=True,
-            op_types_to_quantize=["Conv", *_PASSING_ON],
+            op_types_to_quantize=["Conv", *PASSING_ON],
             nodes_to_quantize=nodes,
-            calibrate_method=CalibrationMethod.Percentile,
-            extra_options={"CalibPercentile": _PERCENTILE},
+            calibrate_method=method,
+            extra_options={"CalibPercentile": _PERCENTILE, "TensorQuantOverrides": given},
         )
         integers = onnx.load(path)
     onnx.checker.check_model(integers, full_check=True)
     return integers
 
 
-def integer_nodes(model: onnx.ModelProto, *, every: bool = False) -> list[str]:
-    """Return the names of the nodes to quantise, in the graph's order; `every`: with all convolutions."""
-    shapes = _shapes(model)
-    made_by = {name: node for node in model.graph.node for name in node.output}
-    convs = [node for node in model.graph.node if node.op_type == "Conv"]
-    largest = max((_pixels(shapes, node) for node in convs), default=0)
-    last = _last_convolutions(model, made_by)
-    chosen = {node.name for node in convs if every or (_pixels(shapes, node) == largest and node.name not in last)}
-    for node in model.graph.node:  # every node comes after those of its inputs
-        takes = [made_by[name].name for name in node.input if name in made_by]
-        if takes and _PASSING_ON.get(node.op_type, _never)(name in chosen for name in takes):
-            chosen.add(node.name)
-    return [node.name for node in model.graph.node if node.name in chosen]
+def _inputs(model: onnx.ModelProto, seen: Batch) -> dict[str, NDArray[np.float32]]:
+    """Return the inputs of a graph for a batch, by name."""
+    inputs = {INPUT_NAME: seen.window.numpy()}
+    if takes_poses(model) and seen.poses is not None:
+        inputs[INPUT_NAME] = seen.window.unflatten(1, (-1, len(AXES))).numpy()
+        inputs[POSES_NAME] = seen.poses.numpy()
+    if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
+        inputs[PAD_NAME] = seen.pad.numpy()
+    return inputs
+
+
+def rounded_ranges(integers: onnx.ModelProto) -> dict[str, tuple[np.float32, np.float32]]:
+    """Return the range of every value that a quantised graph rounds, by its name in the graph in float."""
+    held = {weight.name: weight for weight in integers.graph.initializer}
+    found: dict[str, tuple[np.float32, np.float32]] = {}
+    for node in integers.graph.node:
+        if node.op_type == "QuantizeLinear":
+            scale, zero = (np.float32(numpy_helper.to_array(held[name])) for name in node.input[1:3])
+            found[node.input[0]] = (scale * -zero, scale * (MOST_VALUE - zero))
+    return found
 
 
 def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
@@ -147,39 +174,10 @@ def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
         options.log_severity_level = LOG_FATAL_ONLY
         options.optimized_model_filepath = str(path)
         onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-        kinds = [node.op_type for node in onnx.load(path).graph.node if "Conv" in node.op_type]
+        optimised = onnx.load(path)
+    nodes = [node for graph in branches(optimised) or [optimised.graph] for node in graph.node]
+    kinds = [node.op_type for node in nodes if "Conv" in node.op_type]
     return kinds.count("QLinearConv"), len(kinds)
-
-
-def _never(_: Iterable[bool]) -> bool:
-    return False
-
-
-def _last_convolutions(model: onnx.ModelProto, made_by: dict[str, NodeProto]) -> set[str]:
-    """Return the convolutions from which an output is computed without another convolution or a Gemm in between."""
-    found, behind = set(), [value.name for value in model.graph.output]
-    while behind:
-        node = made_by.get(behind.pop())
-        if node is None:
-            continue
-        if node.op_type == "Conv":
-            found.add(node.name)
-        elif node.op_type != "Gemm":  # a layer of its own, which sees what convolutions made
-            behind += node.input
-    return found
-
-
-def _shapes(model: onnx.ModelProto) -> dict[str, list[int]]:
-    inferred = onnx.shape_inference.infer_shapes(model)
-    return {
-        value.name: [length.dim_value for length in value.type.tensor_type.shape.dim]
-        for value in (*inferred.graph.value_info, *inferred.graph.output)
-    }
-
-
-def _pixels(shapes: dict[str, list[int]], node: NodeProto) -> int:
-    height, width = shapes[node.output[0]][-2:]
-    return height * width
 
 
 @contextlib.contextmanager

@@ -23,7 +23,7 @@ from train.networks.compact import CompactNet
 from train.networks.symmetric import SymmetricResidual, write_out
 
 _MOST_WEIGHT: Final = 127
-_MOST_VALUE: Final = 255
+MOST_VALUE: Final = 255
 _TINY: Final = 1e-30
 """Least weight of a channel, so that a channel of zeros has a scale as well."""
 
@@ -37,7 +37,7 @@ class Grid:
 
     def __call__(self, values: Tensor) -> Tensor:
         """Round values of any shape to the grid."""
-        return torch.fake_quantize_per_tensor_affine(values, self.scale, self.zero_point, 0, _MOST_VALUE)
+        return torch.fake_quantize_per_tensor_affine(values, self.scale, self.zero_point, 0, MOST_VALUE)
 
 
 @dataclass(frozen=True, slots=True)

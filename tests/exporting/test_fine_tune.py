@@ -14,7 +14,8 @@ from export.errors import ExportError
 from export.graphs.graph import outputs, to_model
 from export.graphs.parity import GraphRun
 from export.quantisation.fine_tune import FineTuning, fine_tuned, graph_psnr_db, quantised_well, recalibrated
-from export.quantisation.int8 import integer_nodes, quantised
+from export.quantisation.int8 import quantised
+from export.quantisation.integer_nodes import integer_nodes
 from export.quantisation.rounding import folded, integer_convolutions, rounded
 from firmware_bridge.pad_geometry import USPA44
 from train.data.batch import Batch
@@ -148,7 +149,7 @@ def test_fine_tuning_wins_back_what_rounding_loses(hostile, hostile_graphs, taps
     validation = tuning.validation
     in_float_db = graph_psnr_db(model, 1, validation)
     before_db = in_float_db - graph_psnr_db(integers, 1, validation)
-    done = quantised_well(hostile, USPA44, seen, taps, tuning, before_db - 1e-6)
+    done = quantised_well(hostile, model, USPA44, seen, taps, tuning, before_db - 1e-6)
     now_db = in_float_db - graph_psnr_db(done.integers, 1, validation)
     assert done.trained_on and now_db < before_db
     assert done.said == f"fine-tuned {STEPS} steps: before {before_db:.3f} dB lost in validation, now {now_db:.3f}"
@@ -157,17 +158,17 @@ def test_fine_tuning_wins_back_what_rounding_loses(hostile, hostile_graphs, taps
 
 
 def test_what_costs_little_is_left_as_it_is(hostile, hostile_graphs, taps, tuning):
-    _, integers, seen = hostile_graphs
+    model, integers, seen = hostile_graphs
     for allowed_db, way in ((100.0, tuning), (-100.0, None)):
-        done = quantised_well(hostile, USPA44, seen, taps, way, allowed_db)
+        done = quantised_well(hostile, model, USPA44, seen, taps, way, allowed_db)
         assert done.net is hostile and not done.trained_on and not done.said
         assert done.integers.SerializeToString() == integers.SerializeToString()
 
 
 def test_weights_that_are_no_better_are_not_taken(hostile, hostile_graphs, taps, tuning):
-    _, integers, seen = hostile_graphs
+    model, integers, seen = hostile_graphs
     bad = replace(tuning, steps=3, learning_rate=1.0)
-    done = quantised_well(hostile, USPA44, seen, taps, bad, -100.0)
+    done = quantised_well(hostile, model, USPA44, seen, taps, bad, -100.0)
     assert done.net is hostile and not done.trained_on and done.said.endswith(", so not used")
     assert done.integers.SerializeToString() == integers.SerializeToString()
 

@@ -13,7 +13,8 @@ from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
 from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun
-from export.quantisation.int8 import calibration_batch, convolutions, integer_nodes, quantised
+from export.quantisation.int8 import calibration_batch, convolutions, quantised, rounded_ranges
+from export.quantisation.integer_nodes import integer_nodes
 from export.quantisation.rounding import folded
 from export.to_onnx import export
 from firmware_bridge.pad_geometry import USPA44
@@ -86,6 +87,14 @@ def test_a_batch_of_them_computes_what_one_does(net, model, windows, seen):
     together = quantised(to_model(net, USPA44, batch=5), seen)  # 64 windows are no multiple of 5
     for many, one in zip(GraphRun(together)(windows), GraphRun(quantised(model, seen))(windows), strict=True):
         assert np.abs(many - one).max() < 0.02 * np.abs(one).max()
+
+
+def test_windows_beyond_any_touch_widen_the_ranges(model, windows, seen):
+    one = Batch(seen.window[:1].repeat(32, 1, 1, 1), seen.pattern[:32])
+    narrow, wide = (rounded_ranges(quantised(model, one, beyond=beyond)) for beyond in (None, windows))
+    assert narrow.keys() == wide.keys()
+    assert all(wide[name][0] <= low and wide[name][1] >= high for name, (low, high) in narrow.items())
+    assert any(wide[name][1] > 1.2 * high for name, (_, high) in narrow.items())
 
 
 def test_too_few_taps_have_no_ranges(contract):

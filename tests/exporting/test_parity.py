@@ -16,10 +16,19 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
 from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
+from edge.inference.pose_input import scheduled_rows
 from export import verify as verify_module
 from export.errors import ExportError, ParityError
 from export.graphs.graph import outputs
-from export.graphs.parity import FULL_TRACTION_KPA, LEVELS, GraphRun, differences, extreme_windows, read_windows
+from export.graphs.parity import (
+    FULL_TRACTION_KPA,
+    LEVELS,
+    GraphRun,
+    accepted,
+    differences,
+    extreme_windows,
+    read_windows,
+)
 from export.graphs.reference import network_of
 from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
@@ -38,8 +47,17 @@ def frozen():
 
 
 @cache
+def one_in(step):
+    """Return fewer of its frames: a tenth is enough to break a bound."""
+    names = ("newest", "tap", "indentation_mm", "force_n")
+    return replace(frozen(), **{name: getattr(frozen(), name)[::step] for name in names})
+
+
+@cache
 def rows(name):
-    return list(verify(find_model(name), frozen(), on_pass=lambda: passes.update([name])))
+    """Compare on the whole set what is rounded; float32 is the same on each window, and is compared on a third."""
+    judged = frozen() if name in IN_INTEGERS else one_in(3)
+    return list(verify(find_model(name), judged, on_pass=lambda: passes.update([name])))
 
 
 def graph_of(name):
@@ -82,7 +100,8 @@ def test_most_convolutions_run_in_integers(name):
     model, _ = graph_of(name)
     integer, every = convolutions(model)
     # Of the largest grid: all but the three that give the outputs.
-    assert (integer, every) == ((10, 22) if name == "stsr-small-int8" else (14, 26))
+    # Of the network with poses what encodes earlier taps as well, and those of its graph of one tap.
+    assert (integer, every) == {"stsr-small-int8": (10, 22), "mtsr7-int8": (34, 62)}.get(name, (14, 26))
     assert convolutions(graph_of(name.removesuffix("-int8"))[0])[0] == 0
     assert {output.type.tensor_type.elem_type for output in model.graph.output} == {onnx.TensorProto.FLOAT}
 
@@ -98,22 +117,32 @@ def test_another_runtime_computes_the_same(name):
         "CPU",
         {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1},
     )
-    windows = read_windows(frozen(), contract)
-    pad = [np.zeros((1, contract.pad_width), np.float32)] * bool(contract.pad_width)
-    given = [[np.array(maps) for maps in compiled([window[None], *pad]).values()] for window in windows]
+    windows, others = read_windows(frozen(), contract), []
+    if contract.takes_poses:
+        others.append(scheduled_rows(contract.taps, contract.angle_step_deg)[None])
+    if contract.pad_width:
+        others.append(np.zeros((1, contract.pad_width), np.float32))
+
+    def run(window):
+        tensor = window.reshape(contract.taps, 3, 4, 4) if contract.takes_poses else window
+        return [np.array(maps) for maps in compiled([tensor[None], *others]).values()]
+
+    given = [run(window) for window in windows]
     theirs = [np.concatenate(maps) for maps in zip(*given, strict=True)]
     # In integers the two round where neither is wrong: the maps differ by a step here and there.
     bound = 1e-5 if contract.arithmetic == "float32" else 0.15
     for difference in differences(
         list(contract.output_shapes), GraphRun(model)(windows), theirs, contract.output_full_scale
     ):
-        assert difference.relative < bound
+        assert difference.relative < accepted(difference.output, bound)
     if contract.arithmetic == "int8":
         every = read_windows(frozen(), contract, None)
         judged = judge_model(ModelSession(find_model(name)), frozen())["psnr_db"].mean()
-        patterns = np.concatenate([np.array(next(iter(compiled([window[None], *pad]).values()))) for window in every])
+        patterns = np.concatenate([run(window)[0] for window in every])
         error = np.mean((patterns - frozen().patterns()) ** 2, axis=(1, 2))
-        assert np.mean(10 * np.log10(frozen().full_scale_mm ** 2 / error)) == pytest.approx(judged, abs=0.05)
+        # With poses onnxruntime loses .05 dB by int8 and OpenVINO, which rounds elsewhere, gains .07.
+        most_db = 0.15 if contract.takes_poses else 0.05
+        assert np.mean(10 * np.log10(frozen().full_scale_mm ** 2 / error)) == pytest.approx(judged, abs=most_db)
 
 
 @pytest.mark.parametrize("name", IN_FLOAT)
@@ -148,6 +177,7 @@ def test_each_pass_over_the_windows_is_told_for_a_bar_even_where_there_is_one_mo
 def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeypatch, capsys):
     path = save(spoiled("stsr", 1.01), tmp_path / "stsr.onnx")
     monkeypatch.setattr(verify_module, "network_of", lambda _: network_of(graph_of("stsr")[0]))
+    monkeypatch.setattr(verify_module, "load_frozen_set", lambda path: one_in(10))
     with pytest.raises(SystemExit, match=r"verify: \d+ of \d+ comparisons break a bound"):
         main([str(path)])
     printed = capsys.readouterr().out
@@ -156,7 +186,7 @@ def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeyp
 
 def test_integers_that_cost_too_much_break_the_bound(tmp_path, monkeypatch):
     monkeypatch.setattr(verify_module, "MOST_LOSS_DB", -1.0)
-    broken = [row for row in verify(find_model("stsr-small-int8"), frozen()) if row.broken]
+    broken = [row for row in verify(find_model("stsr-small-int8"), one_in(10)) if row.broken]
     assert len(broken) == len(LEVELS) and all("dB lost, more than -1.0" in row.broken for row in broken)
 
 
@@ -167,7 +197,7 @@ def test_a_deviation_that_is_not_above_zero_breaks_the_bound(monkeypatch):
             return [pattern, deviation * 0, traction]
 
     monkeypatch.setattr(verify_module, "GraphRun", Sure)
-    assert any(row.broken == "a deviation is not above zero" for row in verify(find_model("stsr-int8"), frozen()))
+    assert any(row.broken == "a deviation is not above zero" for row in verify(find_model("stsr-int8"), one_in(10)))
 
 
 def test_integers_that_say_something_else_break_the_bound(monkeypatch):
@@ -178,7 +208,7 @@ def test_integers_that_say_something_else_break_the_bound(monkeypatch):
 
     monkeypatch.setattr(verify_module, "GraphRun", Other)
     monkeypatch.setattr(verify_module, "MOST_LOSS_DB", 100)
-    assert any("pattern differs by" in row.broken for row in verify(find_model("stsr-int8"), frozen()))
+    assert any("pattern differs by" in row.broken for row in verify(find_model("stsr-int8"), one_in(10)))
 
 
 def test_a_network_of_another_training_is_refused(tmp_path):

@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from train.demo import demo_recording
 from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, held_out, main
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
+from train.surfaces.tap_schedules import HALF_PITCH_MM
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +80,7 @@ def test_classical_methods_beat_nothing_and_are_in_order(frozen, tmp_path):
     assert nothing < psnr["bilinear"] < psnr["linear map"]
 
 
-def test_the_demo_presses_holds_and_lifts_four_times_and_scores_none_of_the_scenes_after(tmp_path):
+def test_the_demo_taps_four_times_or_where_it_is_proposed_and_scores_none_of_the_scenes_after(tmp_path):
     arrays = demo_recording()
     again = demo_recording()
     assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
@@ -89,10 +92,19 @@ def test_the_demo_presses_holds_and_lifts_four_times_and_scores_none_of_the_scen
     pressed = force > ON_COUNTS
     scene = arrays["scene"]
     begins = np.flatnonzero(np.diff(pressed.astype(int)) == 1)
-    assert scene[begins].tolist() == [-1] * 4 + [0, 0, 1]
+    assert scene[begins].tolist() == [-1] * 4 + [0, 0, 1, 2]
     assert np.all(force[(arrays["tap"] < 0) & (scene < 0)] < ON_COUNTS)
     assert np.all(arrays["tap"][scene >= 0] == -1)
     assert arrays["unit_patterns"].max(axis=(1, 2)) == pytest.approx(1, abs=2e-3)
+    places = arrays["option_pose"][:, :2] / HALF_PITCH_MM
+    assert {tuple(place) for place in places.round().tolist()} == set(itertools.product(range(-3, 4), repeat=2))
+    same = places.any(axis=1) == 0
+    (here,) = arrays["option_unit_patterns"][same]
+    assert np.abs(here.astype(float) - arrays["unit_patterns"][0]).mean() < 0.05, "but for the error of a pose"
+    there = arrays["option_unit_patterns"][(places.round() == [2, 0]).all(axis=1)][0].astype(float)
+    moved = arrays["unit_patterns"][0].astype(float)[:, 10:]
+    assert np.abs(there[:, :-10] - moved).mean() < 0.05 < np.abs(there[:, 10:] - moved).mean()
+    assert series.poses is not None and (BUNDLE_DIR / "demo.npz").stat().st_size < 1_000_000
 
 
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path):

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.evaluate import windows_of
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.expected_error import doubt
 from edge.perception.runtime import Model
@@ -50,7 +51,7 @@ def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np
         ValueError: the model gives no deviation.
     """
     rows, contract = [], model.contract
-    for window, truth in zip(frozen.windows(contract.taps, given), frozen.patterns(), strict=True):
+    for window, truth in zip(windows_of(frozen, contract, given), frozen.patterns(), strict=True):
         pattern, deviation = model.run(contract.scale_window(window)), model.deviation
         if deviation is None:
             raise ValueError(f"model '{model.name}' gives no deviation, so its error cannot be predicted")
