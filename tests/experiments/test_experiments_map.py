@@ -11,7 +11,7 @@ from map_samples import pixels_mm
 from edge.mapping.object_map import ObjectMap
 from train.experiments.sensor import object_map
 from train.experiments.support.outline import naive_map, outline_error
-from train.experiments.support.slides import scaled, slide
+from train.physics.slides import scaled, slide
 from train.surfaces.paper_figures import figure
 
 SQUARE = shapely.box(-15, -15, 15, 15)

@@ -12,14 +12,15 @@ from train.surfaces.poses import ANGLE_STEP_DEG
 
 PIXEL_MM = 4.7 / 10
 LENGTH_MM = 2.0
+WAVES = 50
 H = 2.35
 
 
 def waves(rng, count):
     """Return random fields as sums of waves: a function from places (m, 2) in mm to values (count, m)."""
-    way = rng.standard_normal((count, 200, 2)) / LENGTH_MM
-    phase = rng.uniform(0, 2 * np.pi, (count, 200, 1))
-    return lambda places: 0.2 + 0.1 * np.sqrt(2 / 200) * np.cos(way @ places.T + phase).sum(axis=1)
+    way = rng.standard_normal((count, WAVES, 2)) / LENGTH_MM
+    phase = rng.uniform(0, 2 * np.pi, (count, WAVES, 1))
+    return lambda places: 0.2 + 0.1 * np.sqrt(2 / WAVES) * np.cos(way @ places.T + phase).sum(axis=1)
 
 
 def places(side):

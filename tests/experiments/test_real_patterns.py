@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edge.inference.bundled import DEFAULT_MODEL, find_model
+from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
 from train.experiments.sensor.real import Played, has_hole, play, share_touched, unevenness
@@ -44,6 +44,20 @@ def test_over_all_scans_the_pad_is_covered_evenly(played):
     assert np.median(unevenness(patterns)) <= MOST_UNEVEN
     for name, one in played.items():
         assert np.median(unevenness(one.patterns)) <= MOST_UNEVEN, name
+
+
+def test_several_taps_of_a_face_anywhere_on_it_stay_one_sheet(played):
+    """A face larger than the pad reads alike at every pose: scans of one grip stand for taps at several."""
+    model, rng = ModelSession(find_model(POSED_MODEL)), np.random.default_rng(0)
+    shifted = np.array([[0, 0, 0, 0, 0], [2.35, 0, 0, 0.2, 1], [0, -2.35, 0, 0.2, 1], [2.35, 2.35, 0, 0.2, 1]])
+    near = np.array([[0, 0, 0, 0, 0], [1, -2, 30, 0.2, 1], [-2, 1, -20, 0.2, 1], [2, 2, 45, 0.2, 1]])
+    for name, one in played.items():
+        strong = np.argsort(one.zeroed[:, 2].sum(axis=(1, 2)))[-len(one.zeroed) // 3 :]
+        scans = one.zeroed[[strong[-1], *rng.choice(strong, 3, replace=False)]].astype(np.float32)
+        for poses in (shifted, near):
+            pattern = model.run(model.contract.scale_window(scans), poses=poses.astype(np.float32))[None]
+            assert share_touched(pattern)[0] >= LEAST_SHARE and unevenness(pattern)[0] <= MOST_UNEVEN, name
+            assert name.startswith(DENTED) or not has_hole(pattern)[0], name
 
 
 def test_patterns_of_real_grips_are_believed():

@@ -23,9 +23,9 @@ from train.data.generation_config import one_thread
 from train.experiments.support.outline import OutlineError, naive_map, outline_error
 from train.experiments.support.pushed import PushedSensor
 from train.experiments.support.shipped import load_shipped
-from train.experiments.support.slides import FIGURE_MM, LANES_MM, SCAN_HZ, SPEED_MM_S, Slide, scaled, slide
 from train.experiments.support.workbench import Workbench
 from train.physics.pad_draws import INPUTS
+from train.physics.slides import FIGURE_MM, LANES_MM, SCAN_HZ, SPEED_MM_S, Slide, scaled, slide
 from train.report import Report, Row, with_interval
 from train.surfaces.paper_figures import figure
 from train.surfaces.random_figures import glyph

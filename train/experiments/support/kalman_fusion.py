@@ -17,6 +17,7 @@ from scipy.optimize import nnls
 
 from edge.inference.familiarity import QUIET_UNITS
 from edge.inference.forward_model import pooling
+from edge.perception.next_tap import SHARED
 from firmware_bridge.pad_geometry import AXES, USPA44
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.generation_config import SEED
@@ -33,9 +34,9 @@ _RIDGE: Final = 1e-5
 _TABLE_STEP_MM2: Final = 0.02
 _DEPTH_SPREAD: Final = 0.087
 """Spread of an earlier tap's depth over the newest one's: drawn evenly from .85 to 1.15."""
-SHARED: Final = 0.45
 DOUBT: Final = 2.0
-"""Regularisation with the highest PSNR of four taps on validation presses of all families, in all four schedules."""
+"""Regularisation with the highest PSNR of four taps on validation presses of all families, in all four schedules.
+SHARED was chosen with it, and the proposal of the next tap uses it as well."""
 _DRIFT_OF_TAXEL: Final = 0.25
 """Share of the drift that is a taxel's own."""
 
