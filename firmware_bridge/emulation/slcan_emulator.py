@@ -9,12 +9,13 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.pty_port import PseudoPort
-from firmware_bridge.emulation.xela_controller import FRAME_S, SlcanAdapter, bus_timeline, controllers_of
+from firmware_bridge.emulation.xela_controller import FRAME_S, Played, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
 
 _STOP_POLL_S: Final = 0.05
@@ -27,6 +28,7 @@ class Emulator:
     Attributes:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
+        hear: takes what is written to the emulator's stdin.
         sent_frames: number of frames that went out whole.
         lost_frames: number of frames without room, because the client did not read.
     """
@@ -50,6 +52,8 @@ class Emulator:
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
         link: Path | None = None,
         waits: bool = False,
+        played: Played = attrgetter("counts"),
+        hear: Callable[[bytes], object] = lambda told: None,
     ) -> None:
         """Prepare to play; nothing is opened yet.
 
@@ -70,6 +74,8 @@ class Emulator:
             on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
             waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
+            played: scans that are played of a track; each is asked for while the one before is sent.
+            hear: takes what is written to the emulator's stdin.
 
         Raises:
             ValueError: an option is out of range.
@@ -83,10 +89,11 @@ class Emulator:
         bus = controllers_of(recordings, controllers, rate_hz)
         self.port = ""
         self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
+        self.hear = hear
         self.sent_frames = 0
         self.lost_frames = 0
         self._timeline = bus_timeline(
-            bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, first_frame=first_frame
+            bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, first_frame=first_frame, played=played
         )
         self._latency_s = latency_s
         self._on_scan = on_scan

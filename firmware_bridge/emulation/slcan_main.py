@@ -53,6 +53,7 @@ def argument_parser(program: str, description: str | None) -> argparse.ArgumentP
     parser.add_argument("--seed", type=int, default=0, help="seed of jitter and unused bytes (default: 0)")
     parser.add_argument("--stamps", metavar="FILE", help="write controller and time [ns] of each scan's last frame")
     parser.add_argument("--link", type=Path, metavar="PATH", help="symbolic link to the emulated serial port")
+    parser.add_argument("--waits", action="store_true", help="wait for a late client, and lose no frames")
     parser.add_argument("--until-stdin-closes", action="store_true", help="end when stdin is closed")
     return parser
 
@@ -91,6 +92,7 @@ def _serve(options: argparse.Namespace, make_emulator: MakeEmulator) -> None:
             "seed": options.seed,
             "on_scan": lambda controller, time_ns: stamps.write(f"{controller} {time_ns}\n") if stamps else None,
             "link": options.link,
+            "waits": options.waits,
         }
         _play(make_emulator(recordings, usual, options, closing), until_stdin_closes=options.until_stdin_closes)
 
@@ -107,8 +109,11 @@ def _play(emulator: Emulator, *, until_stdin_closes: bool) -> None:
         sys.stdout.write(f"{emulator.port}\n")
         sys.stdout.flush()
         while not emulator.wait(_STOP_POLL_S):
-            if until_stdin_closes and select.select([0], [], [], 0)[0] and not os.read(0, 4096):
+            if not until_stdin_closes or not select.select([0], [], [], 0)[0]:
+                continue
+            if not (told := os.read(0, 4096)):
                 break
+            emulator.hear(told)
 
 
 if __name__ == "__main__":

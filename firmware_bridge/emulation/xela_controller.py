@@ -3,8 +3,9 @@
 import heapq
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
+from operator import attrgetter
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ FRAME_S: Final = 0.000_13
 CR: Final = b"\r"
 BEL: Final = b"\a"
 _LONGEST_COMMAND: Final = 32
+Played = Callable[[Track], Iterable[NDArray[np.int32]]]
+"""Function from a track to the scans that are played of it, in order."""
 _SHAPES: Final = tuple(dict.fromkeys(model.geometry.scan_shape for model in ID_MAPS.values()))
 _RIGHT_BITRATE: Final = 8
 _WRONG_BITRATE: Final = 6
@@ -103,22 +106,23 @@ def bus_timeline(
     loop: bool,
     frame_s: float = FRAME_S,
     first_frame: int = 0,
+    played: Played = attrgetter("counts"),
 ) -> Iterator[tuple[float, CanFrame]]:
     """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan.
 
     The first `first_frame` of them are left out, so that a client can also join in the middle of a cycle.
     """
-    lanes = [_lane(controller, jitter_s, seed, loop, frame_s) for controller in controllers]
+    lanes = [_lane(controller, jitter_s, seed, loop, frame_s, played) for controller in controllers]
     return islice(heapq.merge(*lanes, key=lambda timed: timed[0]), first_frame, None)
 
 
 def _lane(
-    controller: Controller, jitter_s: float, seed: int, loop: bool, frame_s: float
+    controller: Controller, jitter_s: float, seed: int, loop: bool, frame_s: float, played: Played
 ) -> Iterator[tuple[float, CanFrame]]:
     noise = random.Random(f"{seed} {controller.can_id}")
     number, free_s = 0, 0.0
     while True:
-        for counts in controller.track.counts:
+        for counts in played(controller.track):
             # Jitter of single scans does not move the grid; a scan waits for the one before.
             time_s = max(free_s, number / controller.rate_hz + noise.uniform(-jitter_s, jitter_s))
             for frame in scan_frames(counts, controller.can_id, noise, controller.model):

@@ -1,9 +1,10 @@
 """Interface of every link; a new link is one file with this interface, and its form in the registry (`registry.py`)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Protocol
 
+from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
@@ -15,10 +16,26 @@ class Wait(NamedTuple):
     Attributes:
         descriptor: file descriptor of the open link.
         longest_s: longest wait, in [s].
+        listens: False where nothing is to be read before `longest_s` is over, unless the link is lost.
     """
 
     descriptor: int
     longest_s: float
+    listens: bool = True
+
+
+class Pace(NamedTuple):
+    """Leave to read scans late, together with others, which costs less than to wake up for each.
+
+    Attributes:
+        together_s: time between two reads, in [s], the same for all links that are read together; 0: as bytes come.
+        still_s: longest time for which scans may wait that repeat the ones before within noise, in [s]; 0: none.
+        restless: names of sensors for whose sake no scan of their link may wait so.
+    """
+
+    together_s: float = 0.0
+    still_s: float = 0.0
+    restless: frozenset[str] = frozenset()
 
 
 SourceKind = Literal["device", "replay", "emulated"]
@@ -33,7 +50,7 @@ class Notice(NamedTuple):
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
             all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
             longer does; "note", a remark on a recording.
-        text: message to the user.
+        text: message to the user; empty where a recording goes on elsewhere, at a user's wish or its end.
         sensors: common prefix of the names of the sensors concerned.
     """
 
@@ -66,6 +83,7 @@ class Link(Protocol):
         origin: kind of source of a recording's scans, however often it was played and recorded again; None if it is
             not available, or equals `kind`.
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
+        states_poses: True where poses of the sensors come with the scans.
     """
 
     name: str
@@ -76,6 +94,7 @@ class Link(Protocol):
     unix_offset_ns: int | None = None
     origin: SourceKind | None = None
     mountings: Mapping[str, Mounting] = MappingProxyType({})
+    states_poses: bool = False
 
     def __enter__(self) -> "Link": ...
 
@@ -88,6 +107,13 @@ class Link(Protocol):
             LinkLostError: the link was there and is gone.
         """
         ...
+
+    def set_pace(self, pace: Pace) -> None:
+        """Allow scans to come late; any thread may call it.
+
+        The scans of many sensors are then read together, and a sensor that nothing touches is read once a period and
+        decoded a few times a second. A link that cannot do so ignores it.
+        """
 
     def wait_on(self) -> Wait | None:
         """Return the condition to wait for before `read(0)`, which then does not wait; None where a read may take long.
@@ -103,6 +129,10 @@ class Link(Protocol):
     def poses(self) -> list[TimedPose]:
         """Return the poses since the last call, all to be used for the scans that the last `read` returned."""
         return []
+
+    def steer(self) -> Callable[[PadPose | None], None] | None:
+        """Return the function that takes where to tap next, None for no proposal; None where there is no robot."""
+        return None
 
     def counters(self) -> dict[str, int]:
         """Return the counts of data received, skipped and missed so far, by name; also after it was closed."""

@@ -131,7 +131,7 @@ class CanBusLink(Link):
                 raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
             now_ns = self._clock_ns()
             if message is None:
-                self._unread.empty_ns = now_ns
+                self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
                 scans = []
             else:
                 self._unread.found(begun_ns, now_ns)

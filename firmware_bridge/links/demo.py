@@ -1,18 +1,25 @@
-"""Demo: an emulated sensor in a process of its own, read over its pseudo-terminal."""
+"""Demo: an emulated sensor on an emulated robot in a process of its own, read over its pseudo-terminal."""
 
+import json
+import os
 import select
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 
 START_TIMEOUT_S: Final = 20.0
 END_TIMEOUT_S: Final = 5.0
+_READ_BYTES: Final = 1 << 16
 
 
 class DemoLink(Link):
@@ -24,12 +31,14 @@ class DemoLink(Link):
     def __init__(self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False) -> None:
         self.name = "demo"
         self.kind: SourceKind = "emulated"
+        self.states_poses = True  # those of its robot
         self.ended = False
         self.trouble: str | None = None
         self._recording = str(recording)
         self._rate_hz = rate_hz
         self._loop = loop
-        self._process: subprocess.Popen[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._partial = b""
         self._link: SlcanSerialLink | None = None
         self._counts: dict[str, int] = {}
 
@@ -41,7 +50,7 @@ class DemoLink(Link):
             [
                 sys.executable,
                 "-m",
-                "firmware_bridge.emulation.slcan_main",
+                "firmware_bridge.emulation.robot_main",
                 "--until-stdin-closes",
                 *rate,
                 *loop,
@@ -51,7 +60,7 @@ class DemoLink(Link):
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
+            bufsize=0,  # lines after the first are read as they come
             start_new_session=True,
         )
         try:
@@ -92,6 +101,24 @@ class DemoLink(Link):
         self.trouble = self._link.trouble
         return scans
 
+    def poses(self) -> list[TimedPose]:
+        """Return the poses that the robot has stated since the last call."""
+        stdout = None if self._process is None else self._process.stdout
+        if stdout is None or not select.select([stdout], [], [], 0)[0]:
+            return []
+        *lines, self._partial = (self._partial + os.read(stdout.fileno(), _READ_BYTES)).split(b"\n")
+        return [_timed_pose(line) for line in lines]
+
+    def steer(self) -> Callable[[PadPose | None], None]:
+        """Return the function that takes where the robot is to tap next, None for the next tap of the recording."""
+        self._ask("follow")
+        return lambda pose: self._ask(None if pose is None else [pose.x_mm, pose.y_mm])
+
+    def _ask(self, asked: str | list[float] | None) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(BrokenPipeError):  # it has ended, which the next read shows
+                self._process.stdin.write(f"{json.dumps(asked)}\n".encode())
+
     def counters(self) -> dict[str, int]:
         """Return the counters of the serial link, the last ones after it was closed."""
         return self._link.counters() if self._link else dict(self._counts)
@@ -109,19 +136,25 @@ class DemoLink(Link):
                 process.kill()
 
 
-def _await_port(process: subprocess.Popen[str]) -> str:
+def _await_port(process: subprocess.Popen[bytes]) -> str:
     if process.stdout is None or process.stderr is None:
         raise ValueError("the emulator's output is not a pipe")
     readable, _, _ = select.select([process.stdout], [], [], START_TIMEOUT_S)
-    port = process.stdout.readline().strip() if readable else ""
+    port = process.stdout.readline().decode().strip() if readable else ""
     if port:
         return port
     process.kill()
-    last_words = process.stderr.read().strip().rpartition("\n")[2]
+    last_words = process.stderr.read().decode().strip().rpartition("\n")[2]
     raise DeviceError(f"the emulator did not start: {last_words or f'silent for {START_TIMEOUT_S:.0f} s'}")
 
 
-def _ends_well(process: subprocess.Popen[str]) -> bool:
+def _timed_pose(line: bytes) -> TimedPose:
+    fields = json.loads(line)
+    time_ns, holds = fields.pop("time_ns"), fields.pop("holds")
+    return TimedPose(PadPose(**fields), time_ns, holds=holds)
+
+
+def _ends_well(process: subprocess.Popen[bytes]) -> bool:
     try:
         return process.wait(END_TIMEOUT_S) == 0
     except subprocess.TimeoutExpired:

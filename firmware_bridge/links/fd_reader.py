@@ -26,6 +26,12 @@ except ImportError:
 
 FULL_BYTES: Final = 255
 """Highest value of VMIN; a scan of sixteen taxels has 352 bytes."""
+MOST_BYTES: Final = 65536
+"""Most bytes read at once: as many as a kernel keeps for a serial port."""
+TERMINAL_BYTES: Final = 4095
+"""Bytes of a kernel's terminal that is full, which may be followed by more."""
+KERNEL_BYTES: Final = 64
+"""Bytes that the kernel returns a call where VMIN is set, however many there are; fewer only if no more are there."""
 LONGEST_WAIT_S: Final = 0.02
 """Longest time that fewer than FULL_BYTES wait to be read, in [s]: without a whole scan there is no hurry."""
 LONGEST_REST_S: Final = 0.004
@@ -62,10 +68,24 @@ class BurstReader:
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
+        self._gathers = False
+        self._wake_at(FULL_BYTES)
+
+    def gather(self, on: bool) -> None:
+        """Let the kernel return all bytes with one read, for `take_all`, whose caller waits between reads.
+
+        Raises:
+            OSError: the port is gone. termios.error, which is no OSError, is possible as well.
+        """
+        if on != self._gathers:
+            self._gathers = on
+            self._wake_at(1 if on else FULL_BYTES)
+
+    def _wake_at(self, least_bytes: int) -> None:
         if termios is not None:
-            attributes = termios.tcgetattr(descriptor)
-            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = FULL_BYTES, 0
-            termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
+            attributes = termios.tcgetattr(self.descriptor)
+            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = least_bytes, 0
+            termios.tcsetattr(self.descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> bytes:
         """Return the bytes received, once `wanted_bytes` have come, or no more come.
@@ -125,8 +145,25 @@ class BurstReader:
         if data:
             self._newest_s = self._clock_s()
         else:
-            self.empty_s = self._clock_s()
+            self.empty_s = now_s  # from before the read: this thread may not run for long after it
         return data
+
+    def take_all(self) -> bytes:
+        """Return all bytes there, without waiting for more; `gather` was called before.
+
+        Raises:
+            OSError: the port is gone, and all earlier bytes have been returned.
+        """
+        now_s = self._clock_s()
+        try:
+            data = os.read(self.descriptor, MOST_BYTES)
+        except BlockingIOError:
+            data = None
+        if data == b"":
+            raise OSError(errno.EIO, "hung up")
+        if data is None or len(data) < TERMINAL_BYTES:
+            self.empty_s = now_s
+        return data or b""
 
     def look(self) -> None:
         """Update `empty_s` if no more than the beginning of a scan is waiting.
@@ -134,15 +171,15 @@ class BurstReader:
         Raises:
             OSError: the port is gone.
         """
+        looked_s = self._clock_s()  # from before the look: this thread may not run for long after it
         waiting = fcntl.ioctl(self.descriptor, termios.FIONREAD, bytes(4)) if fcntl and termios else bytes(4)
         if int.from_bytes(waiting, sys.byteorder) < FULL_BYTES:
-            self.empty_s = self._clock_s()
+            self.empty_s = looked_s
 
     def _take(self, data: bytes, wanted_bytes: int) -> bytes:
         """Return `data` with the bytes there, up to `wanted_bytes`. An error after bytes is left to the next call."""
         while len(data) < wanted_bytes:
             try:
-                # With VMIN set, the kernel returns 64 bytes a call however many there are.
                 piece = os.read(self.descriptor, wanted_bytes - len(data))
                 if not piece:
                     raise OSError(errno.EIO, "hung up")
@@ -153,4 +190,6 @@ class BurstReader:
                     break
                 raise
             data += piece
+            if len(piece) < KERNEL_BYTES:
+                break  # another read would raise an exception, which costs more than all else here
         return data

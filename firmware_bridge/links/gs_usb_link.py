@@ -124,7 +124,7 @@ class GsUsbLink(Link):
             if data:
                 self._unread.found(begun_ns, now_ns)
             else:
-                self._unread.empty_ns = now_ns
+                self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
             scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns, self._scans.clock_begun_ns)
             if data and len(data) < len(self._packet):
                 self._scans.end_transfer()

@@ -5,7 +5,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Self
 
-from firmware_bridge.links.base import Link, Notice, SerialLine, SourceKind, Wait
+from firmware_bridge.links.base import Link, Notice, Pace, SerialLine, SourceKind, Wait
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
@@ -34,6 +34,7 @@ class MountedLink(Link):
         self.patient = link.patient
         self.unix_offset_ns = link.unix_offset_ns
         self.origin = link.origin
+        self.states_poses = link.states_poses
         self.wrapped = link
         self._prefix = f"{name}/" if name else ""
         self._prefix_text = f"{name}: " if name else ""
@@ -55,6 +56,12 @@ class MountedLink(Link):
         if self._places:
             scans = [self._places[scan.sensor].place(scan) if scan.sensor in self._places else scan for scan in scans]
         return [replace(scan, sensor=f"{self._prefix}{scan.sensor}") for scan in scans] if self._prefix else scans
+
+    def set_pace(self, pace: Pace) -> None:
+        """Pass on how late scans may come, and for which of its own sensors not."""
+        size = len(self._prefix)
+        own = frozenset(name[size:] for name in pace.restless if name.startswith(self._prefix))
+        self.wrapped.set_pace(pace._replace(restless=own))
 
     def wait_on(self) -> Wait | None:
         """Return the wait condition of the wrapped link."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, NoticeKind, SerialLine, SourceKind, Wait
+from firmware_bridge.links.base import Link, Notice, NoticeKind, Pace, SerialLine, SourceKind, Wait
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import LINK_SILENT_S
 
@@ -99,6 +99,10 @@ class LastingLink(Link):
         else:
             self._suspect()
         return scans
+
+    def set_pace(self, pace: Pace) -> None:
+        """Pass on how late scans may come."""
+        self._link.set_pace(pace)
 
     def wait_on(self) -> Wait | None:
         """Return the wait condition of the wrapped link; None while it is to be opened again."""

@@ -1,11 +1,10 @@
 """Link that plays recordings, at their own speed or as fast as they are read."""
 
-import heapq
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +20,17 @@ from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S, Clock, Sleep, sleep_until
 
 
-class _Due(NamedTuple):
-    due_ns: int
-    lane: int
-    row: int
-
-
 class ReplayLink(Link):
     """Link to recordings, all started together. It never leaves a scan out; late ones come at once.
 
     Attributes:
         recordings: the recordings that it plays.
+        notes: remarks for the user, which become notices.
     """
 
     def __init__(
         self,
-        paths: Sequence[str | Path],
+        paths: Sequence[str | Path | Recording],
         rate_hz: float | None = None,
         *,
         paced: bool = True,
@@ -46,7 +40,7 @@ class ReplayLink(Link):
         """Load the recordings.
 
         Args:
-            paths: paths of the recordings.
+            paths: paths of the recordings; or recordings, already in memory.
             rate_hz: scans a second of each sensor, also of one with recorded times if paced; by default the recorded
                 times, else the recorded rate.
             paced: True plays at that speed, from now on; else each `read` returns a scan at its recorded time.
@@ -59,11 +53,11 @@ class ReplayLink(Link):
         """
         if rate_hz is not None and not 0 < rate_hz < math.inf:
             raise SourceError(f"rate is {rate_hz} Hz, expected a positive number")
-        self.recordings = [load_recording(path) for path in paths]
+        self.recordings = [one if isinstance(one, Recording) else load_recording(one) for one in paths]
         timed = next((one.path for one in self.recordings for track in one.tracks if track.time_ns is not None), None)
         if not paced and rate_hz is not None and timed is not None:
             raise SourceError(f"{timed} has times of its own, which are kept: leave out --rate-hz, or add --paced")
-        self.name = f"replay:{','.join(map(str, paths))}"
+        self.name = f"replay:{','.join(str(one.path) for one in self.recordings)}"
         self.kind: SourceKind = "replay"
         self.ended = False
         self.patient = not paced
@@ -74,7 +68,7 @@ class ReplayLink(Link):
             if recording.mountings
             for track in recording.tracks
         }
-        self._notes: list[str] = []
+        self.notes: list[str] = []
         self._clock = clock
         self._sleep = sleep
         lanes = [
@@ -83,6 +77,7 @@ class ReplayLink(Link):
             for track in recording.tracks
         ]
         self._tracks = [track for track, _ in lanes]
+        self._times_ns = {track.sensor: due_times_ns for track, due_times_ns in lanes}
         sensors = [track.sensor for track in self._tracks]
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
@@ -92,15 +87,25 @@ class ReplayLink(Link):
             for number in range(len(self.recordings))
             if (lane := self._pose_lane(number, lanes, rate_hz)) is not None
         ]
+        self.states_poses = bool(self._pose_lanes)
         self._poses: list[TimedPose] = []
-        dues = (_lane(lane, due_times_ns) for lane, (_, due_times_ns) in enumerate(lanes))
-        self._timeline = heapq.merge(*dues, key=lambda due: due.due_ns)
-        self._next: _Due | None = next(self._timeline, None)
-        self._start_ns = 0
+        due_ns, lane, row = (
+            np.concatenate(one)
+            for one in zip(
+                *(
+                    (due_times_ns, np.full(len(due_times_ns), number), np.arange(len(due_times_ns)))
+                    for number, (_, due_times_ns) in enumerate(lanes)
+                ),
+                strict=True,
+            )
+        )
+        order = np.lexsort((lane, due_ns))
+        self._due_ns, self._lane, self._row = due_ns[order], lane[order], row[order]
+        self._place = 0
+        self._start_ns = _first_ns(self.recordings[0]) or 0
         if not paced:
-            self._start_ns = _first_ns(self.recordings[0]) or 0
             self.unix_offset_ns = self.recordings[0].unix_offset_ns
-        self._notes += [note for recording in self.recordings for note in recording.notes]
+        self.notes += [note for recording in self.recordings for note in recording.notes]
         self._counts: dict[str, int] = dict.fromkeys(("scans", "torn_wire", "torn_source", "repeated"), 0)
 
     def __enter__(self) -> Self:
@@ -113,32 +118,36 @@ class ReplayLink(Link):
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans due since the last call; waits at most `timeout_s` for the first. If patient, the next."""
-        if self._next is None:
+        next_ns = self._next_ns()
+        if next_ns is None:
             return []
         if self.patient:
-            now_ns, most = self._start_ns + self._next.due_ns, 1
-        else:
-            latest_ns = self._clock() + int(timeout_s * NS_PER_S)
-            now_ns = sleep_until(min(self._start_ns + self._next.due_ns, latest_ns), self._clock, self._sleep)
-            most = math.inf
+            return [self._take()]
+        latest_ns = self._clock() + int(timeout_s * NS_PER_S)
+        now_ns = sleep_until(min(next_ns, latest_ns), self._clock, self._sleep)
         scans: list[Scan] = []
-        while self._next is not None and len(scans) < most and self._start_ns + self._next.due_ns <= now_ns:
-            for lane in self._pose_lanes:
-                self._poses += lane.up_to(self._next.due_ns, self._start_ns)
-            scans.append(self._close(self._next))
-            self._next = next(self._timeline, None)
-        self.ended = self._next is None
+        while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
+            scans.append(self._take())
         return scans
 
     def notices(self) -> list[Notice]:
         """Return the notes on the files, once."""
-        notes, self._notes = self._notes, []
+        notes, self.notes = self.notes, []
         return [Notice(self._start_ns, "note", note) for note in notes]
 
     def poses(self) -> list[TimedPose]:
         """Return the poses that the scans of the last `read` were made with, as in the recording, each once."""
         poses, self._poses = self._poses, []
         return poses
+
+    def times_ns(self, sensor: str) -> NDArray[np.int64]:
+        """Return the times (n,) of a sensor's scans since the first scan, in [ns]."""
+        return self._times_ns[sensor]
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first scan as it is played, in [ns]."""
+        return self._start_ns
 
     def counters(self) -> dict[str, int]:
         """Return the counts of scans, and of the torn and repeated ones among them, as in the recording."""
@@ -157,19 +166,29 @@ class ReplayLink(Link):
             due_times_ns = next(due_times_ns for track, due_times_ns in lanes if track is recording.tracks[0])
             return PoseLane(timed_by_rows(poses, due_times_ns), 0, sensors)
         if rate_hz is not None or first_ns is None:
-            self._notes.append(
+            self.notes.append(
                 f"{recording.path}: its {len(poses)} poses are left out, since --rate-hz replaces the times"
             )
             return None
         return PoseLane(poses, first_ns, sensors)
 
-    def _close(self, due: _Due) -> Scan:
-        time_ns = self._start_ns + due.due_ns
-        track = self._tracks[due.lane]
+    def _next_ns(self) -> int | None:
+        """Return the time of the next scan, in [ns]; None after the last."""
+        return None if self._place == len(self._due_ns) else self._start_ns + int(self._due_ns[self._place])
+
+    def _take(self) -> Scan:
+        """Return the next scan."""
+        due_ns, lane, row = (int(one[self._place]) for one in (self._due_ns, self._lane, self._row))
+        for poses in self._pose_lanes:
+            self._poses += poses.up_to(due_ns, self._start_ns)
+        self._place += 1
+        self.ended = self._place == len(self._due_ns)
+        time_ns = self._start_ns + due_ns
+        track = self._tracks[lane]
         if track.renewed is None:
-            scan = self._series[due.lane].close(track.counts[due.row].copy(), time_ns)
+            scan = self._series[lane].close(track.counts[row].copy(), time_ns)
         else:
-            scan = _recorded(track, track.renewed, due.row, time_ns)
+            scan = _recorded(track, track.renewed, row, time_ns)
         self._counts["scans"] += 1
         self._counts["torn_wire"] += not scan.complete
         self._counts["torn_source"] += scan.complete and scan.torn
@@ -189,11 +208,6 @@ def _recorded(track: Track, renewed: NDArray[np.bool_], row: int, time_ns: int) 
     return Scan(
         track.sensor, number, time_ns, counts, fresh, new, moved_ns, track.vendor[row] if track.vendor else None
     )
-
-
-def _lane(lane: int, due_times_ns: NDArray[np.int64]) -> Iterator[_Due]:
-    for row, due_ns in enumerate(due_times_ns.tolist()):
-        yield _Due(due_ns, lane, row)
 
 
 def _first_ns(recording: Recording) -> int | None:

@@ -30,6 +30,11 @@ class PoseLane:
         self._due_ns = np.where(stated, poses.used_from_ns, poses.time_ns - GAP_NS) - first_ns
         self._row = 0
 
+    def begin_at(self, due_ns: int) -> None:
+        """Go on with the poses around a scan, at its time in [ns] since the first one of the recording."""
+        later = self._due_ns >= due_ns - GAP_NS
+        self._row = int(later.argmax()) if later.any() else len(self._poses)
+
     def up_to(self, due_ns: int, start_ns: int) -> Iterator[TimedPose]:
         """Yield the next poses that a scan uses.
 

@@ -18,8 +18,9 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SerialLine, SourceKind, Wait
+from firmware_bridge.links.base import Link, Pace, SerialLine, SourceKind, Wait
 from firmware_bridge.links.fd_reader import BurstReader
+from firmware_bridge.links.paced_reader import PacedReader, Piece
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
@@ -108,9 +109,11 @@ class SlcanSerialLink(Link):
         self._stamps_to_set: bytes | None = None
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
+        self._paced = PacedReader(self._scans)
 
     def __enter__(self) -> Self:
         self._scans.begin_anew()
+        self._dropped_bytes += self._paced.reset()
         self._stamps_to_set = None
         self.port = self._plugged.find(serial_ports())
         self._serial = self._open_port()
@@ -126,6 +129,7 @@ class SlcanSerialLink(Link):
         port, self._serial, self._bursts = self._serial, None, None
         if port is None:
             return
+        self._dropped_bytes += self._paced.reset()
         with suppress(*_PORT_ERRORS):  # gone already: no adapter to stop
             _wait_until_sent(port)
             for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
@@ -148,18 +152,18 @@ class SlcanSerialLink(Link):
         if self._stamps_to_set is not None:
             self._open_anew(self._serial, self._stamps_to_set)
         try:
-            data = self._bursts.read(timeout_s, self._scans.bytes_until_scan())
-            if self._bursts.held_until_s is not None:
-                return []
-            self._unread.empty_ns = round(self._bursts.empty_s * 1e9)
-            with suppress(OSError):  # the next call reports an error after bytes
-                self._bursts.look()
-        except OSError as error:
+            self._bursts.gather(self._paced.due_s is not None)
+            pieces = self._receive(self._bursts, timeout_s)
+        except _PORT_ERRORS as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
-        self._received_bytes += len(data)
-        now_ns = time.monotonic_ns()
-        scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns, self._scans.clock_begun_ns)
-        if self._questions.due(len(scans), self._scans.decoder.refusals, now_ns):
+        if not pieces:
+            return []
+        scans: list[Scan] = []
+        for data, time_ns, self._unread.empty_ns in pieces:
+            self._received_bytes += len(data)
+            scans += self._unread.mark(self._scans.feed(data, time_ns), time_ns, self._scans.clock_begun_ns)
+        self._paced.follow(pieces[-1].data, scans)
+        if self._questions.due(len(scans), self._scans.decoder.refusals, pieces[-1].time_ns):
             _ask(self._serial, STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
         self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
@@ -173,10 +177,29 @@ class SlcanSerialLink(Link):
             self._open_anew(self._serial, self._stamps_to_set)
         return scans
 
+    def _receive(self, bursts: BurstReader, timeout_s: float) -> list[Piece]:
+        """Return the bytes to decode; an empty list while the end of a scan is on its way, or while scans may wait."""
+        if self._paced.due_s is not None:
+            return self._paced.read(bursts, timeout_s)
+        data = bursts.read(timeout_s, self._scans.bytes_until_scan())
+        if bursts.held_until_s is not None:
+            return []
+        empty_ns = round(bursts.empty_s * 1e9)
+        with suppress(OSError):  # the next call reports an error after bytes
+            bursts.look()
+        return [Piece(data, time.monotonic_ns(), empty_ns)]
+
+    def set_pace(self, pace: Pace) -> None:
+        """Set how late scans may come."""
+        self._paced.pace = pace
+
     def wait_on(self) -> Wait | None:
         """Return the port's descriptor; None while the channel must be reopened, which waits for a quiet line."""
         if self._bursts is None or self._stamps_to_set is not None:
             return None
+        due_s = self._paced.due_s
+        if due_s is not None:
+            return Wait(self._bursts.descriptor, max(due_s - time.monotonic(), 0.0), listens=False)
         return Wait(self._bursts.descriptor, self._bursts.longest_wait_s(self._scans.bytes_until_scan()))
 
     def counters(self) -> dict[str, int]:
@@ -247,6 +270,7 @@ class SlcanSerialLink(Link):
             if self._bursts is not None:
                 self._bursts.look()
         self._scans.begin_anew()
+        self._dropped_bytes += self._paced.reset()
         _say(port, OPEN)
 
     def _drop_old_bytes(self, port: serial.Serial) -> None:

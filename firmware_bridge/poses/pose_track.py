@@ -40,11 +40,6 @@ class PoseTrack:
         self._poses.append((pose, holds))
         return True
 
-    def clear(self) -> None:
-        """Forget all poses, as for a new object."""
-        self._times_ns.clear()
-        self._poses.clear()
-
     def at(self, time_ns: int) -> PadPose | None:
         """Return the pose at a time; None before the first pose, in a gap, and too long after the last one."""
         times_ns = self._times_ns
@@ -62,13 +57,28 @@ class PoseTrack:
             return self._between(after - 1, after, time_ns)
         if since_ns > AHEAD_NS:
             return None
-        if after < 2 or self._poses[after - 2][1]:
-            return pose
-        ahead = self._between(after - 2, after - 1, time_ns)
+        ahead = self._ahead(since_ns)
         if ahead is None:
             return pose
         # As far as it is extrapolated it is uncertain.
-        return replace(ahead, error_mm=hypot(ahead.error_mm, ahead.x_mm - pose.x_mm, ahead.y_mm - pose.y_mm))
+        error_mm = hypot(ahead.error_mm, ahead.x_mm - pose.x_mm, ahead.y_mm - pose.y_mm)
+        turned_deg = (ahead.turn_deg - pose.turn_deg + 180) % 360 - 180
+        return replace(ahead, error_mm=error_mm, error_deg=hypot(ahead.error_deg, turned_deg))
+
+    def _ahead(self, since_ns: int) -> PadPose | None:
+        """Return the pose so long after the last one, by the course over at least as long before it; None if unknown.
+
+        Poses that arrive in one burst lie microseconds apart by the time of their arrival, which shows no speed.
+        """
+        last = first = len(self._times_ns) - 1
+        last_ns = self._times_ns[last]
+        while first and last_ns - self._times_ns[first] < AHEAD_NS:
+            if self._poses[first - 1][1] or last_ns - self._times_ns[first - 1] > GAP_NS:
+                break
+            first -= 1
+        if last_ns - self._times_ns[first] < since_ns:
+            return None
+        return self._between(first, last, last_ns + since_ns)
 
     def _between(self, first: int, second: int, time_ns: int) -> PadPose | None:
         start_ns, end_ns = self._times_ns[first], self._times_ns[second]

@@ -19,7 +19,7 @@ LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000
 HEADER: Final = b"\x00\x01\x00\x00"
 _NUMBERS: Final = dict(
     (
-        *(("int8", "b"), ("uint8", "B"), ("byte", "B"), ("int16", "h"), ("uint16", "H")),
+        *(("bool", "?"), ("int8", "b"), ("uint8", "B"), ("byte", "B"), ("int16", "h"), ("uint16", "H")),
         *(("int32", "i"), ("uint32", "I")),
         *(("int64", "q"), ("uint64", "Q"), ("float32", "f"), ("float64", "d")),
     )

@@ -17,6 +17,7 @@ from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
 
 SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"
 BASELINE_NAME: Final = "tactile_edge_sr/msg/Baseline"
+# The reader takes a definition by its text, so not even a comment in it may change: earlier recordings have it.
 _SCAN_TEXT: Final = """\
 # One reading of all taxels of one sensor, raw.
 std_msgs/Header header          # wall clock time of time_ns; frame_id is the sensor
@@ -73,12 +74,15 @@ class RecordedScan(NamedTuple):
     vendor: VendorReading | None
 
 
-def encode_scan(scan: Scan, unix_ns: int, fresh: int, renewed: int) -> bytes:
-    """Encode a scan that came at `unix_ns` [ns] since 1970; `fresh` and `renewed` are its masks as numbers."""
+def encode_scan(scan: Scan, frame: str, unix_ns: int, fresh: int, renewed: int) -> bytes:
+    """Encode a scan that was on the bus at `unix_ns` [ns] since 1970; `fresh` and `renewed` are its masks as numbers.
+
+    `frame` is that of the results' messages, so that raw scans are marked, too, where their source is no device.
+    """
     vendor = VendorReading() if scan.vendor is None else scan.vendor
     return scan_type(scan.fresh.size).encode(
         {
-            "header": {"stamp": stamp(unix_ns), "frame_id": scan.sensor},
+            "header": {"stamp": stamp(unix_ns), "frame_id": frame},
             "sensor": scan.sensor,
             "number": scan.number,
             "time_ns": scan.time_ns,
@@ -127,11 +131,11 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
     )
 
 
-def encode_baseline(baseline: Baseline, age_s: float | None, unix_ns: int) -> bytes:
+def encode_baseline(baseline: Baseline, frame: str, age_s: float | None, unix_ns: int) -> bytes:
     """Encode a baseline that is used from `unix_ns` on, in [ns] since 1970."""
     return baseline_type(baseline.counts[0].size).encode(
         {
-            "header": {"stamp": stamp(unix_ns), "frame_id": baseline.sensor},
+            "header": {"stamp": stamp(unix_ns), "frame_id": frame},
             "sensor": baseline.sensor,
             "id": baseline.id,
             "origin": baseline.origin,

@@ -82,6 +82,10 @@ class Mounting:
         turned *= self._factors.reshape(turned.shape)
         return turned
 
+    def place_counts(self, counts: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Reorder counts (..., 3, rows, cols) from the order of the id map to the places on the pad."""
+        return counts.reshape(*counts.shape[:-2], -1)[..., list(self.order)].reshape(counts.shape)
+
     def place(self, scan: Scan) -> Scan:
         """Reorder a scan from the order of the id map to the places on the pad, the vendor's readings included.
 
@@ -89,7 +93,7 @@ class Mounting:
         """
         shape = scan.fresh.shape
         order = list(self.order)
-        counts = scan.counts.reshape(len(AXES), -1)[:, order].reshape(scan.counts.shape)
+        counts = self.place_counts(scan.counts)
         fresh, renewed = (array.ravel()[order].reshape(shape) for array in (scan.fresh, scan.renewed))
         for array in (counts, fresh, renewed):
             array.setflags(write=False)

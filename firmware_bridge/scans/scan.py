@@ -89,6 +89,10 @@ class Scan:
         force_n = None if newtons is None else tuple(newtons.reshape(3, -1).sum(axis=1).tolist())
         find(self, "vendor_force_n", force_n)
 
+    def __repr__(self) -> str:
+        taxels = f"{self.fresh.sum()} of {self.fresh.size} taxels, {self.renewed.sum()} renewed"
+        return f"<Scan {self.number} of sensor {self.sensor} at {self.time_ns / 1e9:.3f} s: {taxels}>"
+
     @property
     def torn(self) -> bool:
         """True if some taxels are new and some are not, on the wire or at the source."""

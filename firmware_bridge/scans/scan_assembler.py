@@ -88,6 +88,10 @@ class ScanAssembler:
         self._newest_ns = time_ns
         return self._sensors[cycle.sensor].feed_cycle(cycle, packed, time_ns, device)
 
+    def is_open(self, sensor: str) -> bool:
+        """Return True if a scan of the sensor is open."""
+        return sensor in self._sensors and self._sensors[sensor].open
+
     def begin_anew(self) -> None:
         """Discard open scans: the link broke, and the next readings do not belong to them."""
         for sensor in self._sensors.values():
@@ -107,6 +111,13 @@ class ScanAssembler:
             return fewest
         # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
         return 1 if any(not sensor.wire.order for sensor in self._sensors.values()) else self._taxels
+
+    @property
+    def period_s(self) -> float | None:
+        """Shortest period of a sensor that exists, in [s]; None until one is measured."""
+        periods_ns = [sensor.wire.period_ns for sensor in self._sensors.values() if sensor.confirmed]
+        known_ns = [period_ns for period_ns in periods_ns if period_ns is not None]
+        return min(known_ns) / 1e9 if known_ns else None
 
     def counters(self) -> dict[str, int]:
         """Return the counters, summed over all sensors.
@@ -152,6 +163,10 @@ class _Sensor:
         self._taxels, self._place, self._begins_known = {}, -1, False
         self._last = self._last_cycle = self._device = None
         self.wire.begin_anew()
+
+    @property
+    def open(self) -> bool:
+        return bool(self._taxels)
 
     def missing(self, now_ns: int) -> int | None:
         """Return the number of readings until the open scan closes; 1 while the order is not learnt yet.

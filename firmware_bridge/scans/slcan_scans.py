@@ -1,15 +1,21 @@
 """Stages from slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
 
+from itertools import pairwise, starmap
 from typing import Final
 
-from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, CanFrame, SlcanDecoder
+from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, STAMPED_BYTES, CanFrame, SlcanDecoder
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
+from firmware_bridge.scans.mixed_cycles import BEFORE, MixedCycles
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
+from firmware_bridge.scans.stillness import Stillness
+from firmware_bridge.silence import SCAN_GIVEN_UP_NS
 
 _MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000
+_MIXED_NS: Final = SCAN_GIVEN_UP_NS
+"""Longest time for which frames wait while others are fed, in [ns]."""
 
 
 class SlcanScans:
@@ -27,8 +33,11 @@ class SlcanScans:
         self._stamped: tuple[int, int] | None = None
         self._device = DeviceTime(0, 0)
         self._cycles: dict[bytes, Cycle | None] = {}
+        self._mixed = MixedCycles(model)
+        self._newest_ns = 0
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
+        self._stillness = Stillness()
         self._foreign = 0
         self.can_ids: set[int] = set()
 
@@ -37,29 +46,18 @@ class SlcanScans:
         scans: list[Scan] = []
         for piece in self.decoder.cut(data):
             if isinstance(piece, CanFrame):
+                self._give_up_begun(time_ns, scans)
                 if not piece.extended:  # bounded: there are at most 2048 of these
                     self.can_ids.add(piece.can_id)
                 self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
                 continue
-            packed, frame_bytes = piece
-            cycle_bytes = self._taxels * frame_bytes
-            start = 0
-            while start < len(packed):
-                end = start + cycle_bytes
-                scan = self._feed_cycle(packed[start:end], frame_bytes, time_ns) if end <= len(packed) else None
-                if scan is not None:
-                    scans.append(scan)
-                else:
-                    end = start + frame_bytes
-                    self.can_ids.add(packed[start] << 4 | packed[start + 1] >> 4)
-                    stamp_ms = int.from_bytes(packed[end - 2 : end]) if frame_bytes != PACKED_BYTES else None
-                    self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans)
-                start = end
+            self._feed_frames(*piece, time_ns, scans)
         return scans
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken; the adapter's clock may have restarted as well."""
         self.decoder.begin_anew()
+        self._give_up_begun(self._newest_ns, [])
         self._assembler.begin_anew()
         self._clock, self._stamped = _millisecond_clock(), None
 
@@ -70,19 +68,93 @@ class SlcanScans:
 
     def bytes_until_scan(self) -> int:
         """Return the number of bytes, from 1, that must come at least before a scan can close whole."""
-        return max(1, self._assembler.fewest_missing() * self.decoder.usual_line_bytes - self.decoder.pending_bytes)
+        missing = self._assembler.fewest_missing()
+        for frames, _ in self._mixed.begun.values():
+            missing = min(missing, self._taxels - len(frames) // STAMPED_BYTES)
+        return max(1, missing * self.decoder.usual_line_bytes - self.decoder.pending_bytes)
+
+    @property
+    def period_s(self) -> float | None:
+        """Shortest time between two scans of a sensor, in [s]; None until it is measured."""
+        return self._assembler.period_s
+
+    def level(self, data: bytes) -> None:
+        """Take the readings in `data`, read last, as the ones that `still` compares with."""
+        self._stillness.learn(data, self.decoder.usual_line_bytes)
+
+    def still(self, data: bytes) -> bool:
+        """Return True if `data`, which follows that of `level` or `still`, repeats its readings within noise."""
+        return self._stillness.holds(data, self.decoder.usual_line_bytes)
 
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages; foreign: frames of no taxel of this model."""
-        return self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
+        counters = self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
+        for frames, _ in list(self._mixed.begun.values()):  # another thread may read the link meanwhile
+            counters["readings"] += len(frames) // STAMPED_BYTES
+        return counters
 
-    def _feed_reading(self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan]) -> None:
+    def _feed_frames(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan]) -> None:
+        """Feed a run of usual frames: the cycles of a sensor that come in one piece, and then the others, parted."""
+        self._newest_ns = time_ns
+        start, cycle_bytes = 0, self._taxels * frame_bytes
+        stamped = frame_bytes == STAMPED_BYTES
+        if not stamped:
+            self._give_up_begun(time_ns, scans)
+        mixed = bool(self._mixed.begun)
+        while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
+            scan = self._feed_cycle(packed[start : start + cycle_bytes], frame_bytes, time_ns)
+            if scan is None:
+                break
+            scans.append(scan)
+            start += cycle_bytes
+        if start == len(packed):
+            return
+        for place, frames in self._mixed.part(packed[start:], frame_bytes, time_ns, waits=stamped):
+            if len(frames) > frame_bytes:
+                scan = self._feed_cycle(frames, frame_bytes, time_ns)
+                if scan is not None:
+                    scans.append(scan)
+                    continue
+            self._feed_singly(frames, frame_bytes, time_ns, scans, late=place == BEFORE or len(frames) > frame_bytes)
+        if self._mixed.begun:
+            self._device_time(int.from_bytes(packed[-2:]), time_ns)  # the newest stamp, which was read soonest
+        for number, (_, since_ns) in list(self._mixed.begun.items()):
+            # A scan that is open would end by the first of them.
+            if time_ns - since_ns > SCAN_GIVEN_UP_NS or self._assembler.is_open(self._mixed.names[number]):
+                self._give_up(number, time_ns, scans)
+
+    def _give_up_begun(self, time_ns: int, scans: list[Scan]) -> None:
+        for number in list(self._mixed.begun):
+            self._give_up(number, time_ns, scans)
+
+    def _give_up(self, number: int, time_ns: int, scans: list[Scan]) -> None:
+        """Feed the frames of a begun cycle one by one."""
+        self._feed_singly(self._mixed.begun.pop(number)[0], STAMPED_BYTES, time_ns, scans, late=True)
+
+    def _feed_singly(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan], *, late: bool) -> None:
+        """Feed frames one by one; `late` if others that came after them were fed before."""
+        for start in range(0, len(packed), frame_bytes):
+            end = start + frame_bytes
+            self.can_ids.add(packed[start] << 4 | packed[start + 1] >> 4)
+            stamp_ms = int.from_bytes(packed[end - 2 : end]) if frame_bytes == STAMPED_BYTES else None
+            self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans, late=late)
+
+    def _one_sensor(self, packed: bytes, start: int, frame_bytes: int) -> bool:
+        """Return whether two frames in a row are of one sensor; where scans of several mix, no cycle begins."""
+        taxels = self._model.taxels
+        first, second = (taxels.get(packed[at] << 4 | packed[at + 1] >> 4) for at in (start, start + frame_bytes))
+        return first is not None and second is not None and first[0] == second[0]
+
+    def _feed_reading(
+        self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan], *, late: bool = False
+    ) -> None:
         if reading is None:
             self._foreign += 1
-        else:
-            scans += self._assembler.feed(
-                reading, time_ns, None if stamp_ms is None else self._device_time(stamp_ms, time_ns)
-            )
+            return
+        device = None
+        if stamp_ms is not None:
+            device = self._earlier_time(stamp_ms, time_ns) if late else self._device_time(stamp_ms, time_ns)
+        scans += self._assembler.feed(reading, time_ns, device)
 
     def _feed_cycle(self, packed: bytes, frame_bytes: int, time_ns: int) -> Scan | None:
         """Return the scan of a sensor's whole cycle; None if this is no whole cycle, or a scan is still open."""
@@ -95,17 +167,29 @@ class SlcanScans:
             self.can_ids.update(order)
             self._cycles[can_ids] = self._model.cycle(order)
         cycle = self._cycles[can_ids]
-        # Checked before the last stamp is read: a clock that gets earlier stamps after it counts as set back.
+        # Checked before the clock gets the last stamp: earlier ones after it would count as a clock set back.
         longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle)
         if cycle is None or not longest_ns:
             return None
         if frame_bytes == PACKED_BYTES:
             return self._assembler.feed_cycle(cycle, packed, time_ns)
         first_ms, last_ms = int.from_bytes(packed[frame_bytes - 2 : frame_bytes]), int.from_bytes(packed[-2:])
-        # Read late and in one piece, half a cycle from before a pause and half from after it look like a whole one.
-        if (last_ms - first_ms) % (LAST_TIMESTAMP_MS + 1) * _MS_NS > longest_ns:
-            return None
+        # Half a cycle from before a pause and half from after it look like a whole one.
+        if _ns_between(first_ms, last_ms) > longest_ns:
+            ends = range(frame_bytes, len(packed) + 1, frame_bytes)
+            stamps_ms = [int.from_bytes(packed[end - 2 : end]) for end in ends]
+            if max(starmap(_ns_between, pairwise(stamps_ms))) > longest_ns:
+                return None
         return self._assembler.feed_cycle(cycle, packed, time_ns, self._device_time(last_ms, time_ns))
+
+    def _earlier_time(self, stamp_ms: int, time_ns: int) -> DeviceTime:
+        """Return the time of a frame that came before others whose times were taken."""
+        if self._stamped is None:
+            return self._device_time(stamp_ms, time_ns)
+        back_ns = _ns_between(stamp_ms, self._stamped[0])
+        if back_ns > _MIXED_NS:  # it came after them
+            return self._device_time(stamp_ms, time_ns)
+        return DeviceTime(self._device.host_ns - back_ns, self._device.own_ns - back_ns)
 
     def _device_time(self, stamp_ms: int, time_ns: int) -> DeviceTime:
         # Sixteen frames that come together have about three different stamps: a scan takes 2 ms on the bus.
@@ -113,6 +197,11 @@ class SlcanScans:
             self._stamped = stamp_ms, time_ns
             self._device = self._clock.at(stamp_ms, time_ns)
         return self._device
+
+
+def _ns_between(earlier_ms: int, later_ms: int) -> int:
+    """Return the time between two stamps, in [ns]."""
+    return (later_ms - earlier_ms) % (LAST_TIMESTAMP_MS + 1) * _MS_NS
 
 
 def _millisecond_clock() -> DeviceClock:

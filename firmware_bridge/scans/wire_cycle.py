@@ -40,6 +40,7 @@ class WireCycle:
         pause_ns: longest pause between two readings of one cycle, in [ns].
         doubts: signs of another order in a row; a whole cycle resets them.
         gaps_ns: gaps between the newest readings, of one cycle at most, in [ns]; None where they are not needed.
+        period_ns: time from cycle to cycle, in [ns], by the clock of the pauses; None until it is measured.
         awaited: a cycle in this order that came as one, so that the next one like it is recognised at once.
     """
 
@@ -54,7 +55,7 @@ class WireCycle:
         self.doubts = 0
         self._harmless: set[int] = set()
         self._newest_order: tuple[int, ...] = ()
-        self._period_ns: int | None = None
+        self.period_ns: int | None = None
         self._paced: tuple[int, int] | None = None
         self._cycles = 0
         self._learn(tuple(order))
@@ -119,9 +120,9 @@ class WireCycle:
             if period_ns == 0:  # read in one piece, without stamps: the period is not visible
                 return
             # The shorter of two in a row: one during which the bus was off for a time is too long.
-            shorter_ns = period_ns if self._period_ns is None else min(period_ns, self._period_ns)
+            shorter_ns = period_ns if self.period_ns is None else min(period_ns, self.period_ns)
             self.pause_ns = min(max(shorter_ns // 2, SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
-            self._period_ns, self.gaps_ns = period_ns, None
+            self.period_ns, self.gaps_ns = period_ns, None
             self._pace_due_ns = time_ns + WINDOW_NS
         self._paced = time_ns, self._cycles
 
@@ -133,7 +134,7 @@ class WireCycle:
         self._harmless.clear()
         if not order:
             self.gaps_ns = deque(maxlen=self._length)
-            self._period_ns = self._paced = None
+            self.period_ns = self._paced = None
 
 
 class _Nowhere(dict[int, int]):

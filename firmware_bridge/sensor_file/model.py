@@ -20,6 +20,7 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.sensor_file.pad_frame import LARGEST_MM, PadFrame
 from firmware_bridge.sensor_file.toml_reader import (
     REMEDY,
     Table,
@@ -59,6 +60,7 @@ class SensorEntry:
         learned: its gains as a running sensor has learned them from contacts.
         assumed: those of PARTS that were never measured.
         emulated: those of PARTS that were measured on an emulated sensor.
+        frame: place of the pad on the robot, entered by hand.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -68,6 +70,7 @@ class SensorEntry:
     learned: Pad | None = None
     assumed: frozenset[str] = frozenset()
     emulated: frozenset[str] = frozenset()
+    frame: PadFrame | None = None
 
     @property
     def used_pad(self) -> Pad | None:
@@ -130,6 +133,11 @@ class SensorFile:
         return {name: counts for name, counts in known.items() if counts is not None}
 
     @property
+    def frames(self) -> dict[str, PadFrame]:
+        """Places of the pads on the robot by sensor name, where they are available."""
+        return {name: entry.frame for name, entry in self.sensors.items() if entry.frame is not None}
+
+    @property
     def measured_pads(self) -> dict[str, Pad]:
         """Pads without what was learned, by sensor name."""
         return {name: entry.pad for name, entry in self.sensors.items() if entry.pad is not None}
@@ -180,6 +188,7 @@ def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeo
     counts_per_newton = table.take("counts_per_newton", positive, required=False)
     pads = {key: table.take(key, a_table, required=False) for key in ("pad", "learned")}
     baseline = table.take("baseline", a_table, required=False)
+    frame = table.take("frame", a_table, required=False)
     marks = {key: table.take(key, _parts, required=False) or frozenset() for key in ("assumed", "emulated")}
     table.end()
     known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
@@ -194,6 +203,7 @@ def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeo
         pads["learned"],
         marks["assumed"],
         marks["emulated"],
+        None if frame is None else _frame(path, name, frame),
     )
 
 
@@ -214,6 +224,25 @@ def _pad(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeome
     if widths is not None and gains is None:
         table.refuse("gain_half_widths", "without gains", "both, or none")
     return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=widths)
+
+
+def _frame(path: Path, name: str, values: Mapping[str, Any]) -> PadFrame:
+    table = Table(path, f"sensors.{name}.frame.", values)
+    parent = table.take("parent", text_value)
+    place_mm = table.take("place_mm", partial(_numbers, f"three numbers from -{LARGEST_MM:g} to {LARGEST_MM:g}", 3))
+    quaternion = table.take("quaternion", partial(_numbers, "x, y, z, w of norm 1", 4), required=False)
+    table.end()
+    try:
+        return PadFrame(parent, place_mm, **({} if quaternion is None else {"quaternion": quaternion}))
+    except ValueError as error:
+        return table.refuse("parent, place_mm and quaternion", str(error), "a frame of the robot and a place in it")
+
+
+def _numbers(expected: str, count: int, value: Any) -> tuple[float, ...]:
+    cells = flat_cells(value, (count,), expected)
+    if not all(map(is_number, cells)):
+        raise ValueError(expected)
+    return tuple(map(float, cells))
 
 
 def _baseline(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Baseline:

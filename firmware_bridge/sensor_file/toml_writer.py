@@ -23,6 +23,7 @@ from firmware_bridge.sensor_file.model import (
     SensorFile,
     load_sensor_file,
 )
+from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.zeroing.baseline import Baseline
 
 
@@ -70,6 +71,8 @@ def _text(sensor_file: SensorFile) -> str:
         if entry.counts_per_newton is not None:
             lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
         lines += _mark_lines(entry)
+        if entry.frame is not None:
+            lines += ["", f"[sensors.{_quoted(name)}.frame]", *_frame_lines(entry.frame)]
         if entry.pad is not None:
             about = "# The pad itself, for networks that ask for it."
             lines += ["", f"[sensors.{_quoted(name)}.pad]", about, *_pad_lines(entry.pad, cols)]
@@ -112,6 +115,15 @@ def _mounting_lines(mounting: Mounting, cols: int) -> list[str]:
         f"swap_xy = {str(mounting.swap_xy).lower()}",
         f"signs = {list(mounting.signs)}  # of x (to the right), y (down) and z (into the pad), after the swap",
         *gain_lines,
+    ]
+
+
+def _frame_lines(frame: PadFrame) -> list[str]:
+    return [
+        "# Where the middle of the pad's face is on the robot, for ROS 2 and recordings.",
+        f"parent = {_quoted(frame.parent)}",
+        f"place_mm = {list(frame.place_mm)}",
+        f"quaternion = {list(frame.quaternion)}  # x, y, z, w",
     ]
 
 

@@ -65,6 +65,9 @@ class Baseline:
     origin: Origin
     id: str
 
+    def __repr__(self) -> str:
+        return f"<Baseline {self.id} of sensor {self.sensor}: {self.scans} scans, {self.origin}>"
+
     @classmethod
     def from_counts(cls, sensor: str, counts: NDArray[np.integer], created_unix_s: float) -> Self:
         """Return the median of whole scans, without a check that the pad was free and still.
@@ -79,7 +82,7 @@ class Baseline:
         """
         if len(counts) == 0 or (counts == ABSENT).any():
             raise ValueError(f"a baseline needs whole scans, got {len(counts)} with {(counts == ABSENT).sum()} gaps")
-        median = counts[0] + np.median(_unwrapped(counts), axis=0)
+        median = counts[0] + np.median(unwrapped(counts), axis=0)
         return cls.of(sensor, median % COUNTS_ON_CIRCLE, created_unix_s, len(counts), "start-up")
 
     @classmethod
@@ -196,13 +199,13 @@ class BaselineEstimator:
             counts[:, :, silent] = 0
         self._taken.clear()
         self._silent = None
-        _refuse_motion(counts)
+        refuse_motion(counts)
         baseline = Baseline.from_counts(scan.sensor, counts, self._clock())
         if silent is not None:
             known = np.where(silent, np.float32(np.nan), baseline.counts)
             baseline = Baseline.of(scan.sensor, known, baseline.created_unix_s, baseline.scans, baseline.origin)
         if self._reference is not None:
-            _refuse_load(baseline, self._reference)
+            refuse_load(baseline, self._reference)
         return baseline
 
 
@@ -285,13 +288,19 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
     return baselines
 
 
-def _unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
+def unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Return the differences of scans (n, 3, rows, cols) to the first, the short way round the circle of counts."""
     half = COUNTS_ON_CIRCLE // 2
     return (counts.astype(np.int32) - counts[0].astype(np.int32) + half) % COUNTS_ON_CIRCLE - half
 
 
-def _refuse_motion(counts: NDArray[np.int32]) -> None:
-    moved = _unwrapped(counts)
+def refuse_motion(counts: NDArray[np.int32]) -> None:
+    """Check that a pad was still during scans (n, 3, rows, cols), n at least 3.
+
+    Raises:
+        BaselineRefusedError: it moved, or crept.
+    """
+    moved = unwrapped(counts)
     # Percentiles, not the range: the sensor has single readings far off, which are no motion.
     spread = np.percentile(moved, 95, axis=0) - np.percentile(moved, 5, axis=0)
     limits = np.asarray(SPREAD_LIMIT_COUNTS)[:, None, None]
@@ -306,7 +315,12 @@ def _refuse_motion(counts: NDArray[np.int32]) -> None:
         _refuse(worst, f"crept by {creep[worst]:.0f} counts", CREEP_LIMIT_COUNTS, remedy)
 
 
-def _refuse_load(baseline: Baseline, reference: Baseline) -> None:
+def refuse_load(baseline: Baseline, reference: Baseline) -> None:
+    """Check that no taxel of a baseline lies more than LOAD_LIMIT_COUNTS above a reference.
+
+    Raises:
+        BaselineRefusedError: one does: the pad was loaded.
+    """
     z = len(AXES) - 1
     # A taxel that is missing in either baseline is no evidence of a load.
     known = np.where(np.isnan(baseline.counts), 0, baseline.counts)

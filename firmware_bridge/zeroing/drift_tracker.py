@@ -55,6 +55,9 @@ SLOW_PER_S: Final = 1.0
 """Rate of the common drift, in [counts/s], up to which a taxel's own drift is not followed while one may be touched."""
 STILL_COUNTS: Final = 7.0
 """Largest difference of two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that difference."""
+FOREIGN_COUNTS: Final = 100.0
+"""Median change of taxels, on each axis, at which a stored baseline may be of another pad: rests of pads differ by
+hundreds of counts, those of one pad by ten in a day."""
 STEP_COUNTS: Final = 15.0
 """Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause. A
 smaller change of a single taxel stays in the readings as well, a common one is followed."""
@@ -293,7 +296,12 @@ class DriftTracker:
         where = "all taxels alike, as drift or another attitude" if alike else f"taxel {row * shown.shape[2] + col}"
         above = "above" if counts > 0 else "below"
         what = f"rest level {abs(counts):.0f} counts {above} the one before on {AXES[axis]} ({where})"
-        return f"{what} {self._cause}: free the pad and zero again"
+        note = f"{what} {self._cause}: free the pad and zero again"
+        # Stored baselines are of a pad: fingers may be swapped, or a pad replaced.
+        foreign = np.median(np.abs(own), axis=(1, 2)).min() > FOREIGN_COUNTS
+        if foreign and self._cause == _ZEROED and self._baseline.origin == "file":
+            note += "; most taxels differ: is this baseline of another pad (fingers swapped)?"
+        return note
 
 
 def _alike(common: NDArray[np.float32], own: NDArray[np.float32]) -> bool:

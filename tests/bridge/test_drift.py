@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from edge_samples import BASELINE, REST
+from test_drift_thresholds import Blocks
 
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
@@ -308,3 +309,12 @@ def test_a_rest_level_is_not_compared_before_the_pad_is_still():
     assert pad.events == []
     pad.play(5, sway * 11)
     assert len(pad.events) == 1 and pad.tracker.summary.step_counts == pytest.approx(440, abs=4)
+
+
+@pytest.mark.parametrize(("origin", "counts", "asked"), [("file", 110, 1), ("file", 90, 0), ("start-up", 110, 0)])
+def test_rests_that_differ_on_most_taxels_may_be_those_of_another_pad(origin, counts, asked):
+    stored = Baseline.of("4", REST.astype(np.float32), 1000.0, 100, origin)
+    apart = np.where(np.arange(48).reshape(3, 4, 4) % 2, counts, -counts)
+    pad = Blocks(baseline=stored)
+    pad.blocks(8, apart)
+    assert pad.event.count("is this baseline of another pad (fingers swapped)?") == asked, pad.tracker.note

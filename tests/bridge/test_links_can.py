@@ -298,6 +298,24 @@ def test_read_ends_with_the_scan_though_more_time_is_left(bus):
         assert scan.complete
 
 
+def test_what_came_while_the_reader_stood_still_after_a_wait_is_marked_old(bus, monkeypatch):
+    with link_to(bus) as link:
+        receive = link._bus.recv
+
+        def stands_still(timeout_s):
+            message = receive(timeout_s)
+            for frame in frames_of(1):
+                bus.send(message_of(frame))
+            time.sleep(0.1)
+            return message
+
+        with monkeypatch.context() as patched:
+            patched.setattr(link._bus, "recv", stands_still)
+            assert link.read(0.0) == []
+        (scan,) = read_scans(link, 1)
+        assert scan.unread_ns > 80_000_000
+
+
 def test_what_lay_there_because_nobody_read_is_marked_old(bus):
     with link_to(bus) as link:
         for frame in frames_of(2):

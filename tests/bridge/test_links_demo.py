@@ -22,7 +22,7 @@ def processes_playing(path: Path) -> list[int]:
                 command = (entry / "cmdline").read_bytes().split(b"\0")
             except OSError:
                 continue
-            if b"firmware_bridge.emulation.slcan_main" in command and str(path).encode() in command:
+            if b"firmware_bridge.emulation.robot_main" in command and str(path).encode() in command:
                 found.append(int(entry.name))
     return found
 

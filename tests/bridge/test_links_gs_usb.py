@@ -343,6 +343,24 @@ def test_a_short_packet_ends_a_transfer():
         assert link.counters()["skipped_bytes"] == 13 and link.counters()["bus_off"] == 0
 
 
+def test_what_came_while_the_reader_stood_still_after_a_wait_is_marked_old():
+    port, link = opened()
+    with link:
+        fetched = port.adapter.fetch
+
+        def fetch_and_stand_still(timeout_s):
+            data = fetched(timeout_s)
+            port.adapter.hear(*frames_of(1))
+            time.sleep(0.1)
+            return data
+
+        port.adapter.fetch = fetch_and_stand_still
+        assert link.read(0.0) == []
+        port.adapter.fetch = fetched
+        (scan,) = read_scans(link, 1)
+        assert scan.unread_ns > 80_000_000
+
+
 @pytest.mark.parametrize("features", [0x03, CANDLELIGHT.features])
 def test_what_lay_there_because_nobody_read_is_marked_old(features):
     port, link = opened(GsUsbPort(lambda: GsUsbAdapter(CANDLELIGHT._replace(features=features))))

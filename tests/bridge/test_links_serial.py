@@ -198,12 +198,18 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
 
 
 @pytest.mark.parametrize("piece_bytes", [1, 22, 62, 100, 352])
-def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes):
-    """The same holds after a torn scan, which its own end cannot close."""
+def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypatch):
+    """The same holds after a torn scan, which its own end cannot close.
+
+    Without stamps, a reader that does not run for some milliseconds within a scan splits it: here each arrives at once.
+    """
+    now_ns = [time.monotonic_ns()]
+    monkeypatch.setattr(slcan_serial.time, "monotonic_ns", lambda: now_ns[0])
     lines = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         for sent, complete in ((lines, [True]), (lines[:3] + lines[4:], []), (lines, [False, True]), (lines, [True])):
             text = b"".join(sent)
+            now_ns[0] += 10_000_000
             for at in range(0, len(text), piece_bytes):
                 os.write(device.device_fd, text[at : at + piece_bytes])
             scans = []
@@ -307,6 +313,37 @@ def test_what_lay_there_since_the_opening_is_marked_old_and_sets_no_clock(monkey
         end_s = time.monotonic() + 20
         while any(scan.unread_ns or scan.device_ns is None for scan in read_scans(link, 1)):
             assert time.monotonic() < end_s
+
+
+def test_a_thread_that_stands_still_after_a_look_takes_the_port_for_empty_no_later(monkeypatch):
+    """Otherwise bytes that arrive meanwhile would look new."""
+    leader, follower = pty.openpty()
+    now_s = [100.0]
+
+    def stands_still(system_call):
+        def call(*arguments):
+            try:
+                return system_call(*arguments)
+            finally:
+                now_s[0] += 0.5
+
+        return call
+
+    try:
+        tty.setraw(follower)
+        reader = bursts.BurstReader(follower, clock_s=lambda: now_s[0])
+        monkeypatch.setattr(bursts.fcntl, "ioctl", stands_still(bursts.fcntl.ioctl))
+        reader.look()
+        assert (reader.empty_s, now_s[0]) == (100.0, 100.5)
+        monkeypatch.setattr(bursts.os, "read", stands_still(os.read))
+        assert reader.read(0, 22) == b""
+        assert (reader.empty_s, now_s[0]) == (100.5, 101.0)
+        assert reader.take_all() == b""
+        assert (reader.empty_s, now_s[0]) == (101.0, 101.5)
+    finally:
+        monkeypatch.undo()
+        os.close(leader)
+        os.close(follower)
 
 
 def test_the_end_of_a_scan_that_is_nearly_complete_is_looked_for_at_once():

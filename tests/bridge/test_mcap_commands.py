@@ -25,6 +25,7 @@ from edge.cli import main as cli
 from edge.doctor.watch import Watch
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
+from edge.sinks.ros2.map_messages import image_map, in_si
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -86,10 +87,7 @@ def patterns(path):
     by_topic = messages_of(path)
     said = {at: ros_messages.RESULT.decode(data) for at, data in by_topic["/finger/result"]}
     made_for = {at: json.loads(one["record"])["reused_from"] is None for at, one in said.items()}
-    return {
-        said[at]["scan"]: (made_for[at], ros_messages.image_map(data).tobytes())
-        for at, data in by_topic["/finger/pattern"]
-    }
+    return {said[at]["scan"]: (made_for[at], image_map(data).tobytes()) for at, data in by_topic["/finger/pattern"]}
 
 
 class TestOffline:
@@ -250,7 +248,7 @@ def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):
     exec(compile(script, "recordings.md", "exec"), {})
     shown = [one.pattern for one in results if one.scan.sensor == "4" and one.pattern is not None]
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(shown) > 0 and lines[0].endswith(f"(40, 40) {shown[0].max()!s}")
+    assert len(lines) == len(shown) > 0 and lines[0].endswith(f"(40, 40) {in_si('pattern', shown[0]).max()!s}")
 
 
 def test_the_doctor_goes_by_how_the_recorded_sensors_sat(tmp_path):

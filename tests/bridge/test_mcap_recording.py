@@ -26,10 +26,13 @@ from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
+from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.ros2.ros_types import LOG
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
+from firmware_bridge.recording.scan_messages import BASELINE as BASELINE_KIND
+from firmware_bridge.recording.scan_messages import SCAN, decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
@@ -56,15 +59,13 @@ class TestSink:
                 for (_, data), one in zip(by_topic[f"{topic}/scan"], own, strict=True)
             )
             for name in ("pattern", "deviation"):
-                maps = [ros_messages.image_map(data).tobytes() for _, data in by_topic[f"{topic}/{name}"]]
-                assert maps == [getattr(one, name).tobytes() for one in own if one.pattern is not None] != []
+                maps = [image_map(data).tobytes() for _, data in by_topic[f"{topic}/{name}"]]
+                made = [in_si(name, getattr(one, name)).tobytes() for one in own if one.pattern is not None]
+                assert maps == made != []
             said = [json.loads(ros_messages.RESULT.decode(data)["record"]) for _, data in by_topic[f"{topic}/result"]]
             assert [one["scan"] for one in said] == [one.scan.number for one in own]
             assert {one["counters"]["dropped"] for one in said} == {2}
-            forces = [ros_messages.WRENCH_STAMPED.decode(data) for _, data in by_topic[f"{topic}/wrench"]]
-            assert [one["wrench"]["force"]["z"] for one in forces] == [
-                one.force_n for one in own if one.force_n is not None
-            ]
+            assert any(one.force_n is not None for one in own) and f"{topic}/wrench" not in by_topic, "x, y unknown"
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
@@ -95,7 +96,7 @@ class TestSink:
         sink.tell(Event(5, "lost", None, "the link is gone"), {})
         sink.write(replace(make_results([make_scan()])[0], events=(Event(9, "zeroed", "4", "baseline b"),)), {})
         sink.close()
-        said = [(at, ros_messages.LOG.decode(data)) for at, data in messages_of(tmp_path / "out.mcap")["/events"]]
+        said = [(at, LOG.decode(data)) for at, data in messages_of(tmp_path / "out.mcap")["/events"]]
         assert [(one["name"], one["function"], one["msg"]) for _, one in said] == [
             ("edge-sr", "lost", "the link is gone"),
             ("4", "zeroed", "sensor 4 zeroed on demand: baseline b"),
@@ -260,6 +261,11 @@ class TestReplay:
         sink.write(results[0], {})
         sink.close()
         assert load_recording(path).notes == (f"{path} was recorded from an emulated sensor",)
+        # Scans have the mark of the results, since a reader may take a single topic.
+        said = {topic: data for topic, ((_, data), *_) in messages_of(path).items()}
+        kinds = {"/s4/scan": SCAN, "/s4/baseline": BASELINE_KIND}
+        for topic, kind in kinds.items():
+            assert kind.decode(said[topic])["header"]["frame_id"] == "emulated/4", topic
 
     @pytest.mark.parametrize("form", ["mcap", "npz"])
     @pytest.mark.parametrize("kind", ["emulated", "device"])

@@ -8,6 +8,7 @@ import pytest
 from edge_samples import (
     BASELINE,
     FakeModel,
+    inferred,
     make_contract,
     make_pad_contract,
     make_scan,
@@ -259,8 +260,8 @@ class TestRuntime:
         pads = {"4": PAD, "6": OTHER}
         runtime = self.runtime(ModelSession(path), pad=pads)
         scans = [make_scan(0, sensor=name, press_counts=press, noise=9) for name, press in (("4", 20_000), ("6", 9000))]
-        together = runtime.push_together([(scan, True) for scan in scans])
-        runtime.push_together([(make_scan(1, sensor=name, press_counts=5000), True) for name in ("4", "6")])
+        together = inferred(runtime, scans)
+        inferred(runtime, [make_scan(1, sensor=name, press_counts=5000) for name in ("4", "6")])
         for scan, result in zip(scans, together, strict=True):
             alone = self.runtime(ModelSession(path), pad=pads).push(scan)
             for name in ("pattern", "deviation", "traction"):

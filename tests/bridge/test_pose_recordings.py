@@ -42,9 +42,9 @@ class PosedRuntime(Runtime):
         self.seen.append(TimedPose(pose, time_ns, sensor, holds))
         return super().pose(pose, time_ns, sensor, holds=holds)
 
-    def push_together(self, scans):
-        self.seen += [scan.time_ns for scan, _ in scans]
-        return super().push_together(scans)
+    def take(self, scan):
+        self.seen.append(scan.time_ns)
+        return super().take(scan)
 
 
 def make_scans(count=6):

@@ -59,6 +59,23 @@ def test_shortly_after_the_last_pose_the_course_goes_on_with_a_larger_error():
     assert pose.x_mm == pytest.approx(1.5) and pose.error_mm == pytest.approx(0.5)
 
 
+def test_poses_of_one_burst_show_no_speed():
+    """Lines that a program writes at once arrive within microseconds, whatever their distance in time was."""
+    track = PoseTrack()
+    for burst in range(5):
+        for number in range(10):  # 100 poses/s at 20 mm/s, sent ten at a time
+            track.add(100 * MS * burst + 10_000 * number, PadPose(2.0 * burst + 0.2 * number, 0))
+            pose = track.at(100 * MS * burst + 10_000 * number + 20 * MS)
+            assert pose.x_mm == pytest.approx(2.0 * burst + 0.2 * number, abs=2.0)
+    one = PoseTrack()
+    one.add(0, PadPose(7, 7, 0, 0, 0), holds=True)
+    one.add(5 * MS, PadPose(0, 0, 350, 0, 0))
+    one.add(10 * MS, PadPose(0, 0, 0, 0, 0))
+    ahead = one.at(14 * MS)
+    assert (ahead.x_mm, ahead.turn_deg % 360, ahead.error_deg) == pytest.approx((0, 8, 8)), "not from where it rested"
+    assert one.at(18 * MS) == PadPose(0, 0, 0, 0, 0), "poses of 5 ms say nothing of 8 ms more"
+
+
 def test_a_pose_that_holds_is_that_of_all_times_until_the_next():
     track = PoseTrack()
     track.add(0, PadPose(1, 2), holds=True)
@@ -73,5 +90,3 @@ def test_a_pose_that_is_not_later_is_not_taken_and_memory_is_bounded():
     for at in range(6, 2 * MOST_POSES):
         track.add(at, PadPose(0, 0))
     assert len(track) == MOST_POSES
-    track.clear()
-    assert len(track) == 0 and track.at(7) is None

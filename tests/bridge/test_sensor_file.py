@@ -12,6 +12,7 @@ from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -42,6 +43,15 @@ def pads(draw):
     return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=widths)
 
 
+HALF_TURN = (0.0, 0.6, 0.8, 0.0)
+frames = st.builds(
+    PadFrame,
+    st.sampled_from(("tool0", "left/finger_tip")),
+    st.tuples(*[st.floats(-1e5, 1e5, allow_subnormal=False)] * 3),
+    st.sampled_from(((0.0, 0.0, 0.0, 1.0), HALF_TURN)),
+)
+
+
 @st.composite
 def sensor_files(draw):
     entries = {}
@@ -52,6 +62,7 @@ def sensor_files(draw):
             draw(st.none() | st.floats(1e-3, 1e6)),
             draw(st.none() | st.integers(0, 9).map(lambda seed, n=name, at=created: baseline(n, seed, at))),
             draw(st.none() | pads()),
+            frame=draw(st.none() | frames),
         )
     return SensorFile(draw(st.sampled_from(OF_16)), draw(st.none() | names), entries)
 
@@ -289,3 +300,23 @@ def test_learned_constants_are_used_where_there_are_none_by_hand():
     assert used.constants == {"thickness_mm": 4.0, "poisson": 0.42} and used.intervals == {"poisson": (0.41, 0.43)}
     assert used.gains == by_hand.gains and used.gain_half_widths == by_hand.gain_half_widths
     assert SensorFile(sensors={"4": SensorEntry(learned=learned)}).pads["4"] == learned
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ('parent = "tool0"\nplace_mm = [0, 0]', r"'sensors.4.frame.place_mm': .*expected three numbers"),
+        ('parent = "tool0"\nplace_mm = [0, 0, 1e6]', r"place_mm is .*expected three numbers up to 100000"),
+        ('parent = "/tool0"\nplace_mm = [0, 0, 0]', r"parent is '/tool0', expected the name of a frame"),
+        ('parent = "tool 0"\nplace_mm = [0, 0, 0]', r"expected the name of a frame"),
+        ("place_mm = [0, 0, 0]", r"'sensors.4.frame.parent': missing"),
+        ('parent = "a"\nplace_mm = [0, 0, 0]\nquaternion = [1, 1, 0, 0]', r"expected x, y, z, w of norm 1"),
+        ('parent = "a"\nplace_m = [0, 0, 0]\nplace_mm = [0, 0, 0]', r"'sensors.4.frame.place_m': not known"),
+    ],
+)
+def test_a_frame_that_cannot_be_is_refused(tmp_path, lines, words):
+    path = tmp_path / "s.toml"
+    head = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n[sensors.4]\n[sensors.4.frame]\n'
+    path.write_text(head + lines + "\n")
+    with pytest.raises(SensorFileError, match=words):
+        load_sensor_file(path)

@@ -1,0 +1,136 @@
+"""Command line of the emulated controller on an emulated robot, which states its poses and taps where it is asked to.
+
+    python -m firmware_bridge.emulation.robot_main FILE
+
+The first line it prints is the port. Each further one is a pose as JSON, with the time at which the pad was there.
+After the line "follow" on stdin it waits, after each tap that a proposal may follow, for a line with the place of the
+next one in [mm], such as [2.35, 0], or null for the next one of the recording. Otherwise it plays the recording.
+"""
+
+import json
+import os
+import sys
+from argparse import Namespace
+from collections import deque
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.slcan_main import argument_parser, play
+from firmware_bridge.recording.pose_columns import POSE_FIELDS
+from firmware_bridge.recording.tracks import Recording, Track
+
+FOLLOW: Final = "follow"
+MOVE_SCANS: Final = 10
+"""Scans of the free pad while the robot moves to a tap that was asked for."""
+LONGEST_WAIT_SCANS: Final = 500
+"""Scans after which a robot that is not asked any more taps by the recording."""
+_OPTIONS: Final = ("tap", "option_counts", "option_pose")
+
+
+class Robot:
+    """Robot that moves the pad of a recording: states its poses, and plays the taps that it is asked for.
+
+    Args:
+        recording: of one sensor, with its rate.
+        options: arrays `tap` (n,), -1 outside of taps; `option_counts` (o, f, 3, rows, cols) of taps that may take the
+            place of any but the first; `option_pose` (o, 5). Empty for a recording without.
+    """
+
+    def __init__(self, recording: Recording, options: Mapping[str, NDArray[Any]]) -> None:
+        self._options = options
+        self._poses: dict[int, list[Any]] = {}
+        poses, rate_hz = recording.poses, recording.rate_hz
+        if poses is not None and rate_hz is not None:
+            for row, time_ns in enumerate(poses.time_ns.tolist()):
+                self._poses[round(time_ns * rate_hz / 1e9)] = [*poses.values[row].tolist(), bool(poses.holds[row])]
+        tap = options.get("tap", np.zeros(0, dtype=int))
+        begins = np.flatnonzero((tap[1:] > tap[:-1]) & (tap[1:] > 0)) + 1
+        self._taps = {int(first): int(np.flatnonzero(tap == tap[first])[-1]) + 1 for first in begins}
+        self._asked: deque[list[float] | None] = deque()
+        self._steered = False
+        self._partial = b""
+        self._stated: deque[list[Any] | None] = deque()
+
+    def played(self, track: Track) -> Iterator[NDArray[np.int32]]:
+        """Yield the scans of one round."""
+        self._asked.clear()
+        number = 0
+        while number < len(track.counts):
+            if number in self._taps and self._steered:
+                option = yield from self._waits(track.counts[number - MOVE_SCANS : number])
+                self._asked.clear()
+                if option is not None:
+                    pose = [*self._options["option_pose"][option].tolist(), True]
+                    moving = track.counts[number - MOVE_SCANS : number]
+                    for counts in (*moving, *self._options["option_counts"][option]):
+                        yield from self._sends(counts, pose)
+                        pose = None
+                    number = self._taps[number]
+            yield from self._sends(track.counts[number], self._poses.get(number))
+            number += 1
+
+    def hear(self, told: bytes) -> None:
+        """Take lines that ask for the next tap."""
+        *lines, self._partial = (self._partial + told).split(b"\n")
+        for asked in map(json.loads, lines):
+            if asked == FOLLOW:
+                self._steered = True
+            else:
+                self._asked.append(asked)
+
+    def state(self, controller: int, time_ns: int) -> None:
+        """Print the pose of a scan that was sent, if it has one."""
+        pose = self._stated.popleft() if self._stated else None
+        if pose is not None:
+            line = dict(zip((*POSE_FIELDS, "holds"), pose, strict=True)) | {"time_ns": time_ns}
+            with suppress(BlockingIOError):  # who does not read it goes without
+                os.write(sys.stdout.fileno(), f"{json.dumps(line)}\n".encode())
+
+    def _sends(self, counts: NDArray[np.int32], pose: list[Any] | None = None) -> Iterator[NDArray[np.int32]]:
+        """Yield a scan, whose pose is stated once it was sent."""
+        self._stated.append(pose)
+        yield counts
+
+    def _waits(self, free: NDArray[np.int32]) -> Generator[NDArray[np.int32], None, int | None]:
+        """Yield scans of the free pad until a tap is asked for, and return its number; None for the recording's."""
+        for scan in range(LONGEST_WAIT_SCANS):
+            if self._asked:
+                place = self._asked.popleft()
+                if place is None:
+                    return None
+                away = self._options["option_pose"][:, :2] - np.array(place)
+                return int(np.hypot(*away.T).argmin())
+            yield from self._sends(free[scan % len(free)])
+        return None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play the recording named on the command line."""
+    return play(argument_parser("python -m firmware_bridge.emulation.robot_main", __doc__), arguments, _emulator)
+
+
+def _emulator(
+    recordings: Sequence[Recording], usual: Mapping[str, Any], options: Namespace, closing: ExitStack
+) -> Emulator:
+    robot = Robot(recordings[0], _options(recordings[0].path))
+    with suppress(OSError):
+        os.set_blocking(sys.stdout.fileno(), False)
+    return Emulator(recordings, **{**usual, "on_scan": robot.state, "played": robot.played, "hear": robot.hear})
+
+
+def _options(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a recording that are for the robot; none for one without them."""
+    if path.suffix != ".npz":
+        return {}
+    with np.load(path, allow_pickle=False) as data:
+        return {name: data[name] for name in _OPTIONS} if set(_OPTIONS) <= set(data.files) else {}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""Search of a recording for the scans during which its pad is free and still."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.scans.scan import ABSENT
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, refuse_load, refuse_motion, unwrapped
+
+FEWEST_RECORDED: Final = 30
+"""Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
+FREEST_SHARE: Final = 0.01
+"""Share of the scans with the lowest z, FEWEST_RECORDED or more, whose median a free pad is compared with."""
+MOST_TRIES: Final = 2000
+"""Places of a long recording at which a stretch may begin, so that the search ends within a second or two."""
+
+TOUCH_COUNTS: Final = 1500.0
+"""Rise of the summed z that is a contact, some 1.3 N; a free pad warms by less within a recording."""
+FEWEST_TOUCHED: Final = 5
+STEP: Final = 8
+"""Scans by which a stretch is made longer at a time."""
+
+
+class Stretch(NamedTuple):
+    """Scans during which a pad is free and still.
+
+    Attributes:
+        rows: (n,) their rows in the recording; without torn, repeated and incomplete ones among them.
+        counts: (n, 3, rows, cols) raw counts of them.
+        touched: True if something touches the pad elsewhere in the recording. Without it, a pad that holds something
+            all the time cannot be distinguished from a free one.
+    """
+
+    rows: NDArray[np.intp]
+    counts: NDArray[np.int32]
+    touched: bool
+
+    @property
+    def opens(self) -> bool:
+        """True if a live run would zero from it: it begins the recording, and is as long as a zeroing."""
+        return len(self.rows) >= FEWEST_SCANS and bool(self.rows[0] == 0)
+
+    def baseline(self, sensor: str, created_unix_s: float) -> Baseline:
+        """Return the baseline of these scans, taken at a time in [s] since 1970."""
+        taken = Baseline.from_counts(sensor, self.counts, created_unix_s)
+        return Baseline.of(sensor, taken.counts, created_unix_s, taken.scans, "file")
+
+
+def free_stretch(counts: NDArray[np.int32]) -> Stretch:
+    """Return the stretch with the lowest z in which the pad is still, of FEWEST_RECORDED to FEWEST_SCANS scans.
+
+    A grip can be as still as a free pad for half a second. So the stretch has to be the freest one, and no taxel of it
+    may lie above the freest scans of the whole recording, as with an earlier baseline.
+
+    Args:
+        counts: (n, 3, rows, cols) raw counts of all scans of a sensor; ABSENT where a taxel gave no reading.
+
+    Raises:
+        BaselineRefusedError: there is none, with the reason at the freest place.
+    """
+    whole = (counts != ABSENT).all(axis=(1, 2, 3))
+    whole[1:] &= (counts[1:] != counts[:-1]).any(axis=(1, 2, 3))  # a repeated scan is no second sample
+    rows = np.flatnonzero(whole)
+    taken = counts[rows]
+    if len(rows) < FEWEST_RECORDED:
+        raise BaselineRefusedError(f"{len(rows)} whole new scans, expected at least {FEWEST_RECORDED} of a free pad")
+    z = unwrapped(taken)[:, 2].sum(axis=(1, 2), dtype=np.int64)
+    freest = np.argsort(z, kind="stable")[: max(FEWEST_RECORDED, round(FREEST_SHARE * len(rows)))]
+    reference = Baseline.from_counts("freest", taken[freest], 1.0)
+    if len(rows) >= FEWEST_SCANS and _fault(taken[:FEWEST_SCANS], reference) is None:
+        return Stretch(rows[:FEWEST_SCANS], taken[:FEWEST_SCANS], _touched(z, z[:FEWEST_SCANS]))
+    level = np.convolve(z, np.ones(FEWEST_RECORDED), "valid")
+    begins = np.arange(0, len(level), max(1, len(level) // MOST_TRIES))
+    least: BaselineRefusedError | None = None
+    for begin in begins[np.argsort(level[begins], kind="stable")].tolist():
+        fault = _fault(taken[begin : begin + FEWEST_RECORDED], reference)
+        if fault is None:
+            begin, end = _widest(taken, begin, reference)
+            return Stretch(rows[begin:end], taken[begin:end], _touched(z, z[begin:end]))
+        least = least or fault
+    raise BaselineRefusedError(f"nowhere free and still for {FEWEST_RECORDED} scans; where it is freest, {least}")
+
+
+def _touched(z: NDArray[np.int64], free: NDArray[np.int64]) -> bool:
+    """Return True if some scans are as far above those of a stretch as a contact; a single one may be damaged."""
+    return bool((z > np.median(free) + TOUCH_COUNTS).sum() >= FEWEST_TOUCHED)
+
+
+def _widest(taken: NDArray[np.int32], begin: int, reference: Baseline) -> tuple[int, int]:
+    """Return where a stretch is that begins at a place, or up to as many scans before, and is as long as it may be."""
+    end = begin + FEWEST_RECORDED
+    while end + STEP <= min(len(taken), begin + FEWEST_SCANS) and _goes_on(taken, begin, end + STEP, end, reference):
+        end += STEP
+    while begin >= STEP and end - begin + STEP <= FEWEST_SCANS and _goes_on(taken, begin - STEP, end, begin, reference):
+        begin -= STEP
+    return begin, end
+
+
+def _goes_on(taken: NDArray[np.int32], begin: int, end: int, at: int, reference: Baseline) -> bool:
+    """Return True if all these scans are of a free and still pad, and so are those alone that are new at one end.
+
+    A still pad may have a few scans that are far off, and so few of a press must not pass as those.
+    """
+    new = taken[begin:at] if at - begin == STEP else taken[at:end]
+    return _fault(new, reference) is None and _fault(taken[begin:end], reference) is None
+
+
+def _fault(counts: NDArray[np.int32], reference: Baseline) -> BaselineRefusedError | None:
+    """Return the reason for which these scans are none of a free and still pad."""
+    try:
+        refuse_motion(counts)
+        refuse_load(Baseline.from_counts("freest", counts, 1.0), reference)
+    except BaselineRefusedError as refusal:
+        return refusal
+    return None

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+from bridge_samples import REAL_RECORDINGS
+
+from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.scan import ABSENT
+from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
+
+
+def scans(*levels, seed=3):
+    """Return counts of (count, press) parts, with the noise of a still pad; a press of None moves all the time."""
+    rng, parts = np.random.default_rng(seed), []
+    for count, press in levels:
+        part = 30000 + rng.normal(0, 3, (count, 3, 4, 4))
+        part[:, 2] += np.linspace(200, 3000, count)[:, None, None] if press is None else press
+        parts.append(part)
+    return np.concatenate(parts).round().astype(np.int32)
+
+
+def test_the_freest_still_scans_are_taken_wherever_they_are():
+    counts = scans((120, None), (150, 1000), (80, None), (60, 0), (40, None))
+    stretch = free_stretch(counts)
+    assert stretch.rows[0] >= 349 and stretch.rows[-1] < 411 and len(stretch.rows) >= 50
+    baseline = stretch.baseline("4", 5.0)
+    assert np.abs(baseline.counts - 30000).max() < 3 and (baseline.scans, baseline.origin) == (
+        len(stretch.rows),
+        "file",
+    )
+    assert not stretch.opens and stretch.touched
+
+
+def test_a_still_grip_is_not_free():
+    """Still for longer than any other part, and loaded: the pad is free elsewhere, if never for long enough."""
+    with pytest.raises(BaselineRefusedError, match=r"nowhere free and still for 30 scans.*"):
+        free_stretch(scans((200, 1000), (40, None), (FEWEST_RECORDED - 5, 0), (40, None)))
+
+
+def test_a_free_beginning_is_where_a_live_run_zeroes():
+    stretch = free_stretch(scans((110, 2), (50, None), (100, 0)))
+    assert stretch.opens and stretch.rows.tolist() == list(range(100)) and stretch.touched
+
+
+def test_a_recording_without_a_contact_does_not_show_that_its_pad_is_free():
+    assert not free_stretch(scans((40, 8), (60, 0), (40, 60))).touched  # 960 counts in all
+    assert free_stretch(scans((40, 8), (60, 0), (5, 100))).touched
+    assert not free_stretch(scans((40, 8), (60, 0), (4, 100), (40, 0))).touched  # damaged
+
+
+def test_repeated_and_incomplete_scans_are_no_samples():
+    counts = np.repeat(scans((FEWEST_RECORDED - 1, 0)), 4, axis=0)
+    with pytest.raises(BaselineRefusedError, match="29 whole new scans"):
+        free_stretch(counts)
+    counts = scans((60, 0), (60, None))
+    counts[5, :, 1, 1] = ABSENT
+    assert 5 not in free_stretch(counts).rows
+
+
+GRIPS = sorted(REAL_RECORDINGS.glob("*/xela_sensor?.csv"))
+
+
+@pytest.mark.skipif(not GRIPS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
+def test_of_real_grips_the_stretch_with_the_lowest_z_is_taken_and_known_to_be_free_only_after_a_release():
+    """Three trials hold the box to their end. One lets go: it is still at first, too, with 12,000 counts on the pad."""
+    for path in GRIPS:
+        counts = load_recording(path).tracks[0].counts
+        stretch = free_stretch(counts)
+        z = counts[:, 2].sum(axis=(1, 2))
+        assert stretch.rows[0] > len(counts) / 2 and not stretch.opens, path
+        assert np.median(z[stretch.rows]) < np.quantile(z, 0.4), path
+        assert stretch.touched == ("2022-02-22" in path.parent.name), path

@@ -1,0 +1,102 @@
+"""Frames of several sensors that mix on a bus, read in pieces of any length."""
+
+import random
+
+import pytest
+
+from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.slcan_scans import SlcanScans
+
+ORDERS = {name: [can_id for can_id, _ in USPA44_MAP.wire_order(name)] for name in ("4", "6", "8", "10")}
+FRAME_MS = 0.52
+
+
+class OneByOne(SlcanScans):
+    """The same stages, by which every frame is decoded alone as it comes."""
+
+    def _feed_frames(self, packed, frame_bytes, time_ns, scans):
+        self._feed_singly(packed, frame_bytes, time_ns, scans, late=False)
+
+
+def on_the_bus(rng, cycles, *, stamped, faults):
+    """Lines with the time of each in ms: four sensors whose cycles take most of the time, and one foreign frame."""
+    sent = []
+    for lane, order in enumerate(ORDERS.values()):
+        for cycle in range(cycles):
+            begun_ms = 10 * cycle + 2 * lane + rng.random()
+            for place, can_id in enumerate(order):
+                if rng.random() >= faults:
+                    data = bytes([rng.randrange(256) for _ in range(8)])
+                    sent += [(begun_ms + FRAME_MS * place, CanFrame(can_id, data))] * (1 + (rng.random() < faults))
+    sent += [(10.0 * cycle + 3, CanFrame(0x7F0, bytes(8))) for cycle in range(0, cycles, 7)]
+    sent.sort(key=lambda timed: timed[0])
+    return [
+        (time_ms, encode_frame(frame._replace(timestamp_ms=int(time_ms + 59_900) % 60_000) if stamped else frame))
+        for time_ms, frame in sent
+    ]
+
+
+def fed(scans, lines, rng, longest_ms):
+    """Feed the lines in reads of random length, which may end within a line; return scans, and when each came."""
+    came, waiting, due_ms = [], b"", 0.0
+    for time_ms, line in [*lines, (lines[-1][0] + 1000, b"")]:
+        if time_ms >= due_ms:
+            kept = rng.randrange(20) if line else 0
+            data, waiting = waiting[: len(waiting) - kept], waiting[max(len(waiting) - kept, 0) :]
+            came += [(due_ms, scan) for scan in scans.feed(data, int(due_ms * 1e6))]
+            due_ms = time_ms + rng.uniform(0, longest_ms)
+        waiting += line
+    return came
+
+
+@pytest.mark.parametrize("faults", [0.0, 0.002, 0.05])
+@pytest.mark.parametrize("longest_ms", [0.0, 6.0, 60.0])
+def test_mixed_cycles_give_the_scans_that_their_frames_give_one_by_one(longest_ms, faults):
+    for seed in range(2):
+        lines = on_the_bus(random.Random(seed), 60, stamped=True, faults=faults)
+        mixed, one_by_one = SlcanScans(), OneByOne()
+        got, expected = (fed(scans, lines, random.Random(seed), longest_ms) for scans in (mixed, one_by_one))
+        for name in ORDERS:
+            mine, theirs = ([(ms, scan) for ms, scan in some if scan.sensor == name] for some in (got, expected))
+            assert len(mine) == len(theirs) > 40
+            for (ms, scan), (expected_ms, other) in zip(mine, theirs, strict=True):
+                assert (scan.number, scan.counts.tolist()) == (other.number, other.counts.tolist())
+                assert (scan.renewed == other.renewed).all() and ms == expected_ms
+                assert abs(scan.on_bus_ns - other.on_bus_ns) <= 1_000_000
+        assert mixed.can_ids == one_by_one.can_ids
+        counts, others = mixed.counters(), one_by_one.counters()
+        assert counts == others and counts["frames"] == counts["readings"] + counts["foreign"]
+
+
+def test_most_whole_cycles_are_decoded_as_such(monkeypatch):
+    decoded = []
+    singly = SlcanScans._feed_singly
+    monkeypatch.setattr(
+        SlcanScans,
+        "_feed_singly",
+        lambda self, packed, size, *rest, **late: (
+            decoded.append(len(packed) // size),
+            singly(self, packed, size, *rest, **late),
+        ),
+    )
+    lines = on_the_bus(random.Random(1), 60, stamped=True, faults=0.0)
+    assert len(fed(SlcanScans(), lines, random.Random(1), 6.0)) == 240
+    assert sum(decoded) < 0.1 * len(lines)
+
+
+def test_without_stamps_nothing_waits_and_a_broken_link_leaves_nothing():
+    scans = SlcanScans()
+    for stamped in (False, True, False, True):
+        lines = [line for _, line in on_the_bus(random.Random(2), 3, stamped=stamped, faults=0.0)]
+        scans.feed(b"".join(lines[:150]), 0)
+        counts = scans.counters()
+        assert counts["frames"] == counts["readings"] + counts["foreign"]
+        if stamped:
+            assert scans.bytes_until_scan() < 16 * 26
+        scans.begin_anew()
+    counts = scans.counters()
+    assert (
+        counts["readings"]
+        == 16 * counts["scans"] + counts["abandoned"] + counts["unconfirmed"] + (counts["resynchronised"])
+    )
