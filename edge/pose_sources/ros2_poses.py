@@ -21,7 +21,7 @@ from edge.pose_sources.tool_frame import pad_pose, placed
 from edge.pose_sources.transform_tree import TransformTree
 from edge.sinks.ros2.dds_domain import join
 from edge.sinks.ros2.dds_types import dds_type
-from edge.sinks.ros2.pose_messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE, TRANSFORM_STAMPED
+from edge.sinks.ros2.ros_types import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE, TRANSFORM_STAMPED
 from firmware_bridge.errors import CdrError
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose

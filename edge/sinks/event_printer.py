@@ -8,6 +8,8 @@ from typing import Final, TextIO
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
+from edge.terminal.text_wrap import rewritable
+from firmware_bridge.silence import SHOWN_AT_REST_S
 
 CLEAR_LINE: Final = "\r\x1b[K"
 FIRST_HINT_S: Final = 5.0
@@ -17,18 +19,20 @@ FIRST_HINT_S: Final = 5.0
 class MessageSink(Sink):
     """Printer of each event as a line."""
 
+    patience_s = SHOWN_AT_REST_S
+
     def __init__(
         self,
         stream: TextIO | None = None,
         *,
-        hint: str = "",
+        hint: Callable[[], str] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin without an event.
 
         Args:
             stream: output; stderr by default.
-            hint: advice while no scan has come at all; it is printed at growing intervals.
+            hint: returns advice while no scan has come at all; it is printed at growing intervals.
             clock_s: monotonic, in [s].
         """
         self._stream = sys.stderr if stream is None else stream
@@ -40,7 +44,7 @@ class MessageSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Print the events before this scan, and once in a contact that its pattern is not to be believed."""
-        self._hint = ""
+        self._hint = None
         for event in result.events:
             self.say(event)
         sensor = result.scan.sensor
@@ -59,7 +63,7 @@ class MessageSink(Sink):
         silent_s = self._clock_s() - self._begun_s
         if self._hint and silent_s >= self._patience_s:
             self._patience_s *= 2
-            self._say(f"no scan in {silent_s:.0f} s: {self._hint}")
+            self._say(f"no scan in {silent_s:.0f} s: {self._hint()}")
 
     def say(self, event: Event) -> None:
         """Print an event without counters."""
@@ -69,7 +73,7 @@ class MessageSink(Sink):
         if self._stream is None:
             return
         try:
-            self._stream.write(f"{CLEAR_LINE if self._stream.isatty() else ''}edge-sr: {_harmless(text)}\n")
+            self._stream.write(f"{CLEAR_LINE if rewritable(self._stream) else ''}edge-sr: {_harmless(text)}\n")
             self._stream.flush()
         except OSError:
             self._stream = None  # the window was closed; that ends no recording

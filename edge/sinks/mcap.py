@@ -17,16 +17,15 @@ from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import record
 from edge.sinks.mcap_writer import McapFile
 from edge.sinks.ros2.cdr_messages import (
-    IMAGE,
-    LOG,
     RESULT,
-    WRENCH_STAMPED,
     frame_of,
-    image,
     log_message,
     result_message,
+    transforms,
     wrench,
 )
+from edge.sinks.ros2.map_messages import UNITS, image, in_si
+from edge.sinks.ros2.ros_types import IMAGE, LOG, TF_MESSAGE, WRENCH_STAMPED
 from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.forced_end import finishing
 from firmware_bridge.links.base import SourceKind
@@ -37,10 +36,12 @@ from firmware_bridge.recording.pose_messages import POSE, encode_pose
 from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
 from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.zeroing.baseline import Baseline
 
 EVENTS_TOPIC: Final = "/events"
 POSES_TOPIC: Final = "/poses"
+FRAMES_TOPIC: Final = "/tf_static"
 _PROFILE: Final = "ros2"
 
 
@@ -57,6 +58,7 @@ class McapSink(Sink):
         *,
         lossless: bool = True,
         mountings: Mapping[str, Mounting] | None = None,
+        frames: Mapping[str, PadFrame] | None = None,
         geometry: SensorGeometry = USPA44,
         unix_offset_ns: int | None = None,
         origin: SourceKind | None = None,
@@ -69,6 +71,7 @@ class McapSink(Sink):
             contract: of the model that the run begins with.
             lossless: wait for a slow disk, rather than leave records out.
             mountings: of the sensors, by name: without them, axes would point elsewhere when the file is played again.
+            frames: places of the pads on the robot, by sensor name.
             geometry: of the sensors.
             unix_offset_ns: added to the time of a scan gives [ns] since 1970; by default as the clocks are now.
             origin: kind of source that the scans come from, where results are of a recording; else that of the results.
@@ -82,6 +85,7 @@ class McapSink(Sink):
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._baselines: dict[str, Baseline | None] = {}
+        self._geometry, self._frames = geometry, dict(frames or {})
         self._scan, self._baseline = scan_type(geometry.taxel_count), baseline_type(geometry.taxel_count)
         self._origin = origin
         self._source_told = False
@@ -124,23 +128,25 @@ class McapSink(Sink):
         if not self._has_room():
             return
         scan = result.scan
-        sensor, unix_ns = scan.sensor, scan.time_ns + self._offset_ns
+        sensor, unix_ns, frame = scan.sensor, scan.time_ns + self._offset_ns, frame_of(result)
+        on_bus_unix_ns = scan.on_bus_ns + self._offset_ns
         fields = record(result, counters)
         try:
             if not self._source_told:
                 self._file.add_metadata(SOURCE_METADATA, {"kind": self._origin or result.source})
                 self._source_told = True
             if result.baseline is not None and self._baselines.get(sensor) is not result.baseline:
-                data = encode_baseline(result.baseline, result.baseline_age_s, unix_ns)
+                data = encode_baseline(result.baseline, frame, result.baseline_age_s, unix_ns)
                 self._add(sensor, "baseline", self._baseline, unix_ns, data)
                 self._baselines[sensor] = result.baseline
-            self._add(
-                sensor, "scan", self._scan, unix_ns, encode_scan(scan, unix_ns, fields["fresh"], fields["renewed"])
-            )
-            self._add(sensor, "result", RESULT, unix_ns, result_message(result, fields, unix_ns))
+            if sensor in self._frames:
+                self._add("", FRAMES_TOPIC, TF_MESSAGE, unix_ns, transforms({frame: self._frames.pop(sensor)}, unix_ns))
+            data = encode_scan(scan, frame, on_bus_unix_ns, fields["fresh"], fields["renewed"])
+            self._add(sensor, "scan", self._scan, unix_ns, data)
+            self._add(sensor, "result", RESULT, unix_ns, result_message(result, fields, on_bus_unix_ns))
             for name, values in maps_of(result).items():
-                self._add(sensor, name, IMAGE, unix_ns, image(values, frame_of(result), unix_ns))
-            force = wrench(result, unix_ns)
+                self._add(sensor, name, IMAGE, unix_ns, image(in_si(name, values), frame, on_bus_unix_ns))
+            force = wrench(result, self._geometry, on_bus_unix_ns)
             if force is not None:
                 self._add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
             for event in result.events:
@@ -212,7 +218,8 @@ class McapSink(Sink):
             if kind.name not in self._schemas:
                 self._schemas[kind.name] = self._file.add_schema(kind.name, "ros2msg", kind.definition)
             topic = f"/{sensor_path(sensor)}/{name}" if sensor else name
-            channel = self._file.add_channel(topic, "cdr", self._schemas[kind.name], {"sensor": sensor})
+            about = {"sensor": sensor} | ({"unit": UNITS[name].name} if name in UNITS else {})
+            channel = self._file.add_channel(topic, "cdr", self._schemas[kind.name], about)
             self._channels[sensor, name] = channel
         self._file.add_message(channel, unix_ns, data)
 

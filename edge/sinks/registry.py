@@ -8,16 +8,18 @@ from typing import Final
 from edge.errors import UsageError
 from edge.inference.contract import Contract
 from edge.inference.pose_input import POSE_WIDTH
+from edge.pipeline.commands import Commands
 from edge.pipeline.sink import Sink
 from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 FORMS: Final = (
     *("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz", "mcap:FILE.mcap"),
-    *("shm:NAME", "zenoh:KEY", "ros2:TOPIC"),
+    *("shm:NAME", "zenoh:KEY", "ros2:TOPIC", "ros2:TOPIC?commands"),
 )
 _TARGETED: Final = ("jsonl", "npz", "mcap", "shm", "zenoh", "ros2")
 
@@ -35,7 +37,7 @@ def check_sink(text: str) -> tuple[str, str]:
     if not target.endswith(ending):
         raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in {ending}")
     if form == "ros2":
-        base_topic(target)
+        _ros2_topic(target)
     if form == "zenoh":
         from edge.sinks.zenoh import understood
 
@@ -60,11 +62,13 @@ def open_sink(
     *,
     lossless: bool = True,
     mountings: Mapping[str, Mounting] | None = None,
+    frames: Mapping[str, PadFrame] | None = None,
     geometry: SensorGeometry = USPA44,
     unix_offset_ns: int | None = None,
     source: str | None = None,
     origin: SourceKind | None = None,
     stop: threading.Event | None = None,
+    commands: Commands | None = None,
 ) -> Sink:
     """Open the sink that `text` names.
 
@@ -73,14 +77,17 @@ def open_sink(
         contract: names the maps that will come, and their shapes.
         lossless: wait for slow readers, rather than leave records out.
         mountings: of the sensors, by name.
+        frames: places of the pads on the robot, by sensor name.
         geometry: of the sensors.
         unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
         source: kind of the source, written with events.
         origin: kind of source that the scans come from, where a recording names it.
         stop: set when the run is to end: then no slow reader is waited for.
+        commands: takes those that come over a sink that was asked to accept them.
 
     Raises:
-        UsageError: no such form; the forms are listed.
+        UsageError: no such form, and the forms are listed; or a sink in metres, and a model whose patterns have no unit
+            that is known.
         SinkError: the sink cannot be opened.
     """
     # Each is imported only where it is used, which saves start-up time and memory.
@@ -106,6 +113,7 @@ def open_sink(
             origin=origin,
         )
     if form == "mcap":
+        _check_unit(text, contract)
         from edge.sinks.mcap import McapSink
 
         return McapSink(
@@ -113,6 +121,7 @@ def open_sink(
             contract,
             lossless=lossless,
             mountings=mountings,
+            frames=frames,
             geometry=geometry,
             unix_offset_ns=unix_offset_ns,
             origin=origin,
@@ -131,4 +140,35 @@ def open_sink(
         if (error.name or "").partition(".")[0] != "cyclonedds":
             raise
         raise UsageError(f"{text} needs Cyclone DDS: {how_to_install('ros2')}") from error
-    return Ros2Sink(target, unix_offset_ns=unix_offset_ns, source=source)
+    _check_unit(text, contract)
+    topic, accepts = _ros2_topic(target)
+    return Ros2Sink(
+        topic,
+        geometry=geometry,
+        frames=frames,
+        commands=commands if accepts else None,
+        unix_offset_ns=unix_offset_ns,
+        source=source,
+    )
+
+
+def _check_unit(text: str, contract: Contract) -> None:
+    """Check that patterns can be written in metres.
+
+    Raises:
+        UsageError: their unit is another than mm.
+    """
+    if contract.output_unit != "mm":
+        raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
+
+
+def _ros2_topic(target: str) -> tuple[str, bool]:
+    """Return the topic of a target, and whether commands are accepted.
+
+    Raises:
+        UsageError: the target has another form.
+    """
+    topic, asked, option = target.partition("?")
+    if asked and option != "commands":
+        raise UsageError(f"ros2:{target} has {option!r} after its topic, expected ros2:TOPIC or ros2:TOPIC?commands")
+    return base_topic(topic), bool(asked)

@@ -10,14 +10,21 @@ from edge.perception.event import Event
 from edge.perception.result import NextTap, Result
 from edge.pipeline.scan_rate import Rate
 from edge.pipeline.sink import Sink
-from firmware_bridge.silence import SHOWN_SILENT_S
+from edge.terminal.text_wrap import rewritable
+from firmware_bridge.silence import SHOWN_AT_REST_S, SHOWN_SILENT_S
 
 REFRESH_S: Final = 0.1
 CLEAR_TO_END: Final = "\x1b[K"
+ALL_DETAILS: Final = 4
+"""Levels of detail of the line: 4 has all of it, 0 only what a person must act on."""
+_BETWEEN: Final = " | "
+_MORE: Final = " ..."
 
 
 class StatusSink(Sink):
     """Live line, rewritten at most ten times a second; nothing is written where there is no terminal."""
+
+    patience_s = SHOWN_AT_REST_S
 
     def __init__(
         self,
@@ -29,7 +36,7 @@ class StatusSink(Sink):
         self._stream = sys.stderr if stream is None else stream
         self._clock_s = clock_s
         self._columns = columns
-        self._terminal = self._stream is not None and self._stream.isatty()
+        self._terminal = rewritable(self._stream)
         self._latest: dict[str, Result] = {}
         self._rates: dict[str, Rate] = {}
         self._counters: Mapping[str, int] = {}
@@ -73,12 +80,25 @@ class StatusSink(Sink):
     def _show(self, end: str = "") -> None:
         # The last column stays free: some terminals wrap as soon as it is filled.
         try:
-            self._stream.write("\r" + self.line()[: max(self._columns() - 1, 0)] + CLEAR_TO_END + end)
+            self._stream.write("\r" + self._fitted(self._columns() - 1) + CLEAR_TO_END + end)
             self._stream.flush()
         except OSError:
             self._terminal = False  # the window was closed; that ends no recording
 
-    def line(self) -> str:
+    def _fitted(self, columns: int) -> str:
+        """Return the most detailed line of a width; one without details may be too long all the same."""
+        line = self.line()
+        for details in range(ALL_DETAILS - 1, -1, -1):
+            if len(line) <= columns:
+                return line
+            line = self.line(details)
+        if len(line) <= columns:
+            return line
+        room = max(columns - len(_MORE), 0)
+        ends = [line.rfind(between, 0, room + len(between)) for between in (_BETWEEN, " ")]
+        return (line[: next((end for end in ends if end > 0), 0)] + _MORE)[: max(columns, 0)]
+
+    def line(self, details: int = ALL_DETAILS) -> str:
         """Return the line, the most important part first."""
         parts = []
         sources = {result.source for result in self._latest.values()} - {"device"}
@@ -86,7 +106,7 @@ class StatusSink(Sink):
         silence_s = self._clock_s() - self._last_scan_s
         if silence_s >= SHOWN_SILENT_S or not self._latest:
             parts.append(f"no scan for {silence_s:.0f} s")
-        parts += [self._sensor_text(name) for name in sorted(self._latest)]
+        parts += [self._sensor_text(name, details) for name in sorted(self._latest)]
         count = self._counters.get
         if self._without_poses:
             of = ",".join(sorted(name or "" for name in self._without_poses))
@@ -102,44 +122,45 @@ class StatusSink(Sink):
             "poses dropped": count("poses_dropped", 0),
         }
         parts += [f"{number} {name}" for name, number in counts.items() if number]
-        zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
-        parts += [result.baseline_text() for result in zeroed]
-        return " | ".join(parts)
+        if details == ALL_DETAILS:
+            zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
+            parts += [result.baseline_text() for result in zeroed]
+        return _BETWEEN.join(parts)
 
-    def _sensor_text(self, name: str) -> str:
+    def _sensor_text(self, name: str, details: int) -> str:
         result = self._latest[name]
         silence_s = self._clock_s() - self._received_s[name]
         if silence_s >= SHOWN_SILENT_S and len(self._latest) > 1:
             return f"{name} no scan for {silence_s:.0f} s"
-        words = [name, result.state]
+        words = [(0, f"{name} {result.state}")]
         if result.state in ("zeroing", "incomplete") and result.note is not None:
             return f"{name} {result.note}"
         if result.dead:
-            words.append(f"without taxel {','.join(map(str, result.dead))}")
+            words.append((0, f"without taxel {','.join(map(str, result.dead))}"))
         if result.drift is not None and result.drift.step_counts:
-            words.append(f"rest off by {result.drift.step_counts:.0f}")
+            words.append((1, f"rest off by {result.drift.step_counts:.0f}"))
         if result.trusted is False:
-            words.append(f"NOT BELIEVED ({result.untrusted_reason})")
+            words.append((0, f"NOT BELIEVED ({result.untrusted_reason})"))
         if result.contact:
-            words.append(f"tap {result.taps_used}")
+            words.append((2, f"tap {result.taps_used}"))
         if result.force_n is not None:
-            words.append(f"{result.force_n:.2f} N")
+            words.append((0, f"{result.force_n:.2f} N"))
         elif result.force_counts is not None:
-            words.append(f"{result.force_counts:.0f} counts")
+            words.append((0, f"{result.force_counts:.0f} counts"))
         if result.area_mm2 is not None:
-            words.append(f"{result.area_mm2:.0f} mm2")
+            words.append((1, f"{result.area_mm2:.0f} mm2"))
         if result.interval_mm is not None:
-            words.append(f"+-{result.interval_mm:.3f} mm")
+            words.append((2, f"+-{result.interval_mm:.3f} mm"))
         if result.next_tap is not None:
-            words.append(_next_tap_text(result.next_tap))
+            words.append((2, _next_tap_text(result.next_tap)))
         if result.reused_from is not None:
-            words.append("unchanged")
+            words.append((3, "unchanged"))
         elif result.run_time_us is not None:
-            words.append(f"{result.run_time_us:.0f} us")
+            words.append((3, f"{result.run_time_us:.0f} us"))
         rate_hz = self._rates[name].rate_hz
         if rate_hz is not None:
-            words.append(f"{rate_hz:.0f} Hz")
-        return " ".join(words)
+            words.append((3, f"{rate_hz:.0f} Hz"))
+        return " ".join(word for level, word in words if level <= details)
 
 
 def _next_tap_text(proposed: NextTap) -> str:

@@ -17,7 +17,9 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.sinks.json_encoding import record
 from edge.sinks.ros2 import cdr_messages as ros_messages
+from edge.sinks.ros2 import map_messages, ros_types
 from firmware_bridge.errors import CdrError
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.cdr import HEADER, MessageType, stamp
 from firmware_bridge.recording.scan_messages import SCAN, decode_scan, encode_scan
 from firmware_bridge.scans.scan import VendorReading
@@ -99,45 +101,46 @@ STAMP = Time(1_700_000_000, 123_456_789)
 def test_an_image_is_what_cyclonedds_writes(sensor):
     values = np.random.default_rng(1).normal(size=(3, 5)).astype(np.float32)
     expected = Image(Header(STAMP, sensor), 3, 5, "32FC1", 0, 20, list(values.tobytes())).serialize()
-    data = ros_messages.image(values, sensor, UNIX_NS)
+    data = map_messages.image(values, sensor, UNIX_NS)
     assert data == bytes(expected)
-    assert ros_messages.image_map(data).tobytes() == values.tobytes()
+    assert map_messages.image_map(data).tobytes() == values.tobytes()
 
 
 def test_an_image_of_columns_is_written_row_by_row():
     values = np.arange(12, dtype=np.float32).reshape(3, 4).T
-    assert (ros_messages.image_map(ros_messages.image(values, "4", 0)) == values).all()
+    assert (map_messages.image_map(map_messages.image(values, "4", 0)) == values).all()
 
 
 def test_another_image_is_not_taken_for_a_map():
-    said = ros_messages.IMAGE.decode(ros_messages.image(np.zeros((2, 2), np.float32), "4", 0))
+    said = ros_types.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
-        ros_messages.image_map(ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
+        map_messages.image_map(ros_types.IMAGE.encode({**said, "encoding": "mono8"}))
 
 
-def test_a_force_says_what_is_known_and_no_more():
+def test_a_force_is_a_wrench_where_all_of_it_is_known():
     newtons = np.full((3, 4, 4), 0.125, np.float32)
     scan = make_scan(press_counts=3000)
     result = Result(replace(scan, vendor=VendorReading(newtons)), "device", "m", "contact", force_n=2.5)
-    nothing = Vector3(math.nan, math.nan, math.nan)
-    for force_n, vector in ((2.0, Vector3(2.0, 2.0, 2.0)), (2.5, Vector3(math.nan, math.nan, 2.5))):
-        expected = WrenchStamped(Header(STAMP, "4"), Wrench(vector, nothing)).serialize()
-        said = ros_messages.wrench(replace(result, force_n=force_n), UNIX_NS)
-        assert said == bytes(expected), "x and y are known where all of it is the vendor's"
-    said = ros_messages.WRENCH_STAMPED.decode(ros_messages.wrench(replace(result, scan=scan), UNIX_NS))
-    assert said["wrench"]["force"]["z"] == 2.5 and math.isnan(said["wrench"]["force"]["x"])
+    nothing = Vector3(0.0, 0.0, 0.0)  # equal forces all over the pad turn it nowhere
+    expected = WrenchStamped(Header(STAMP, "4"), Wrench(Vector3(2.0, 2.0, 2.0), nothing)).serialize()
+    said = ros_messages.wrench(replace(result, force_n=2.0), USPA44, UNIX_NS)
+    assert said is not None and abs(np.frombuffer(said[-48:]) - np.frombuffer(bytes(expected)[-48:])).max() < 1e-12
+    assert said[:-48] == bytes(expected)[:-48]
+    assert ros_messages.wrench(result, USPA44, UNIX_NS) is None, "z of another calibration than x and y"
+    assert ros_messages.wrench(replace(result, scan=scan), USPA44, UNIX_NS) is None
 
 
 @pytest.mark.parametrize(("source", "frame"), [("device", "4"), ("emulated", "emulated/4"), ("replay", "replay/4")])
 def test_the_frame_says_where_there_is_no_sensor(source, frame):
     result = Result(make_scan(press_counts=3000), source, "m", "contact", force_n=2.5)
-    said = ros_messages.WRENCH_STAMPED.decode(ros_messages.wrench(result, UNIX_NS))
+    assert ros_messages.frame_of(result) == frame
+    said = ros_messages.RESULT.decode(ros_messages.result_message(result, record(result, {}), UNIX_NS))
     assert said["header"]["frame_id"] == frame
 
 
 def test_nothing_known_in_newtons_is_no_wrench():
     result = Result(make_scan(press_counts=3000), "device", "m", "contact", force_counts=3000.0)
-    assert ros_messages.wrench(result, UNIX_NS) is None
+    assert ros_messages.wrench(result, USPA44, UNIX_NS) is None
 
 
 @pytest.mark.parametrize(("kind", "level"), [("lost", 40), ("silent", 30), ("back", 20), ("sink", 40)])
@@ -150,7 +153,7 @@ def test_an_event_is_a_line_of_the_log(kind, level):
 def test_a_scan_is_what_cyclonedds_writes_and_comes_back_as_it_was(number):
     for scan in odd_scans(4)[2 * number : 2 * number + 2]:
         fresh, renewed = (sum(1 << i for i, one in enumerate(m.ravel()) if one) for m in (scan.fresh, scan.renewed))
-        data = encode_scan(scan, UNIX_NS, fresh, renewed)
+        data = encode_scan(scan, scan.sensor, UNIX_NS, fresh, renewed)
         vendor = scan.vendor or VendorReading()
         lists = [[] if a is None else a.ravel().tolist() for a in (vendor.newtons, vendor.temperature_k, vendor.ups_hz)]
         device_ns = -1 if scan.device_ns is None else scan.device_ns
@@ -219,7 +222,7 @@ def test_a_definition_names_the_messages_in_it():
     text = SCAN.definition
     assert text.count("=" * 80) == 2
     assert text.index("MSG: std_msgs/Header\n") < text.index("MSG: builtin_interfaces/Time\nint32 sec\n")
-    assert ros_messages.WRENCH_STAMPED.definition.count("MSG: geometry_msgs/Vector3\n") == 1
+    assert ros_types.WRENCH_STAMPED.definition.count("MSG: geometry_msgs/Vector3\n") == 1
     for wrong in ("float128 a", "int8 A", "std_msgs/Other a", "string[] a"):
         with pytest.raises(ValueError, match=r"kind|not a field"):
             MessageType("x/msg/X", wrong)

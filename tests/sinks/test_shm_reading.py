@@ -113,9 +113,13 @@ class TestReading:
         for time_ns in (now_ns - 60_000_000_000, now_ns + 60_000_000_000):  # the latter is of another machine
             sink.write(replace(result, scan=replace(result.scan, time_ns=time_ns)), {})
             assert shm_read.latest(memory, "4", **young) is None
+            refused = shm_read.refusal(shm_read.newest(memory)["4"], **young)
+            assert re.fullmatch(r"the newest reading is -?(60|59)\.\d\d s old, expected under 60", refused)
         for source in ("emulated", "replay"):
             sink.write(replace(result, source=source), {})
             assert shm_read.latest(memory, "4", **young) is None
+            refused = shm_read.refusal(shm_read.newest(memory)["4"], **young)
+            assert refused.startswith(f"its source is {source}, not a device: --pretend")
             assert shm_read.latest(memory, "4", **young, pretend=True) is not None
 
     def test_a_depth_that_is_not_to_be_believed_is_not_shown(self, sink, name):
@@ -129,15 +133,22 @@ class TestReading:
             assert re.fullmatch(line, shm_read.described(memory, latest(memory, "4")))
 
     @pytest.mark.parametrize(
-        ("words", "line"), [(["--pretend"], r"\d+ counts, [\d.]+ mm at most"), ([], "nothing to .*")]
+        ("words", "line"),
+        [
+            (["left/4", "--pretend"], r"\d+ counts, [\d.]+ mm at most"),
+            (["left/4"], "nothing to act on: its source is emulated, not a device: .*"),
+            (["5"], "nothing to act on: no sensor 5, but left/4.*"),
+        ],
     )
     def test_the_example_prints_what_it_acts_on_until_the_memory_is_gone(self, name, start_writer, words, line):
         start_writer()
-        command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, "left/4", *words]
+        command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, *words]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         with ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, **pipes)) as reader:
             while not re.fullmatch(line, told := reader.stdout.readline().rstrip()):
-                assert told == "nothing to act on", "of the writer, which had no turn for 50 ms"
+                assert told.startswith("nothing to act on: the newest reading is"), (
+                    "of the writer, which had no turn for 50 ms"
+                )
             Path("/dev/shm", name).unlink()
             _, errors = reader.communicate()
         assert reader.returncode == 1

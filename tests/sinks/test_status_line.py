@@ -23,9 +23,19 @@ def test_what_others_wrote_does_nothing_to_the_terminal():
     assert stream.getvalue() == "edge-sr: \\x1b[2J\\x9b\\rpad\\n\\ud800 in µm\n"
 
 
+def test_a_terminal_that_knows_no_escape_sequences_gets_none(monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    stream = Terminal()
+    status, messages = StatusSink(stream), MessageSink(stream)
+    status.write(make_results(1)[0], RUN)
+    messages.tell(Event(0, "trouble", None, "the cable is out"), {})
+    status.close()
+    assert stream.getvalue() == "edge-sr: the cable is out\n"
+
+
 def test_what_to_do_is_said_ever_more_seldom_until_the_first_scan():
     stream, now_s = io.StringIO(), [0.0]
-    messages = MessageSink(stream, hint="is it powered?", clock_s=lambda: now_s[0])
+    messages = MessageSink(stream, hint=lambda: "is it powered?", clock_s=lambda: now_s[0])
     for now_s[0] in np.arange(0, 60, 0.5):
         messages.wait()
     hints = [f"edge-sr: no scan in {silent_s} s: is it powered?" for silent_s in (5, 10, 20, 40)]
@@ -78,6 +88,28 @@ class TestStatus:
             " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overrun | 3 torn"
             f" | baseline {BASELINE.id} 12 s old"
         )
+
+    @pytest.mark.parametrize(
+        ("columns", "line"),
+        [
+            (150, "EMULATED | 4 contact tap 1 3002 counts 22 mm2 250 us 100 Hz | 6 no stored baseline for sensor 6"),
+            (132, "EMULATED | 4 contact 3002 counts 22 mm2 | 6 no stored baseline for sensor 6"),
+            (100, "EMULATED | 4 contact 3002 counts | 6 no stored baseline for sensor 6, only for 4: zeroing ..."),
+            (60, "EMULATED | 4 contact 3002 counts ..."),
+            (20, "EMULATED ..."),
+            (10, " ..."),
+            (4, " .."),
+            (0, ""),
+        ],
+    )
+    def test_a_narrow_terminal_gets_fewer_words_and_none_cut(self, columns, line):
+        sink = self.make(columns)
+        ticks = iter(range(0, 10**9, 250_000))
+        for result in make_results(4, clock_ns=lambda: next(ticks)):
+            sink.write(result, RUN)
+        sink.close()
+        shown = self.shown()[-1].rstrip("\n").removesuffix("\x1b[K")
+        assert shown.startswith(line) and len(shown) <= max(columns - 1, 0), shown
 
     def test_newtons_where_calibrated_and_no_source_for_a_device(self):
         sink = self.make()
@@ -163,7 +195,7 @@ class TestStatus:
         for result in make_results(8):
             sink.write(result, RUN)
             self.now_s += 1
-        assert max(len(line) for line in self.shown()) == columns - 1
+        assert self.shown() and max(len(line) for line in self.shown()) <= max(columns - 1, 0)
 
     def test_the_last_line_stands_at_the_end(self):
         sink = self.make()

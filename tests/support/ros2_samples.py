@@ -1,8 +1,14 @@
-"""Results for the ROS 2 sink, and the environment that keeps its tests to this machine."""
+"""Results for the ROS 2 sink, nodes that listen and speak, and the environment that keeps them to this machine."""
 
+import json
 import os
+import queue
+import subprocess
+import sys
+import threading
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +16,13 @@ import pytest
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 import ros2_messages
-from edge_samples import make_scan
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.topic import Topic
+from edge_samples import ROOT, make_scan
 
 from edge.perception.result import Result
+from edge.sinks.ros2 import dds_domain as ros2_domain
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.links.base import SourceKind
 
@@ -23,6 +33,16 @@ ENVIRONMENT = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     "CYCLONEDDS_URI": TAG,
 }
+
+LISTENERS_CONFIGURATION = (
+    '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    '<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer address="localhost"/></Peers></Discovery>'
+    f"</Domain></CycloneDDS>,{TAG}"
+)
+PYTHONPATH = os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "tests/support"), os.environ.get("PYTHONPATH"))))
+PATIENCE_S = 20
+CDR = Qos(Policy.Reliability.Reliable(0), Policy.DataRepresentation(use_cdrv0_representation=True))
 
 
 def contact(number, *, sensor="4", source: SourceKind = "device", **changes):
@@ -47,7 +67,78 @@ def keep_published(sink, kept, *names):
         if not names or name in names:
             kept.append(ros2_messages.decode(name, data))
 
-    sink._publish = keep
+    sink._publish, sink._is_read = keep, lambda writer: True
+
+
+class Listener:
+    """A subscriber; its lines are kept as they come."""
+
+    def __init__(self, topics, *words, more=""):
+        environment = os.environ | {
+            "CYCLONEDDS_URI": LISTENERS_CONFIGURATION + more,
+            "PYTHONPATH": PYTHONPATH,
+        }
+        command = [sys.executable, str(ROOT / "tests/support/ros2_listener.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
+        self.process = subprocess.Popen(
+            [*command, json.dumps(topics), *words], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        self.heard = []
+        self._lines = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        for line in self.process.stdout or ():
+            self._lines.put(json.loads(line))
+
+    def of(self, topic):
+        self._keep()
+        return [line["message"] for line in self.heard if line["topic"] == topic]
+
+    def _keep(self):
+        while not self._lines.empty():
+            self.heard.append(self._lines.get())
+
+    def until(self, satisfied, act=lambda: None):
+        """Go on acting until the messages that were received suffice."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not satisfied():
+            assert time.monotonic() < end_s, f"heard only {[line['topic'] for line in self.heard]}"
+            assert self.process.poll() is None
+            act()
+            time.sleep(0.01)
+
+    def __enter__(self):
+        self.until(lambda: self._keep() or self.heard)
+        return self
+
+    def __exit__(self, *exc_info):
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+class Speaker:
+    """A node that says a word on a topic until it is heard."""
+
+    def __init__(self, topic, word):
+        self._domain, self._participant = ros2_domain.join(ENVIRONMENT)
+        kind: Any = ros2_messages.dds_type("std_msgs/msg/String")
+        self._writer = DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), CDR)
+        self._message = kind(data=word)
+
+    def until(self, satisfied):
+        end_s = time.monotonic() + PATIENCE_S
+        while not satisfied():
+            assert time.monotonic() < end_s
+            self._writer.write(self._message)
+            time.sleep(0.01)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc_info):
+        del self._writer, self._participant, self._domain
 
 
 @pytest.fixture

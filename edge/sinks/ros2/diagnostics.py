@@ -81,8 +81,9 @@ def _values(result: Result, counters: Mapping[str, int], silence_s: float | None
     if silence_s is not None:
         values["scan_age_s"] = _text(silence_s)
     values["dead"] = ", ".join(f"{taxel}: {reason}" for taxel, reason in result.dead.items())
-    if result.force_n is None and result.wrench is None:
-        values["force"] = "counts only, so there is no wrench: --counts-per-newton gives newtons"
+    if result.wrench is None and result.scan.vendor_force_n is None:
+        known = "counts only" if result.force_n is None else "z alone, which is on force_z_n"
+        values["wrench"] = f"not published: of the force there is {known}; a model with traction gives all of it"
     return values | {name: str(count) for name, count in counters.items() if count}
 
 

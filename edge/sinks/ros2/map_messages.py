@@ -1,0 +1,130 @@
+"""Maps as ROS 2 messages in the units that ROS has: images and clouds of points. No I/O."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.perception.result import Result
+from edge.sinks.ros2.ros_types import IMAGE, POINT_CLOUD, header
+from firmware_bridge.pad_geometry import SensorGeometry
+from firmware_bridge.scans.scan import ABSENT, Scan
+
+_POINT_FIELDS: Final = ("x", "y", "z", "fx", "fy", "fz", "sigma")
+_FLOAT32: Final = 7
+"""Number of float32 in sensor_msgs/PointField."""
+
+
+class Unit(NamedTuple):
+    """Unit of a map in messages, and the factor to it from the map's own."""
+
+    name: str
+    factor: float
+
+
+UNITS: Final[Mapping[str, Unit]] = {
+    "pattern": Unit("m", 1e-3),
+    "deviation": Unit("m", 1e-3),
+    "traction": Unit("Pa", 1e3),
+}
+
+
+def in_si(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the map of this name in its unit of UNITS."""
+    return values * np.float32(UNITS[name].factor)
+
+
+def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
+    """Return a map (H, W) as an Image of encoding 32FC1, x to the right and y down.
+
+    A map (3, H, W) of vectors becomes one of 3 H rows: x, below it y, below it z.
+    """
+    pixels = np.ascontiguousarray(values.reshape(-1, values.shape[-1]), dtype="<f4")
+    height, width = pixels.shape
+    return IMAGE.encode(
+        {
+            "header": header(frame, unix_ns),
+            "height": height,
+            "width": width,
+            "encoding": "32FC1",
+            "is_bigendian": 0,
+            "step": 4 * width,
+            "data": pixels.view(np.uint8),
+        }
+    )
+
+
+def image_map(data: bytes) -> NDArray[np.float32]:
+    """Return the map (H, W) in an Image that `image` made.
+
+    Raises:
+        CdrError: it is not an Image.
+        ValueError: the Image is of another encoding or byte order.
+    """
+    image = IMAGE.decode(data)
+    if image["encoding"] != "32FC1" or image["is_bigendian"]:
+        raise ValueError(f"an image of encoding {image['encoding'][:20]!r}, expected 32FC1, little-endian")
+    return image["data"].view("<f4").reshape(image["height"], image["width"])
+
+
+def taxels(scan: Scan) -> NDArray[np.float32]:
+    """Return the raw counts (3, rows, cols) of a scan, NaN where a taxel gave no reading."""
+    counts = scan.counts.astype(np.float32)
+    counts[scan.counts == ABSENT] = np.nan
+    return counts
+
+
+def points(result: Result, geometry: SensorGeometry, frame: str, unix_ns: int) -> bytes:
+    """Return a pattern as a cloud of a point per pixel; without a pattern, an empty cloud.
+
+    The fields are float32: x and y on the pad's face and z into it, in [m]; the force on the pixel fx, fy, fz in [N]
+    and the standard deviation sigma of z in [m], NaN where the model gives none.
+    """
+    cloud = np.empty((0, 0, len(_POINT_FIELDS)), dtype="<f4")
+    if result.pattern is not None:
+        height, width = result.pattern.shape
+        cloud = np.full((height, width, len(_POINT_FIELDS)), np.nan, dtype="<f4")
+        cloud[..., :2] = _pixel_places_m(height, width, geometry)
+        cloud[..., 2] = in_si("pattern", result.pattern)
+        if result.traction is not None:
+            cloud[..., 3:6] = _pixel_forces_n(result.traction, height, width, geometry)
+        if result.deviation is not None:
+            cloud[..., 6] = in_si("deviation", result.deviation)
+    height, width, numbers = cloud.shape
+    return POINT_CLOUD.encode(
+        {
+            "header": header(frame, unix_ns),
+            "height": height,
+            "width": width,
+            "fields": [
+                {"name": name, "offset": 4 * index, "datatype": _FLOAT32, "count": 1}
+                for index, name in enumerate(_POINT_FIELDS)
+            ],
+            "is_bigendian": False,
+            "point_step": 4 * numbers,
+            "row_step": 4 * numbers * width,
+            "data": cloud.view(np.uint8),
+            "is_dense": bool(np.isfinite(cloud).all()),
+        }
+    )
+
+
+@lru_cache(maxsize=8)
+def _pixel_places_m(height: int, width: int, geometry: SensorGeometry) -> NDArray[np.float32]:
+    """Return x and y of the pixels (H, W, 2) from the middle of the face, in [m]."""
+    pitch_m = geometry.pixel_pitch_mm(height // geometry.rows) / 1e3
+    y, x = np.indices((height, width), dtype=np.float32)
+    return np.stack([x - (width - 1) / 2, y - (height - 1) / 2], axis=2) * np.float32(pitch_m)
+
+
+def _pixel_forces_n(
+    traction_kpa: NDArray[np.float32], height: int, width: int, geometry: SensorGeometry
+) -> NDArray[np.float32]:
+    """Return the force on each pixel (H, W, 3) of a traction (3, h, w) over the same face."""
+    _, rows, cols = traction_kpa.shape
+    pixel_m2 = (geometry.pixel_pitch_mm(height // geometry.rows) / 1e3) ** 2
+    at_rows, at_cols = np.arange(height) * rows // height, np.arange(width) * cols // width
+    forces = traction_kpa * np.float32(UNITS["traction"].factor * pixel_m2)
+    return forces[:, at_rows][:, :, at_cols].transpose(1, 2, 0)
