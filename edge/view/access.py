@@ -69,11 +69,17 @@ class Access:
             return Refusal(HTTPStatus.FORBIDDEN, text)
         return None
 
-    def url(self, port: int) -> str:
-        """Return the page's address for a person on this machine, or on another where others can reach it."""
-        host = self.name if _is_everything(self.host) else self.host
-        shown = f"[{host}]" if ":" in host else host
-        return f"http://{shown}:{port}{PAGE}" + ("" if self.token is None else f"?token={self.token}")
+    def urls(self, port: int, addresses: Sequence[str] = ()) -> list[str]:
+        """Return the addresses of the page, the most useful first.
+
+        Args:
+            port: of the server.
+            addresses: of this machine, where the server listens at all of them. Its name is the last: other machines
+                may not know it.
+        """
+        hosts = [*addresses, self.name] if is_everything(self.host) else [self.host]
+        query = "" if self.token is None else f"?token={self.token}"
+        return [f"http://{f'[{host}]' if ':' in host else host}:{port}{PAGE}{query}" for host in hosts]
 
     def _is_ours(self, host: str) -> bool:
         matched = _HOST.fullmatch(host)
@@ -84,7 +90,7 @@ class Access:
             return True
         address = _address(name)
         if address is not None:
-            return address.is_loopback or _is_everything(self.host)
+            return address.is_loopback or is_everything(self.host)
         # Any domain will do: a stranger may use this name too, but needs the token where other machines can reach us.
         return not is_loopback(self.host) and name.partition(".")[0] == self.name.lower().partition(".")[0]
 
@@ -109,7 +115,8 @@ def is_loopback(host: str) -> bool:
     return host.lower() == "localhost" if address is None else address.is_loopback
 
 
-def _is_everything(host: str) -> bool:
+def is_everything(host: str) -> bool:
+    """Return True if the host stands for all addresses of this machine."""
     address = _address(host)
     return address is not None and address.is_unspecified
 

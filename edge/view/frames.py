@@ -13,6 +13,7 @@ from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import encodable, event_record, record
 from edge.view.run_snapshot import Newest, NumberedEvent, Point, RunSnapshot
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.replay_player import PlayerState
 from firmware_bridge.silence import SENSOR_SILENT_NS
 
 VERSION: Final = 1
@@ -148,6 +149,7 @@ def hello(run: Run, recording: Path | None) -> bytes:
         "taps": contract.taps,
         "pattern_unit": contract.output_unit,
         "full_scale": contract.output_full_scale,
+        "contact_level": contract.contact_level,
         "pixel_pitch_mm": contract.pitch_mm / contract.scale,
         "taxel_pitch_mm": contract.pitch_mm,
         "rows": contract.rows,
@@ -162,9 +164,17 @@ def hello(run: Run, recording: Path | None) -> bytes:
     return pack(header, {})
 
 
-def state(recording: Path | None, viewers: int, silent: dict[str, float]) -> bytes:
-    """Return the frame of the run's state apart from its results."""
-    return pack({"kind": "state", "recording": _path(recording), "viewers": viewers, "silent": silent}, {})
+def state(
+    recording: Path | None,
+    viewers: int,
+    silent: dict[str, float],
+    played: PlayerState | None = None,
+    recorded: tuple[float, int] | None = None,
+) -> bytes:
+    """Return the frame of the run's state apart from its results; `recorded` is length in [s] and size in bytes."""
+    header = {"kind": "state", "recording": _path(recording), "viewers": viewers, "silent": silent}
+    header["recorded_s"], header["recorded_bytes"] = (None, None) if recorded is None else recorded
+    return pack(header | {"replay": None if played is None else played._asdict()}, {})
 
 
 def refused(time_ns: int, why: str, source: SourceKind | None) -> bytes:
@@ -184,7 +194,8 @@ def _drawn(point: Point, first_ns: int) -> list[float | None]:
     force = None if point.force_counts is None else round(point.force_counts, 1)
     area = None if point.area_mm2 is None else round(point.area_mm2, 2)
     force_n = None if point.force_n is None else round(point.force_n, 4)
-    return [round((point.time_ns - first_ns) / 1e9, 3), force, area, force_n]
+    shear = None if point.shear_ratio is None else round(point.shear_ratio, 3)
+    return [round((point.time_ns - first_ns) / 1e9, 3), force, area, force_n, shear]
 
 
 def _seconds(ns: int) -> float:

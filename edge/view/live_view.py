@@ -14,13 +14,15 @@ from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.pipeline.commands import Commands
 from edge.pipeline.sink import Sink
-from edge.view.access import grant
+from edge.view.access import grant, is_everything
 from edge.view.frames import Run
+from edge.view.own_addresses import own_addresses
 from edge.view.recorder import FORM, Recorder
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.server import Server
 from edge.view.sink import ViewSink
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.replay_player import Player
 
 LOOPBACK: Final = "127.0.0.1"
 
@@ -31,6 +33,7 @@ class LiveView:
     Attributes:
         sinks: sinks that the loop writes to; they never fail.
         url: the page's address.
+        other_urls: more addresses of it, where it listens at all addresses of this machine.
     """
 
     def __init__(
@@ -62,12 +65,22 @@ class LiveView:
         self._recorder = Recorder(record_dir, self._tell)
         commands.record = self._recorder.record
         import_module(f"edge.sinks.{FORM}")  # now, not between two scans: the import may take a fifth of a second
-        self._server = Server(self._snapshot, commands, access, port, lambda: self._recorder.path, self._failed)
+        recorder = self._recorder
+        self._server = Server(
+            self._snapshot,
+            commands,
+            access,
+            port,
+            lambda: recorder.path,
+            lambda: recorder.recorded,
+            failed=self._failed,
+        )
         self._view = ViewSink(self._snapshot, lambda: self._server.watched, self._server.wake)
         self._contract = contract
         self._open = contextlib.ExitStack()
         self.sinks: list[Sink] = [self._recorder, self._view]
-        self.url = access.url(self._server.port)
+        addresses = own_addresses(host) if is_everything(host) else []
+        self.url, *self.other_urls = access.urls(self._server.port, addresses)
 
     def __enter__(self) -> Self:
         self._open.callback(self._server.close)
@@ -84,6 +97,7 @@ class LiveView:
         model: str,
         open_sink: Callable[[str], Sink],
         messages: Callable[[Event], object],
+        player: Player | None = None,
     ) -> None:
         """Answer requests from now on.
 
@@ -93,10 +107,11 @@ class LiveView:
             model: name of the model that the run begins with.
             open_sink: opens the sink that a text names, to record into.
             messages: called with the events of recordings, which viewers get too.
+            player: of the recording that is shown, which begins with the first viewer; None if viewers cannot steer it.
         """
         self._messages = messages
         self._recorder.open_sink = open_sink
-        self._server.begin(Run(name, kind, model, self._contract, secrets.token_hex(8)))
+        self._server.begin(Run(name, kind, model, self._contract, secrets.token_hex(8)), player)
 
     def show_map(self, state: MapState) -> None:
         """Show a state of the map. Never waits."""

@@ -53,12 +53,24 @@ class Recorder(Sink):
         self._aside.submit(get_native_id).result()
         self._opening: Future[tuple[Sink, Path]] | None = None
         self._wanted = False
+        self._begun_s = 0.0
         self._closing: tuple[Future[None], Path | None] | None = None
 
     @property
     def unwritten(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Number of records left out, of all recordings."""
         return self._unwritten + (0 if self._sink is None else self._sink.unwritten)
+
+    @property
+    def recorded(self) -> tuple[float, int] | None:
+        """Length of the recording so far in [s], and size of its file in bytes; None while there is none."""
+        path, begun_s = self.path, self._begun_s
+        if path is None:
+            return None
+        try:
+            return round(time.monotonic() - begun_s, 1), path.stat().st_size
+        except OSError:
+            return None  # it was moved or removed meanwhile
 
     def record(self, on: bool) -> None:
         """Begin a recording, or end it; does nothing where that is so already."""
@@ -138,7 +150,8 @@ class Recorder(Sink):
     def _begin(self, opened: Future[tuple[Sink, Path]]) -> None:
         self._opening = None
         try:
-            self._sink, self.path = opened.result()
+            self._sink, path = opened.result()
+            self._begun_s, self.path = time.monotonic(), path
         except SinkError as error:
             self._say("sink", f"not recording: {error}")
             return

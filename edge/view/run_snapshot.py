@@ -31,6 +31,7 @@ class Point(NamedTuple):
         force_counts: or None.
         area_mm2: or None.
         force_n: or None.
+        shear_ratio: share of the force that is shear, or None.
     """
 
     number: int
@@ -38,6 +39,7 @@ class Point(NamedTuple):
     force_counts: float | None
     area_mm2: float | None
     force_n: float | None
+    shear_ratio: float | None
 
 
 class Newest(NamedTuple):
@@ -140,7 +142,8 @@ class _Trace:
         self.number += 1
         time_ns = result.scan.time_ns
         self.rate.add(time_ns)
-        point = Point(self.number, time_ns, result.force_counts, result.area_mm2, result.force_n)
+        shear = None if result.wrench is None else result.wrench.shear_ratio
+        point = Point(self.number, time_ns, result.force_counts, result.area_mm2, result.force_n, shear)
         self._recent.append(point)
         past = self._past
         if not past or time_ns // _POINT_NS != past[-1].time_ns // _POINT_NS:

@@ -34,6 +34,7 @@ from edge.view.static_page import load_page
 from edge.view.viewer_commands import LONGEST_BYTES, execute
 from edge.view.viewer_connection import Attended
 from firmware_bridge.links.base import SourceKind
+from firmware_bridge.links.replay_player import Player
 
 STATE_S: Final = 1.0
 TIDY_S: Final = 10.0
@@ -62,6 +63,7 @@ class Server:
         access: Access,
         port: int,
         recording: Callable[[], Path | None] = lambda: None,
+        recorded: Callable[[], tuple[float, int] | None] = lambda: None,
         failed: Callable[[str], object] = lambda text: None,
     ) -> None:
         """Take the port; pages are answered from `begin` to `close`.
@@ -72,6 +74,7 @@ class Server:
             access: conditions that a request must meet.
             port: 0 for any free one.
             recording: returns the file that is recorded into, or None.
+            recorded: returns its length in [s] and its size in bytes, or None.
             failed: called with the reason when the page ends early, from the server's thread.
 
         Raises:
@@ -82,6 +85,7 @@ class Server:
         self._commands = commands
         self._access = access
         self._recording = recording
+        self._recorded = recorded
         self._failed = failed
         self._page = load_page()
         self._socket = _listen(access.host, port)
@@ -93,10 +97,11 @@ class Server:
         self._news = asyncio.Event()
         self._ending = False
         self._source: SourceKind | None = None
+        self._player: Player | None = None
 
-    def begin(self, run: Run) -> None:
-        """Answer pages and sockets; `run` is the first that a viewer gets."""
-        self._source = run.kind
+    def begin(self, run: Run, player: Player | None = None) -> None:
+        """Answer pages and sockets; `run` is the first that a viewer gets, who steers the player."""
+        self._source, self._player = run.kind, player
         ready = threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(run, ready), name="live-view")
         self._thread.start()
@@ -160,12 +165,15 @@ class Server:
                         await self._news.wait()
                 self._news.clear()
                 frames = Frames(self._snapshot, time.monotonic_ns(), self._source)
-                silent, recording = frames.silent(), self._recording()
-                new_state = (recording, len(self._viewers), tuple(silent))
+                played = None if self._player is None else self._player.state
+                # A recording that rests is not silent: nothing is wrong with its sensors.
+                silent = {} if played is not None and played.rests else frames.silent()
+                recording = self._recording()
+                new_state = (recording, len(self._viewers), tuple(silent), played and played[1:])
                 now_s = time.monotonic()
                 if new_state != sent or now_s - sent_s >= STATE_S:
                     sent, sent_s = new_state, now_s
-                    broadcast(self._viewers, state(recording, len(self._viewers), silent))
+                    broadcast(self._viewers, state(recording, len(self._viewers), silent, played, self._recorded()))
                 gone = self._connections.gone
                 if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
                     self._connections.gone, tidied_s, closing = 0, now_s, gone > 0
@@ -202,13 +210,17 @@ class Server:
                 return
             self._viewers[connection] = attended
             self.watched = True
+            if self._player is not None:
+                self._player.begin()
             pinging = asyncio.create_task(attended.follow())
             try:
                 self._news.set()
                 async for message in connection:
                     if connection.state is not State.OPEN:
                         break  # many commands may wait from before it closed, and each takes its time
-                    why = execute(message, attended.viewer, self._commands)
+                    why = execute(message, attended.viewer, self._commands, self._player)
+                    if self._player is not None:
+                        self._news.set()
                     if why is not None:
                         broadcast([connection], refused(time.monotonic_ns(), why, self._source))
                     await asyncio.sleep(COMMAND_PAUSE_S)

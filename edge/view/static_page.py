@@ -9,8 +9,8 @@ FOLDER: Final = Path(__file__).with_name("page")
 STYLE_LINK: Final = b'<link rel="stylesheet" href="page.css">'
 SCRIPT_LINK: Final = b'<script type="module" src="page.js"></script>'
 SCRIPTS: Final = (
-    *("colour_map.js", "words.js", "link.js", "traces.js", "marks.js"),
-    *("numbers.js", "sensor.js", "map.js", "page.js"),
+    *("colour_map.js", "words.js", "link.js", "traces.js", "marks.js", "history.js", "contact_shape.js", "relief.js"),
+    *("overlay.js", "explain.js", "numbers.js", "limits.js", "sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
 )
 """Files of the script in the order in which they are joined, so that they share one scope."""
 

@@ -1,27 +1,29 @@
 """Commands of viewers: JSON as on stdin, and commands that belong to the page alone."""
 
 import json
+import math
 from typing import Any, Final
 
 from edge.pipeline.commands import WAITING, Command, Commands, runtime_command
 from edge.view.viewer_state import Viewer
+from firmware_bridge.links.replay_player import Player
 
 LONGEST_BYTES: Final = 4096
 FORMS: Final = (
     '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}, {"cmd": "record", "on": true}, '
-    '{"cmd": "pause", "on": true}'
+    '{"cmd": "pause", "on": true}; of a recording {"cmd": "play", "at_s": 1.5} with "speed" and "on" as wanted'
 )
 
 
-def execute(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
-    """Queue the command in a viewer's message; returns the reason if it is refused."""
-    why = _refusal(message, viewer, commands)
+def execute(message: str | bytes, viewer: Viewer, commands: Commands, player: Player | None = None) -> str | None:
+    """Queue the command in a viewer's message, or steer the player; returns the reason if it is refused."""
+    why = _refusal(message, viewer, commands, player)
     if why is not None:
         commands.refuse()
     return why
 
 
-def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+def _refusal(message: str | bytes, viewer: Viewer, commands: Commands, player: Player | None) -> str | None:
     try:
         parsed = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
@@ -29,6 +31,8 @@ def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | 
     if not isinstance(parsed, dict):
         return f"{_shown(message)} is not a JSON object: expected {FORMS}"
     name = parsed.get("cmd")
+    if name == "play":
+        return _play(parsed, message, player)
     if name in ("record", "pause"):
         on = _switch(parsed)
         if on is None:
@@ -44,6 +48,24 @@ def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | 
     if commands.full:
         return f"{WAITING} commands are waiting: repeat it when the run has executed them"
     commands.put(command)
+    return None
+
+
+def _play(parsed: dict[str, Any], message: str | bytes, player: Player | None) -> str | None:
+    """Steer the player; returns the reason if it is refused."""
+    if player is None:
+        return "no recording is played that a page can steer"
+    at_s, speed, on = (parsed.get(key) for key in ("at_s", "speed", "on"))
+    numbers = all(type(one) in (int, float) and math.isfinite(one) for one in (at_s, speed) if one is not None)
+    known = parsed.keys() <= {"cmd", "at_s", "speed", "on"} and (on is None or isinstance(on, bool))
+    if not (numbers and known and (speed is None or speed > 0)):
+        return f'{_shown(message)}: expected {{"cmd": "play"}} with numbers "at_s", "speed", and "on": true or false'
+    if speed is not None:
+        player.set_speed(float(speed))
+    if on is not None:
+        player.pause(on=not on)
+    if at_s is not None:
+        player.jump(float(at_s))
     return None
 
 

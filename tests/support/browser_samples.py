@@ -1,5 +1,6 @@
 """Live page in headless Chromium: runs to look at, and what a person sees of them."""
 
+import base64
 import contextlib
 import os
 import re
@@ -72,7 +73,13 @@ def open_page(browser):
     strangers = [url for url in asked if not re.match(r"(http|ws)://127\.0\.0\.1:\d+/|data:", url)]
     assert asked and strangers == []
     # That nobody answers, or not as wanted, is Chromium's to tell, and what some of these tests are about.
-    told = ("ERR_CONNECTION_REFUSED", "403 (Forbidden)", "Unexpected response code: 403", "503")
+    told = (
+        "ERR_CONNECTION_REFUSED",
+        "403 (Forbidden)",
+        "Unexpected response code: 403",
+        "503",
+        "426 (Upgrade Required)",
+    )
     unexpected = [text for text in wrong if not any(words in text for words in told)]
     assert unexpected == [], unexpected
 
@@ -86,9 +93,10 @@ class Run(subprocess.Popen[str]):
 
 @contextlib.contextmanager
 def edge_sr(*arguments):
-    """Run `edge-sr --view 0` and yield it with the address that it reports."""
+    """Run `edge-sr --view 0` and yield it with the address that it reports; a command comes first."""
+    command = [one for one in arguments[:1] if not str(one).startswith("-")]
     process = Run(
-        [sys.executable, "-m", "edge.cli.main", "--view", "0", *map(str, arguments)],
+        [sys.executable, "-m", "edge.cli.main", *command, "--view", "0", *map(str, arguments[len(command) :])],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
         stdin=subprocess.DEVNULL,
@@ -153,7 +161,8 @@ def emulated(folder, *tracks, options=()):
         times_ns = np.arange(len(counts)) * PERIOD_NS
         np.savez(path, **facts, scan=np.arange(len(counts)), time_ns=times_ns, counts=counts.astype(np.int32))
         recordings.append(load_recording(path))
-    with Emulator(recordings, loop=True) as emulator:
+    # A link of its own, for a pseudo-terminal that is gone may be given to another test, and the run tries it again.
+    with Emulator(recordings, loop=True, link=folder / "port") as emulator:
         stored = ["--baseline", folder / "zero.json", "--model", "stsr-int8", "--every-scan"]
         with edge_sr("--source", f"slcan:{emulator.port}", *stored, *options) as run:
             run.emulator = emulator
@@ -172,6 +181,17 @@ def pressed(demo):
 
 
 # What a person sees of a page.
+
+
+def painted(page):
+    """Return once all that the page was asked for so far is painted: it paints at its next animation frame."""
+    page.evaluate("() => new Promise((go_on) => requestAnimationFrame(go_on))")
+
+
+def resize(page, width, height):
+    page.set_viewport_size({"width": width, "height": height})
+    page.wait_for_function("([width, height]) => innerWidth === width && innerHeight === height", arg=[width, height])
+    painted(page)
 
 
 def part(page, name, sensor="4"):
@@ -194,10 +214,21 @@ def logged(page, text):
     playwright.expect(page.locator("#log li").filter(has_text=text).first).to_be_visible()
 
 
+RGBA = """canvas => {
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  return [canvas.height, canvas.width, btoa(Array.from(data, (one) => String.fromCharCode(one)).join(""))];
+}"""
+
+
+def colours_of(pixels):
+    """Return the colours (rows, cols, 4) of a canvas read by RGBA."""
+    height, width, data = pixels
+    return np.frombuffer(base64.b64decode(data), np.uint8).reshape(height, width, 4).astype(float)
+
+
 def shares(pixels):
     """Return the shares of the scale of a canvas's colours, by the terminal's own table of the same colours."""
-    height, width, *data = pixels
-    rgba = np.array(data, dtype=float).reshape(height, width, 4)
+    rgba = colours_of(pixels)
     assert (rgba[..., 3] == 255).all()
     steps = np.linspace(0, 1, 256)
     return steps[np.abs(rgba[..., None, :3] - colours(steps)).sum(axis=-1).argmin(axis=-1)]

@@ -4,6 +4,7 @@ import numpy as np
 from edge_samples import make_scan
 
 from edge.perception.result import Result
+from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
 
@@ -36,8 +37,10 @@ def pattern_of(height, pose, indentation_mm):
     return pressed.reshape(40, SAMPLES, 40, SAMPLES).mean(axis=(1, 3)).astype(np.float32)
 
 
-def result_of(height, pose, indentation_mm=0.3, *, number=0, **changes):
-    """Return the result of a press; changes are of its fields."""
+def result_of(
+    height, pose, indentation_mm=0.3, *, number=0, posed=True, sensor="4", source: SourceKind = "replay", **changes
+):
+    """Return the result of a press, with its pose unless it is not `posed`; changes are of its fields."""
     pattern = pattern_of(height, pose, indentation_mm)
     known = {
         "contact": True,
@@ -46,8 +49,9 @@ def result_of(height, pose, indentation_mm=0.3, *, number=0, **changes):
         "deviation": np.full_like(pattern, DEVIATION_MM),
         "trusted": True,
         "force_counts": 10_000 * indentation_mm,
+        "pose": pose if posed else None,
     }
-    return Result(make_scan(number), "replay", "perfect", "contact", **known | changes)
+    return Result(make_scan(number, sensor=sensor), source, "perfect", "contact", **known | changes)
 
 
 def raster(turns=(0.0,), step_mm=4.0, half_mm=24.0):

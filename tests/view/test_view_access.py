@@ -11,6 +11,7 @@ from edge.pipeline.commands import WAITING, Command, Commands
 from edge.view.access import grant, is_loopback
 from edge.view.viewer_commands import LONGEST_BYTES, execute
 from edge.view.viewer_state import Viewer
+from firmware_bridge.links.replay_player import Player
 
 TOKEN = "correct-horse-battery"
 
@@ -140,12 +141,15 @@ class TestAccess:
             ("127.0.0.1", None, "http://127.0.0.1:8077/"),
             ("::1", None, "http://[::1]:8077/"),
             ("192.168.0.5", TOKEN, f"http://192.168.0.5:8077/?token={TOKEN}"),
-            ("0.0.0.0", TOKEN, f"http://robot:8077/?token={TOKEN}"),
+            ("0.0.0.0", TOKEN, f"http://192.0.2.7:8077/?token={TOKEN}"),
+            ("::", TOKEN, f"http://[2001:db8::7]:8077/?token={TOKEN}"),
         ],
     )
     def test_the_address_printed_is_one_that_is_granted(self, host, token, url):
         access = grant(host, "robot", token)
-        assert access.url(8077) == url
+        shown = access.urls(8077, {"0.0.0.0": ["192.0.2.7"], "::": ["2001:db8::7"]}.get(host, []))
+        assert shown[0] == url
+        assert shown[1:] == ([f"http://robot:8077/?token={TOKEN}"] if host in ("0.0.0.0", "::") else [])
         authority, _, rest = url.partition("//")[2].partition("/")
         assert asks(access, "/" + rest, authority) is None
 
@@ -164,6 +168,24 @@ class TestAsked:
         asked = Commands()
         why = [execute(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer(), asked) for m in messages]
         return asked, why
+
+    def test_a_recording_is_steered_by_what_makes_sense(self):
+        player, asked = Player(), Commands()
+        player.reach(0.0, 6.0, 0)
+
+        def play(**wanted):
+            return execute(json.dumps({"cmd": "play"} | wanted), Viewer(), asked, player)
+
+        assert play(on=False, speed=0.5, at_s=4) is None
+        assert (player.state.paused, player.state.speed, player.take_jump()) == (True, 0.5, 4.0)
+        assert play(at_s=99) is None and player.take_jump() == 6.0
+        before = player.state
+        for wrong in ({"at_s": "4"}, {"at_s": True}, {"speed": 0}, {"speed": -1}, {"on": 1}, {"att_s": 4}):
+            assert "expected" in str(play(**wrong)), wrong
+        assert execute('{"cmd": "play", "at_s": NaN}', Viewer(), asked, player) is not None
+        assert player.state == before and player.take_jump() is None
+        assert execute('{"cmd": "play", "on": true}', Viewer(), asked) == "no recording is played that a page can steer"
+        assert asked.poll() == []
 
     def test_commands_are_polled_once_in_their_order(self):
         asked, why = self.execute(

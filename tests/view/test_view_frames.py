@@ -16,6 +16,7 @@ from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
 from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
 from edge.view.sink import ViewSink
 from edge.view.viewer_state import Viewer
+from firmware_bridge.links.replay_player import PlayerState
 
 
 class Clock:
@@ -65,17 +66,17 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     np.testing.assert_array_equal(maps["zeroed"], result.zeroed)
     np.testing.assert_array_equal(maps["taps"], result.window[: result.taps_used, 2])
     assert header["trace"] == [
-        [0.0, round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4)]
+        [0.0, round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4), None]
     ]
 
 
 def test_what_is_not_there_is_left_out(heard, clock):
     heard.add(Press().next(0), {})
     [(header, maps)] = look(Viewer(), heard, clock)
-    assert list(maps) == ["zeroed"] and header["contact"] is False and header["trace"][0][2:] == [None, None]
+    assert list(maps) == ["zeroed"] and header["contact"] is False and header["trace"][0][2:] == [None, None, None]
     heard.add(Press("6", baselines={}).next(0), {})
     header, maps = look(Viewer(), heard, clock)[1]
-    assert header["sensor"] == "6" and maps == {} and header["trace"][0][1:] == [None, None, None]
+    assert header["sensor"] == "6" and maps == {} and header["trace"][0][1:] == [None, None, None, None]
 
 
 def test_hello_says_what_does_not_change():
@@ -91,6 +92,7 @@ def test_hello_says_what_does_not_change():
         "taps": 4,
         "pattern_unit": "mm",
         "full_scale": 2.0,
+        "contact_level": CONTRACT.contact_level,
         "pixel_pitch_mm": pytest.approx(0.47),
         "taxel_pitch_mm": 4.7,
         "rows": 4,
@@ -262,7 +264,12 @@ def test_state_tells_the_silence_of_a_sensor(heard, clock):
     clock.now_ns += 500_000_000
     assert Frames(heard, clock(), "emulated").silent() == {"4": 1.2}
     header, _ = unpack(state(Path("edge.mcap"), 3, {"4": 1.2}))
-    assert header == {"kind": "state", "recording": "edge.mcap", "viewers": 3, "silent": {"4": 1.2}, "maps": []}
+    facts = {"kind": "state", "recording": "edge.mcap", "viewers": 3, "silent": {"4": 1.2}, "maps": []}
+    assert header == facts | {"replay": None, "recorded_s": None, "recorded_bytes": None}
+    recorded = unpack(state(Path("edge.mcap"), 1, {}, None, (2.5, 70_000)))[0]
+    assert (recorded["recorded_s"], recorded["recorded_bytes"]) == (2.5, 70_000)
+    played = PlayerState(1.5, 6.7, 0.5, paused=True, waiting=False, rounds=2)
+    assert unpack(state(None, 1, {}, played))[0]["replay"] == played._asdict()
 
 
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from browser_samples import (
     PERIOD_NS,
+    RGBA,
     browser,
+    colours_of,
     demo,
     emulated,
     folder,
@@ -69,12 +71,16 @@ def page(held, open_page):
     return page
 
 
-PIXELS = """canvas => {
-  const image = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-  return [canvas.height, canvas.width, ...image.data];
-}"""
 PAINTED = """canvas => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height)
   .data.filter((value, at) => at % 4 === 3 && value).length"""
+
+RESIZED = f"""async (canvas) => {{
+  const before = canvas.width;
+  canvas.closest(".sensor").style.width = "700px";
+  await new Promise((go_on) => requestAnimationFrame(() => setTimeout(go_on, 0)));
+  return [canvas.width !== before, ({PAINTED})(canvas) > 50];
+}}"""
+"""The next frame already has every canvas in its new size, and painted."""
 
 INKED = """canvas => {
   const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -104,18 +110,22 @@ def frames_of(page):
 class TestHeld:
     def test_the_canvas_shows_the_truth_on_the_models_scale_or_on_its_own(self, page, held):
         word(page, "contact")
-        shown = shares(part(page, "pattern").evaluate(PIXELS))
+        playwright.expect(part(page, "pattern-high")).to_contain_text("largest so far")
+        page.keyboard.press("s")
+        playwright.expect(part(page, "pattern-high")).to_contain_text("full scale")
+        shown = shares(part(page, "pattern").evaluate(RGBA))
         assert shown.shape == (40, 40) and likeness(shown, held.truth) > 0.95
         assert np.sqrt(np.mean((0.5 * shown - held.truth) ** 2)) < 0.03  # [mm], of .5 full scale
         playwright.expect(part(page, "pattern-high")).to_contain_text("0.50\u202fmm, full scale")
         page.keyboard.press("s")
         playwright.expect(part(page, "pattern-high")).to_contain_text("largest so far")
-        wait_for(lambda: shares(part(page, "pattern").evaluate(PIXELS)).max() > 0.9)  # painted with the next frame
-        stretched = shares(part(page, "pattern").evaluate(PIXELS))
+        wait_for(lambda: shares(part(page, "pattern").evaluate(RGBA)).max() > 0.9)  # painted with the next frame
+        stretched = shares(part(page, "pattern").evaluate(RGBA))
         assert shown.max() < 0.7 and likeness(stretched, held.truth) > 0.95
+        page.keyboard.press("s")
         page.reload()
         live(page)
-        playwright.expect(part(page, "pattern-high")).to_contain_text("largest so far")
+        playwright.expect(part(page, "pattern-high")).to_contain_text("full scale")
 
     def test_maps_traces_and_numbers_are_there_and_move(self, page):
         before = part(page, "force-now").inner_text()
@@ -127,9 +137,46 @@ class TestHeld:
         for name in ("shear", "force-plot", "area-plot", "over"):
             assert part(page, name).evaluate(PAINTED) > 50, name
         for name in ("taxels", "deviation"):
-            height, width, *data = part(page, name).evaluate(PIXELS)
-            assert (height, width) == ((4, 4) if name == "taxels" else (40, 40))
-            assert len({tuple(data[at : at + 3]) for at in range(0, len(data), 4)}) > 5
+            rgba = colours_of(part(page, name).evaluate(RGBA))
+            assert rgba.shape[:2] == ((4, 4) if name == "taxels" else (40, 40))
+            assert len(np.unique(rgba.reshape(-1, 4), axis=0)) > 5
+        assert part(page, "over").evaluate(RESIZED) == [True, True]
+
+    def test_a_value_above_a_limit_is_marked_and_logged_once(self, page):
+        limit = part(page, "force-limit")
+        marked = page.locator(".traces > div[data-over=yes]")
+        limit.fill("1000000")
+        limit.press("e")  # no key of the page, as in any field
+        limit.fill("10")
+        limit.blur()
+        playwright.expect(marked).to_have_count(1)
+        logged(page, "force above the limit of 10")
+        assert page.locator("dialog[open]").count() == 0
+        before = part(page, "force-now").inner_text()
+        playwright.expect(part(page, "force-now")).not_to_have_text(before)
+        assert page.locator("#log li", has_text="above the limit").count() == 1
+        page.reload()
+        live(page)
+        playwright.expect(marked).to_have_count(1)
+        limit.fill("")
+        limit.blur()
+        playwright.expect(marked).to_have_count(0)
+
+    def test_shear_is_drawn_in_place_of_the_area(self, page):
+        heard = frames_of(page)
+        page.reload()
+        live(page)
+        wait_for(lambda: any(point[4] is not None for header in heard for point in header.get("trace", [])))
+        toggle, plot = part(page, "shear_toggle"), part(page, "area-plot")
+        page.keyboard.press("Space")  # else it moves by itself
+        word(page, "paused")
+        images = [plot.evaluate("canvas => canvas.toDataURL()")]
+        for state in ("true", "false"):
+            toggle.click()
+            playwright.expect(toggle).to_have_attribute("aria-pressed", state)
+            images.append(plot.evaluate("canvas => canvas.toDataURL()"))
+        assert images[0] == images[2] != images[1]
+        page.keyboard.press("Space")
 
     def test_arrow_keys_read_a_pixel(self, page, held):
         part(page, "field").focus()
@@ -157,7 +204,7 @@ class TestHeld:
         frozen = self.shown(page)
         before = part(other, "force-now").inner_text()
         playwright.expect(part(other, "force-now")).not_to_have_text(before)
-        page.wait_for_timeout(1200)
+        page.wait_for_timeout(1200)  # more than a hole that the trace would show
         self.reconnect(page, 1)
         self.ask(page, "is it held?")  # answered after the pause that the page asked for again
         del heard[:]
@@ -218,7 +265,7 @@ class TestHeld:
         page.keyboard.press("Shift+R")
         playwright.expect(other.locator("#record")).to_have_attribute("aria-pressed", "true")
         logged(other, "recording into")
-        page.wait_for_timeout(1000)
+        playwright.expect(other.locator("#record")).to_contain_text(re.compile(r"Recording [1-9]\d*\ss, \d\.\d\sMB"))
         page.locator("#record").click()
         playwright.expect(other.locator("#record")).to_have_attribute("aria-pressed", "false")
         logged(page, "recorded into")
@@ -232,10 +279,10 @@ class TestHeld:
         page.keyboard.press("Escape")
         playwright.expect(page.locator("#manual")).to_be_hidden()
         reached = []
-        for _ in range(12):
+        for _ in range(24):
             page.keyboard.press("Tab")
             reached.append(page.evaluate("document.activeElement.id || document.activeElement.dataset.part"))
-        want = ["zero", "reset", "record", "pause", "scale", "help", "field", "span", "log"]
+        want = ["zero", "reset", "record", "pause", "scale", "relief", "save", "help", "back", "field", "span", "log"]
         assert [name for name in reached if name in want][: len(want)] == want
         page.locator("#scale").focus()
         assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
@@ -266,11 +313,11 @@ class TestHeld:
         playwright.expect(page.locator("#link")).to_have_text("connected")
         after = self.kept(devtools)
         assert page.evaluate("sockets.length") == RECONNECTS + 1
-        assert page.evaluate("sockets.filter((one) => one.deref() !== undefined).length") <= 2
+        page.wait_for_function("gc(), sockets.filter((one) => one.deref() !== undefined).length <= 2")
         assert after["JSEventListeners"] <= before["JSEventListeners"] + 5
         assert after["Nodes"] <= before["Nodes"] + 50
         assert after["JSHeapUsedSize"] < before["JSHeapUsedSize"] + 1_000_000
-        assert open_files(held) <= files + 2
+        wait_for(lambda: open_files(held) <= files + 2)
         logged(page, "connected again")
 
     def reconnect(self, page, times):
@@ -288,7 +335,7 @@ class TestHeld:
         )
 
     def shown(self, page):
-        return [part(page, name).evaluate(PIXELS) for name in ("pattern", "force-plot")] + [
+        return [part(page, name).evaluate(RGBA) for name in ("pattern", "force-plot")] + [
             part(page, "force-now").inner_text()
         ]
 

@@ -1,6 +1,7 @@
 """Live page of where to touch next: the number, and the pad's outline over the last pattern."""
 
 from dataclasses import replace
+from itertools import count
 
 from browser_samples import PERIOD_NS, browser, number, open_page, part, playwright
 from view_samples import Press, live_page
@@ -25,12 +26,15 @@ def drawn(page, x, y):
 
 def test_the_pad_is_outlined_where_to_touch_next_until_the_next_tap(open_page, tmp_path):
     with live_page(tmp_path) as shown:
-        press = Press()
+        press, numbers = Press(), count(3)
+        idle, contact = press.next(0), press.next(3000)
         proposed: list[NextTap | str | None] = [None]
 
-        def following(press_counts=None, period_ns=PERIOD_NS):
-            """Return a contact, or idle scans after it."""
-            made = press.next(3000 if proposed[0] == "contact" else 0, period_ns)
+        def following():
+            """Return one contact, or idle scans after it; pressed for so long, a sensor would not believe it."""
+            again = next(numbers)
+            made = contact if proposed[0] == "contact" else idle
+            made = replace(made, scan=replace(made.scan, number=again, time_ns=again * PERIOD_NS))
             return replace(made, next_tap=proposed[0]) if isinstance(proposed[0], NextTap) else made
 
         shown.press.next = following

@@ -13,9 +13,11 @@ from browser_samples import (
     noise,
     number,
     open_page,
+    painted,
     part,
     playwright,
     pressed,
+    resize,
     word,
 )
 
@@ -94,6 +96,7 @@ def test_who_asked_may_force_and_only_what_was_refused(demo, folder, open_page):
         page.keyboard.press("Shift+Z")  # once
         page.keyboard.press("r")
         logged(other, "earlier taps forgotten")
+        painted(page)  # after all that it has sent is known here
         assert sent == [
             {"cmd": "zero", "sensor": "6"},
             {"cmd": "zero"},
@@ -114,11 +117,14 @@ def test_two_sensors_a_dead_taxel_and_a_cable_that_is_out(demo, folder, open_pag
         playwright.expect(part(page, "dead", "4")).to_be_hidden()
         (left, top, right, _), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
         assert top == other_top and right < other_left
-        page.set_viewport_size({"width": 390, "height": 844})
+        resize(page, 390, 844)
         (left, _, _, bottom), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
         assert left == other_left and bottom < other_top
         run.emulator.hang_up()
         for sensor in "46":
             word(page, "no scan for", sensor)
+            playwright.expect(part(page, "link", sensor)).to_contain_text("no scan for")
+            playwright.expect(page.locator("#link")).to_contain_text("; no scan from ")
+            playwright.expect(page.locator("#link")).to_have_attribute("data-up", "part")
             playwright.expect(part(page, "field", sensor)).to_have_attribute("data-live", "no")
         logged(page, "link lost")

@@ -6,6 +6,8 @@ import socket
 import threading
 import time
 from contextlib import ExitStack, suppress
+from ipaddress import ip_address
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -71,6 +73,11 @@ class TestPage:
             assert query.startswith("token=") and refused_with(page) == 403
             with page.viewer(f"?{query}"):
                 pass
+            urls = [page.view.url, *page.view.other_urls]
+            assert urls[-1] == f"http://{socket.gethostname()}:{page.port}/?{query}"
+            for url in urls[:-1]:  # each is opened as a person on another machine does, if there is a network
+                host = url.partition("//")[2].partition(":")[0]
+                assert not ip_address(host).is_loopback and urlopen(url, timeout=5).status == 200
 
     @pytest.mark.parametrize(
         "request_",
@@ -161,6 +168,9 @@ class TestFrames:
                 "recording": None,
                 "viewers": 1,
                 "silent": {},
+                "replay": None,
+                "recorded_s": None,
+                "recorded_bytes": None,
                 "maps": [],
             }
             with page.viewer():

@@ -73,7 +73,7 @@ class Link {
       this.why = null;
       this.onChange();
     }
-    this.onFrame(unpack(data));
+    this.onFrame(unpack(data), data);
   }
 
   lose(socket, code = null) {

@@ -1,11 +1,11 @@
 // ---- The map of the object, larger than the pad ----
 
 const MAP_MARKS = { doubted: [200, 40, 30], nothing: [0, 0, 0, 0] };
-const PATTERN_COUNTS = [["doubted", "not believed"], ["light", "too light"], ["outside", "outside the map"], ["without_pose", "without a pose"]];
+const PATTERN_COUNTS = [["doubted", "not believed"], ["light", "too light"], ["outside", "outside the map"], ["without_pose", "without a pose"], ["together", "of two pads at one place"]];
 
 class MapPane {
   constructor() {
-    Object.assign(this, { header: null, contact: null, doubted: null, dirty: false });
+    Object.assign(this, { header: null, shown: null, contact: null, doubted: null, dirty: false });
     this.root = byId("map");
     sizes.observe(byId("map-over"));
   }
@@ -37,15 +37,17 @@ class MapPane {
   paint() {
     this.dirty = false;
     show(this.root, this.header !== null);
+    this.shown = this.header;
     if (this.header === null) return;
-    const { pixels, px_per_mm, counts } = this.header;
+    const { pixels, counts } = this.header;
     this.paintContact(byId("map-contact"), pixels);
     paintBar(byId("map-bar"), VIRIDIS);
     const left = PATTERN_COUNTS.filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
-    say(byId("map-counts"), [`${counts.fused} patterns`, ...left].join(", "));
+    const mark = page.hello?.source === "emulated" ? "EMULATED: " : "";
+    say(byId("map-counts"), `${mark}${[`${counts.fused} patterns`, ...left].join(", ")}`);
     show(byId("map-empty"), counts.fused === 0);
     say(byId("map-empty"), counts.without_pose > 0 ? "no poses come: send those of the pad" : "nothing touched yet");
-    this.paintPads(byId("map-over"), pixels / px_per_mm);
+    this.paintPads();
   }
 
   paintContact(canvas, count) {
@@ -64,15 +66,16 @@ class MapPane {
     context.putImageData(image, 0, 0);
   }
 
-  /** Draw the outline of each pad where it is now, with a mark at the end of its x axis. */
-  paintPads(canvas, sizeMm) {
-    const [context, width, height] = blank(canvas);
-    if (width === 0 || page.hello === null) return;
+  /** Draw the outline of each pad where it was when the map was painted, with a mark at the end of its x axis. */
+  paintPads() {
+    const [context, width, height] = blank(byId("map-over"));
+    if (width === 0 || page.hello === null || this.shown === null) return;
+    const sizeMm = this.shown.pixels / this.shown.px_per_mm;
     const { rows, cols, taxel_pitch_mm: pitch } = page.hello;
     const [halfX, halfY] = [(cols * pitch) / 2, (rows * pitch) / 2];
-    const [centreX, centreY] = this.header.centre_mm;
+    const [centreX, centreY] = this.shown.centre_mm;
     const ink = ["#fff", "#000a"];
-    for (const [x, y, turn] of Object.values(this.header.pads)) {
+    for (const [x, y, turn] of Object.values(this.shown.pads)) {
       const [cosine, sine] = [Math.cos((turn * Math.PI) / 180), Math.sin((turn * Math.PI) / 180)];
       const place = (right, down) => [
         width / 2 + ((x - centreX + cosine * right - sine * down) / sizeMm) * width,
@@ -86,16 +89,6 @@ class MapPane {
         context.lineTo(...place(halfX - 2, 0));
       });
     }
-    const barMm = SCALE_BARS_MM.find((mm) => mm <= sizeMm / 3) ?? sizeMm;
-    const bar = (barMm / sizeMm) * width;
-    haloed(context, ink, 2, () => {
-      context.moveTo(10, height - 16);
-      context.lineTo(10, height - 10);
-      context.lineTo(10 + bar, height - 10);
-      context.lineTo(10 + bar, height - 16);
-    });
-    context.font = FONT;
-    context.textAlign = "center";
-    haloedText(context, ink, `${barMm}${THIN}mm`, 10 + bar / 2, height - 16);
+    scaleBar(context, ink, sizeMm, width, height);
   }
 }

@@ -16,6 +16,21 @@ function haloedText(context, [ink, halo], text, x, y) {
   context.fillText(text, x, y);
 }
 
+/** Draw a bar of a round length at the lower left of a canvas that shows so many mm across. */
+function scaleBar(context, ink, widthMm, width, height) {
+  const barMm = SCALE_BARS_MM.find((mm) => mm <= widthMm / 3) ?? widthMm;
+  const bar = (barMm / widthMm) * width;
+  haloed(context, ink, 2, () => {
+    context.moveTo(10, height - 16);
+    context.lineTo(10, height - 10);
+    context.lineTo(10 + bar, height - 10);
+    context.lineTo(10 + bar, height - 16);
+  });
+  context.font = FONT;
+  context.textAlign = "center";
+  haloedText(context, ink, `${barMm}${THIN}mm`, 10 + bar / 2, height - 16);
+}
+
 function arrow(context, ink, x, y, dx, dy) {
   const length = Math.hypot(dx, dy);
   haloed(context, ink, 1.6, () => {

@@ -2,7 +2,7 @@
 
 const NUMBERS = {
   Contact: [
-    ["force", "force", "big"], ["area", "area", "big"], ["centre", "centroid_mm"], ["taps used", "taps_used"], ["another tap", "another_tap"],
+    ["force", "force", "big"], ["area", "area", "big"], ["centre", "centroid_mm"], ["size", "ellipse"], ["long axis", "axis"], ["taps used", "taps_used"], ["another tap", "another_tap"],
     ["next tap", "next_tap"],
   ],
   Wrench: [
@@ -17,6 +17,7 @@ const NUMBERS = {
   Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
   Baseline: [["id", "baseline"], ["origin", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["taxel, step", "own"]],
 };
+const LOSS_SHARE = 0.01; // of the scans: fewer losses, as in the first second of a run, are no reason to worry
 const LOSSES = new Set(["dropped", "missed", "late", "torn_wire", "unwritten"]);
 const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand" };
 const TOO_LIGHT = "too light to check";
@@ -55,10 +56,13 @@ function numberTexts(sensor) {
   const { result, hello } = sensor;
   const made = sensor.made();
   const drift = result.drift_counts;
+  const ellipse = made.state === "contact" && made.trusted !== false && sensor.newest() ? sensor.ellipse() : null;
   return {
     force: sensor.part["force-now"].textContent,
     area: sensor.part["area-now"].textContent,
     centroid_mm: made.centroid_mm ? `${made.centroid_mm.map((mm) => number(mm, 1)).join(", ")}${THIN}mm` : "\u2013",
+    ellipse: ellipseText(ellipse),
+    axis: axisText(ellipse),
     ...wrenchTexts(made),
     ...trustTexts(made, hello.checks),
     taps_used: made.taps_used ? `${made.taps_used} of ${hello.taps}` : "\u2013",

@@ -10,9 +10,16 @@ const painter = {
     page.map.dirty = true;
     this.ask();
   },
+  /** Paint at once, also while paused: a canvas of a new size is blank. */
+  resized() {
+    for (const sensor of page.sensors.values()) sensor.paint();
+    page.map.paintPads();
+  },
   paint() {
     this.asked = 0;
     paintPage();
+    past.paint();
+    replay.paint();
     for (const sensor of page.sensors.values()) if (sensor.dirty) sensor.paint();
     if (page.map.dirty && !page.paused) page.map.paint();
   },
@@ -32,7 +39,10 @@ const page = {
   eventNumber: 0, // number of the run's latest event that is in the log
   paused: false,
   pausedS: 0,
-  auto: memory.get("scale") === "auto",
+  auto: memory.get("scale") !== "fixed",
+  relief: memory.get("relief") === "on",
+  shear: memory.get("shear") === "on",
+  atS: null, // time of the run that is looked back at; null: live
   spanS: memory.get("span") === "60" ? 60 : 10,
   asked: null, // latest request of this page to zero: {sensor, or undefined for all; untilS}
   forcible: new Set(), // sensors whose zeroing was refused, while it may be forced
@@ -43,13 +53,14 @@ const page = {
 
 function announce(text) { say(byId("live"), text); }
 
-/** Add a line; one of the same key as the line before is counted instead, since only its numbers may differ. */
-function log(what, { key = what, bad = false, ageS = 0 } = {}) {
+/** Add a line; one of the same key as the line before, or `again` as any line, is counted instead, since only its numbers may differ. */
+function log(what, { key = what, bad = false, ageS = 0, again = false } = {}) {
   const list = byId("log");
   const clock = new Date(Date.now() - 1000 * ageS).toLocaleTimeString();
   list.querySelector(".none")?.remove();
-  const first = list.firstElementChild;
+  const first = again ? [...list.children].find((line) => line.dataset.key === key) : list.firstElementChild;
   if (first?.dataset.key === key) {
+    list.prepend(first);
     first.dataset.times = String(Number(first.dataset.times) + 1);
     [clock, what, `${first.dataset.times} times`].forEach((text, place) => { first.children[place].textContent = text; });
     return;
@@ -76,13 +87,18 @@ function paintPage() {
   origin.dataset.source = source;
   say(origin, source === "replay" ? "REPLAY: a recording, not live data" : "EMULATED: these are not data of a sensor");
   const models = new Set([...page.sensors.values()].map((sensor) => sensor.result?.model ?? hello.model));
-  say(byId("about"), hello === null ? "" : [hello.name, ...(models.size ? models : [hello.model])].join(", "));
+  const about = byId("about");
+  const modelNames = [...(models.size ? models : hello === null ? [] : [hello.model])];
+  say(about, hello === null ? "" : [shortName(hello.name), ...modelNames].join(", "));
+  if (hello !== null) explain(about, [hello.name, ...modelNames].join(", "));
   paintTrouble();
-  byId("pause").setAttribute("aria-pressed", String(page.paused));
-  byId("pause").firstChild.textContent = page.paused ? "Resume " : "Pause ";
+  const held = page.paused || (replay.at?.paused ?? false);
+  byId("pause").setAttribute("aria-pressed", String(held));
+  byId("pause").firstChild.textContent = held ? "Resume " : "Pause ";
+  byId("relief").setAttribute("aria-pressed", String(page.relief));
   const recording = Boolean(page.state.recording);
   byId("record").setAttribute("aria-pressed", String(recording));
-  byId("record").firstChild.textContent = recording ? "Recording " : "Record ";
+  byId("record").firstChild.textContent = recording ? `Recording ${recordedText(page.state)}` : "Record ";
   say(byId("scale").firstElementChild, `Scale: ${page.auto ? "auto" : "fixed"}`);
   for (const id of ["zero", "reset", "record", "force"]) byId(id).disabled = !link.up;
   show(byId("waiting"), page.sensors.size === 0);
@@ -95,9 +111,10 @@ function paintTrouble() {
   const [trouble, state] = [byId("trouble"), byId("link")];
   const waitS = link.nextS === null ? 0 : Math.max(0, Math.ceil(link.nextS - nowS()));
   const next = waitS > 0 ? `next try in ${waitS}${THIN}s` : "trying again";
-  state.dataset.up = link.up ? "yes" : "no";
+  const silent = [...page.sensors.values()].filter((sensor) => sensor.silentS !== null && !replay.rests);
+  state.dataset.up = link.up ? (silent.length > 0 ? "part" : "yes") : "no";
   const viewers = page.state.viewers > 1 ? `, ${page.state.viewers} viewers` : "";
-  say(state, link.up ? `connected${viewers}` : page.hello === null && link.tries === 0 ? "connecting" : "not connected");
+  say(state, link.up ? `connected${viewers}${silent.length > 0 ? `; no scan from ${silent.map((sensor) => sensor.name).join(", ")}` : ""}` : page.hello === null && link.tries === 0 ? "connecting" : "not connected");
   const lost = !link.up && link.tries > 0;
   show(trouble, lost || page.paused);
   trouble.dataset.kind = lost ? "lost" : "pause";
@@ -106,7 +123,11 @@ function paintTrouble() {
   say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor continues. Press space to resume`);
 }
 
+const recordedText = ({ recorded_s: seconds, recorded_bytes: bytes }) => (seconds == null ? "" : `${duration(seconds)}, ${(bytes / 1e6).toFixed(1)}${THIN}MB `);
 const lostWord = () => (page.link.ended ? "run ended" : "connection lost");
+
+/** Return the name of a source with files by their names alone. */
+const shortName = (name) => name.replace(/(?<=[:,])[^,:]*\/(?=[^/,]+\.(?:csv|npz|mcap)\b)/g, "");
 
 function titleText(source) {
   const mark = source === "device" ? "" : `${source.toUpperCase()} `;
@@ -126,11 +147,11 @@ const frameHandlers = {
     for (const sensor of page.sensors.values()) sensor.hello = header;
     if (page.paused) page.link.send({ cmd: "pause", on: true });
   },
-  result(header, maps) {
+  result(header, maps, buffer) {
     if (page.hello === null) return;
     const sensor = sensorOf(header.sensor);
     if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the pause reached the program, and not again
-    else sensor.take(header, maps);
+    else sensor.take(header, maps, buffer);
   },
   map(header, maps) {
     page.map.take(header, maps); // also while paused, since each frame holds what has changed since the one before
@@ -145,6 +166,7 @@ const frameHandlers = {
   },
   state(header) {
     page.state = header;
+    replay.take(header.replay);
     if (page.hello === null) return;
     for (const [name, sensor] of page.sensors) {
       const silentS = header.silent?.[name] ?? null;
@@ -182,6 +204,7 @@ function sensorOf(name) {
     const next = [...byId("sensors").children].find((root) => later.some((other) => other.root === root));
     byId("sensors").insertBefore(sensor.root, next ?? null);
     page.sensors.set(name, sensor);
+    hand.arrange();
     painter.all();
   }
   return page.sensors.get(name);
@@ -191,7 +214,10 @@ function sensorOf(name) {
 function forgetRun() {
   for (const sensor of page.sensors.values()) sensor.remove();
   page.sensors.clear();
+  hand.arrange();
   page.map.forget();
+  page.atS = null;
+  replay.take(null);
   page.paused = false;
   page.eventNumber = 0;
   forgetRefusal();
@@ -218,12 +244,33 @@ const act = {
   reset() { command({ cmd: "reset" }); },
   record() { command({ cmd: "record", on: !page.state.recording }); },
   pause() {
+    if (replay.at !== null && !page.paused) return replay.play(replay.at.paused);
     page.paused = !page.paused;
     page.pausedS = nowS();
     for (const sensor of page.sensors.values()) sensor.trace.hold(page.paused);
     page.link.send({ cmd: "pause", on: page.paused });
     painter.all();
+    return undefined;
   },
+  relief() {
+    page.relief = !page.relief;
+    memory.set("relief", page.relief ? "on" : "off");
+    painter.all();
+  },
+  shear() {
+    page.shear = !page.shear;
+    memory.set("shear", page.shear ? "on" : "off");
+    painter.all();
+  },
+  save() { if (!byId("saving").open) byId("saving").showModal(); },
+  before() { hand.step(-1); },
+  after() { hand.step(1); },
+  close() { hand.open(null); },
+  live() { past.live(); },
+  back() { past.step(-1); },
+  on() { past.step(1); },
+  slower() { replay.speed(-1); },
+  faster() { replay.speed(1); },
   scale() {
     page.auto = !page.auto;
     for (const sensor of page.sensors.values()) sensor.highest = sensor.pattern ? largest(sensor.pattern.values) : 0;
@@ -238,13 +285,14 @@ const act = {
   help() { if (!byId("manual").open) byId("manual").showModal(); },
 };
 
-const KEYS = { z: "zero", "shift z": "force", r: "reset", "shift r": "record", " ": "pause", s: "scale", t: "span", "?": "help" };
+const KEYS = { z: "zero", "shift z": "force", r: "reset", "shift r": "record", " ": "pause", s: "scale", t: "span", v: "relief", e: "save", l: "live", ",": "back", ".": "on", "<": "slower", ">": "faster", "?": "help", "[": "before", "]": "after", escape: "close" };
 
 function pressed(event) {
-  if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || byId("manual").open) return;
+  if (event.ctrlKey || event.altKey || event.metaKey || (event.repeat && !",.".includes(event.key)) || document.querySelector("dialog[open]")) return;
   if (event.key === " " && event.target instanceof HTMLButtonElement) return; // the space bar presses that button
+  if (event.target.matches?.("input[type=number]")) return; // digits of a limit
   const letter = event.key.toLowerCase(); // independent of Caps Lock
-  const action = KEYS[event.shiftKey && letter !== "?" ? `shift ${letter}` : letter];
+  const action = KEYS[event.shiftKey && /[a-z]/.test(letter) ? `shift ${letter}` : letter];
   if (action === undefined) return;
   event.preventDefault();
   act[action]();
@@ -253,8 +301,8 @@ function pressed(event) {
 // ---- Start ----
 
 page.link = new Link({
-  onFrame({ header, maps }) {
-    frameHandlers[header.kind]?.(header, maps);
+  onFrame({ header, maps }, buffer) {
+    frameHandlers[header.kind]?.(header, maps, buffer);
     painter.ask();
   },
   onChange() {
@@ -272,14 +320,21 @@ page.link = new Link({
   },
 });
 
-for (const id of ["zero", "force", "reset", "record", "pause", "scale", "help"]) byId(id).onclick = () => act[id]();
+for (const id of ["zero", "force", "reset", "record", "pause", "scale", "relief", "save", "help", "slower", "faster"]) byId(id).onclick = () => act[id]();
+byId("to-live").onclick = () => act.live();
+byId("play").onclick = () => replay.play(replay.at.paused);
+byId("back").oninput = ({ target }) => (Number(target.value) >= 0 ? past.live() : past.show(past.newestS() + Number(target.value)));
+byId("place").oninput = ({ target }) => { replay.dragged = true; replay.seek(Number(target.value)); };
+byId("place").onchange = () => { replay.dragged = false; };
+for (const ending of ["png", "csv", "npz"]) byId(`save-${ending}`).onclick = () => saveMoment(ending);
+tip.listen();
 document.addEventListener("keydown", pressed);
 document.addEventListener("visibilitychange", () => { page.link.hurry(); painter.all(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => painter.all());
 // Only ages and waits change without a new frame.
 setInterval(() => {
   page.link.look();
-  const moving = !page.link.up || page.paused || [...page.sensors.values()].some((sensor) => !sensor.live());
+  const moving = !page.link.up || page.paused || page.atS !== null || replay.at !== null || [...page.sensors.values()].some((sensor) => !sensor.live());
   if (moving) painter.all();
 }, 500);
 page.link.open();

@@ -1,9 +1,12 @@
 // ---- A sensor ----
 
+const NOTHING = { result: null, receivedS: 0, pattern: null, deviation: null, touchedS: 0, touched: null, zeroed: null, taps: null };
+const SHOWN = Object.keys(NOTHING);
+
 class Sensor {
   constructor(name, hello) {
     Object.assign(this, { name, hello, result: null, receivedS: 0, pattern: null, deviation: null, touchedS: 0, zeroed: null, taps: null, cursor: null });
-    Object.assign(this, { trace: new Trace(), touched: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
+    Object.assign(this, { trace: new Trace(), history: new History(), path: new Path(), later: null, touched: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
     this.part = Object.fromEntries([...root.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
@@ -14,7 +17,8 @@ class Sensor {
     this.part.field.setAttribute("aria-label", `pattern of sensor ${name}; arrow keys read out a pixel`);
     this.part.taxels.setAttribute("aria-label", `taxels of sensor ${name}, z in colour and shear as arrows`);
     this.fields = this.addNumbers();
-    this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"]];
+    this.limits = new Limits(this);
+    this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"], this.part.relief];
     for (const canvas of this.sized) sizes.observe(canvas);
     paintBar(this.part["pattern-bar"], VIRIDIS);
     paintBar(this.part["taxels-bar"], CIVIDIS);
@@ -34,6 +38,7 @@ class Sensor {
         const term = list.appendChild(document.createElement("dt"));
         const value = list.appendChild(document.createElement("dd"));
         term.textContent = label;
+        explain(term, EXPLAIN[key]);
         value.dataset.number = key;
         if (size) { term.className = value.className = size; }
         fields[key] = value;
@@ -47,11 +52,20 @@ class Sensor {
     const { field, zero, span } = this.part;
     zero.onclick = () => act.zero(this.name);
     span.onclick = () => act.span();
-    field.onpointermove = (event) => {
+    this.part.shear_toggle.onclick = () => act.shear();
+    field.onpointermove = field.onpointerdown = (event) => {
       const box = field.getBoundingClientRect();
       this.point((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
     };
-    field.onpointerleave = () => this.point(null);
+    field.onpointerleave = (event) => { if (event.pointerType === "mouse") this.point(null); }; // a finger's pixel stays
+    for (const name of ["force-plot", "area-plot"]) {
+      this.part[name].onpointerdown = (event) => {
+        const box = this.part[name].getBoundingClientRect();
+        const share = (box.right - 6 - event.clientX) / (box.width - 46);
+        const endS = page.atS === null ? this.trace.newestS : Math.min(this.trace.newestS, page.atS + page.spanS / 2);
+        if (share >= 0 && share <= 1) past.show(endS - share * page.spanS);
+      };
+    }
     field.onblur = () => this.point(null);
     field.onkeydown = (event) => this.steer(event);
   }
@@ -63,24 +77,39 @@ class Sensor {
 
   // -- frames --
 
-  take(header, maps) {
+  take(header, maps, buffer) {
     const first = this.result === null;
-    this.result = header;
-    this.receivedS = nowS() - (header.age_s ?? 0);
     this.silentS = null;
     this.trace.add(header.trace ?? []);
-    this.zeroed = maps.zeroed ?? null;
-    this.taps = maps.taps ?? null;
-    if (maps.pattern) {
-      this.pattern = maps.pattern;
-      this.deviation = maps.deviation ?? null;
-      this.touchedS = this.receivedS;
-      this.touched = header;
-      this.highest = largest(maps.pattern.values, this.highest);
-    } else if (header.baseline === null) {
-      this.pattern = this.deviation = null; // no earlier pattern is valid without a baseline
-    }
+    const atS = header.trace?.at(-1)?.[0];
+    this.history.add(atS, buffer, HISTORY_BYTES / page.sensors.size);
+    this.path.add(atS, header);
+    this.absorb(page.atS === null ? this : this.later, header, maps, nowS() - (header.age_s ?? 0));
+    if (maps.pattern) this.highest = largest(maps.pattern.values, this.highest);
     this.logNotes(header, first);
+    this.limits.watch();
+    this.dirty = true;
+  }
+
+  /** Take a frame into what is shown, or will be once nobody looks back. */
+  absorb(shown, header, maps, receivedS) {
+    Object.assign(shown, { result: header, receivedS, zeroed: maps.zeroed ?? null, taps: maps.taps ?? null });
+    if (maps.pattern) Object.assign(shown, { pattern: maps.pattern, deviation: maps.deviation ?? null, touchedS: receivedS, touched: header });
+    else if (header.baseline === null) shown.pattern = shown.deviation = null; // no earlier pattern is valid without a baseline
+  }
+
+  /** Show what was at this time of the run; live data are kept for later. */
+  recall(atS) {
+    this.later ??= Object.fromEntries(SHOWN.map((name) => [name, this[name]]));
+    Object.assign(this, NOTHING);
+    const frame = this.history.at(atS);
+    if (frame !== null) this.absorb(this, frame.header, frame.maps, frame.atS);
+    this.dirty = true;
+  }
+
+  comeBack() {
+    if (this.later !== null) Object.assign(this, this.later);
+    this.later = null;
     this.dirty = true;
   }
 
@@ -89,7 +118,7 @@ class Sensor {
     const shown = note_kinds.filter((kind) => kind !== "rest_level");
     const kinds = shown.length === 0 ? "" : JSON.stringify([shown, dead]);
     if (kinds !== "" && kinds !== this.noteKinds && !(first && this.result.state === "zeroing")) {
-      log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}` });
+      log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}`, again: true });
     }
     this.noteKinds = kinds;
   }
@@ -134,7 +163,7 @@ class Sensor {
     const unit = this.unit();
     const at = row * cols + col;
     const uncertainty = this.deviation === null ? "" : ` \u00b1 ${amount(this.deviation.values[at], 3, unit)}`;
-    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${uncertainty}${this.live() ? "" : ", not live"}`;
+    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${uncertainty}${this.live() ? "" : page.atS === null ? ", not live" : ", then"}`;
   }
 
   // -- state --
@@ -144,7 +173,12 @@ class Sensor {
   ageS() { return nowS() - this.receivedS; }
 
   /** True if the sensor is silent: the program reports it, or the newest result is old. */
-  away() { return this.silentS !== null || (this.result !== null && this.ageS() > 1); }
+  away() { return page.atS === null && !replay.rests && this.quiet(); }
+
+  quiet() {
+    const { result, receivedS } = this.later ?? this;
+    return this.silentS !== null || (result !== null && nowS() - receivedS > 1);
+  }
 
   /** True if the pattern shown is of the newest scan; after a dropped scan the pattern before stays for a moment. */
   newest() {
@@ -152,10 +186,10 @@ class Sensor {
     return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < FRESH_S);
   }
 
-  live() { return this.newest() && page.link.up && !this.away() && !page.paused; }
+  live() { return page.atS === null && this.newest() && page.link.up && !this.away() && !page.paused; }
 
   /** True if the pattern is shown in grey; while paused it keeps its colours, and the state shows "paused". */
-  old() { return this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest()); }
+  old() { return page.atS === null && this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest()); }
 
   /** Return the result of the pattern shown if that is the newest; else the newest result. */
   made() { return this.newest() ? this.touched : this.result; }
@@ -170,11 +204,15 @@ class Sensor {
     return unknown ? `${TOO_LIGHT} whether the pattern is to be believed` : null;
   }
 
+  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, this.hello.pixel_pitch_mm, this.hello.contact_level); }
+
   word() {
+    if (page.atS !== null) return ["past", this.result === null ? "no scan then" : `${this.newest() && this.doubted() ? "contact, not believed" : this.result.state}, ${number(this.trace.newestS - page.atS, 1)}${THIN}s ago`];
     if (!page.link.up) return ["lost", lostWord()];
     if (page.paused) return ["paused", "paused"];
     if (this.result === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
     if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
+    if (replay.rests) return ["paused", `${this.result.state}, held`];
     if (this.newest() && this.doubted()) return ["doubted", "contact, not believed"];
     const state = this.result.state === "dropped" ? "contact" : this.result.state; // a newer scan was already waiting
     return [state, state];
@@ -184,6 +222,11 @@ class Sensor {
 
   paint() {
     this.dirty = false;
+    hand.paint(this);
+    if (hand.shows(this)) this.paintWhole();
+  }
+
+  paintWhole() {
     this.paintWord();
     this.paintPattern();
     this.paintTaxels();
@@ -208,6 +251,19 @@ class Sensor {
     say(why, this.result?.note ?? "");
     this.root.classList.toggle("lost", state === "lost" || state === "silent");
     show(zero, page.sensors.size > 1);
+    zero.disabled = !page.link.up;
+    this.paintLink();
+  }
+
+  /** Return whether scans come from this sensor now, also while the page looks back: not only that the page is connected. */
+  comes() { return page.link.up && (this.later ?? this).result !== null && (replay.rests || !this.quiet()); }
+
+  paintLink() {
+    const up = this.comes();
+    this.part.link.dataset.up = up ? "yes" : "no";
+    const rate = (this.later ?? this).result?.rate_hz;
+    const away = this.silentS === null ? "no scan" : `no scan for ${duration(this.silentS)}`;
+    say(this.part.link, !page.link.up ? "no connection" : replay.rests ? "recording held" : up ? `${known(rate) ? amount(rate, 0, "scans/s") : "scans come"}` : away);
   }
 
   high() {
@@ -222,68 +278,34 @@ class Sensor {
     stamp.classList.toggle("aside", page.paused);
     field.dataset.live = live ? "yes" : "no";
     say(stamp, this.stampText());
-    show(stamp, !live);
+    show(stamp, !live && !(page.atS !== null && this.newest()));
     say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
     if (this.pattern !== null) {
       const [rows, cols] = this.pattern.shape;
       paintMap(pattern, this.pattern.values, rows, cols, high, VIRIDIS);
       const most = largest(this.pattern.values);
-      say(this.part["pattern-most"], live ? `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}` : "");
+      say(this.part["pattern-most"], live || page.atS !== null ? `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}` : "");
     } else {
       pattern.getContext("2d").clearRect(0, 0, pattern.width, pattern.height);
       say(this.part["pattern-most"], "");
     }
+    const relief = page.relief && this.pattern !== null;
+    field.classList.toggle("relief", relief);
+    if (relief) paintRelief(this.part.relief, this.pattern, high, VIRIDIS);
     const verdict = this.verdict();
     show(this.part.verdict, verdict !== null);
     say(this.part.verdict, verdict ?? "");
     this.root.classList.toggle("doubted", this.doubted());
-    this.paintOver(over, live);
+    paintOver(this, over, live || (page.atS !== null && this.newest()));
     readout.classList.toggle("read", this.cursor !== null);
-    say(readout, this.cursor === null ? "hover, or use the arrow keys, to read a pixel" : this.reading());
+    say(readout, this.cursor === null ? (matchMedia("(hover: none)").matches ? "tap the pattern to read a pixel" : "hover, or use the arrow keys, to read a pixel") : this.reading());
   }
 
   stampText() {
+    if (page.atS !== null) return this.result === null ? "no scan then" : "no contact then";
     if (page.paused && this.newest()) return `paused ${ago(nowS() - page.pausedS)}`;
     if (this.pattern === null) return this.result === null ? "no scan yet" : this.result.baseline === null ? "no baseline yet" : "no contact yet";
     return `last contact ${ago(nowS() - this.touchedS)}`;
-  }
-
-  paintOver(canvas, live) {
-    const [context, width, height] = blank(canvas);
-    const [rows, cols] = this.size();
-    const widthMm = cols * this.hello.pixel_pitch_mm;
-    if (!(widthMm > 0) || width === 0) return;
-    const ink = this.pattern === null ? [colour("text"), colour("card")] : ["#fff", "#0009"];
-    const barMm = SCALE_BARS_MM.find((mm) => mm <= widthMm / 3) ?? widthMm;
-    const bar = (barMm / widthMm) * width;
-    haloed(context, ink, 2, () => {
-      context.moveTo(10, height - 16);
-      context.lineTo(10, height - 10);
-      context.lineTo(10 + bar, height - 10);
-      context.lineTo(10 + bar, height - 16);
-    });
-    context.font = FONT;
-    context.textAlign = "center";
-    haloedText(context, ink, `${barMm}${THIN}mm`, 10 + bar / 2, height - 16);
-    const centre = live ? this.touched.centroid_mm : null;
-    if (centre) {
-      const [x, y] = [width / 2 + (centre[0] / widthMm) * width, height / 2 + (centre[1] / widthMm) * width];
-      haloed(context, ink, 1.5, () => { context.moveTo(x - 6, y); context.lineTo(x + 6, y); context.moveTo(x, y - 6); context.lineTo(x, y + 6); });
-    }
-    const wrench = live ? this.touched.wrench : null;
-    if (wrench?.centre_of_pressure_mm) {
-      const [x, y] = wrench.centre_of_pressure_mm.map((mm, axis) => [width, height][axis] / 2 + (mm / widthMm) * width);
-      const [fx, fy] = wrench.force_n;
-      const length = (SHEAR_SHARE * width) / Math.hypot(...wrench.force_n);
-      haloed(context, ink, 1.5, () => context.arc(x, y, 5, 0, 2 * Math.PI));
-      arrow(context, ink, x, y, fx * length, fy * length);
-    }
-    const next = this.pattern === null || this.away() || !page.link.up ? null : this.result?.next_tap;
-    if (next) outlinePad(context, ink, width, height, width / widthMm, next);
-    if (this.cursor !== null) {
-      const [row, col] = this.cursor;
-      haloed(context, ink, 2, () => context.rect((col * width) / cols, (row * height) / rows, width / cols, height / rows));
-    }
   }
 
   paintTaxels() {
@@ -304,35 +326,10 @@ class Sensor {
       const high = roundUp(largest(believed, LEAST_COUNTS));
       paintMap(taxels, z, rows, cols, high, CIVIDIS);
       say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
-      if (width > 0) this.paintShear(context, width, height, rows, cols, values, high);
+      if (width > 0) paintShear(this, context, width, height, rows, cols, values, high);
     }
     const [rows, cols] = [this.hello.rows, this.hello.cols];
     for (const [taxel] of deaths) cross(context, width, height, rows, cols, Number(taxel));
-  }
-
-  paintShear(context, width, height, rows, cols, values, high) {
-    const count = rows * cols;
-    let longest = LEAST_SHEAR_COUNTS;
-    for (let taxel = 0; taxel < count; taxel++) {
-      if (!this.result.dead?.[taxel]) longest = Math.max(longest, Math.hypot(values[taxel], values[count + taxel]));
-    }
-    longest = roundUp(longest);
-    const cell = Math.min(width / cols, height / rows);
-    this.part.ruler.style.width = `${0.45 * cell}px`;
-    say(this.part["shear-most"], `${short(longest)}${THIN}counts`);
-    context.font = '10px system-ui, "DejaVu Sans", sans-serif';
-    context.textAlign = "center";
-    for (let taxel = 0; taxel < count; taxel++) {
-      if (this.result.dead?.[taxel]) continue;
-      const [x, y] = [((taxel % cols) + 0.5) * (width / cols), (Math.floor(taxel / cols) + 0.5) * (height / rows)];
-      const z = values[2 * count + taxel];
-      const ink = level(z, high) > 0.6 * LEVELS ? ["#000", "#fff6"] : ["#fff", "#0006"];
-      arrow(context, ink, x, y, (values[taxel] / longest) * 0.45 * cell, (values[count + taxel] / longest) * 0.45 * cell);
-      if (cell > 34) {
-        context.fillStyle = ink[0];
-        context.fillText(number(z), x, y + cell / 2 - 4);
-      }
-    }
   }
 
   paintDeviation() {
@@ -342,7 +339,7 @@ class Sensor {
     const there = this.deviation !== null;
     field.classList.toggle("old", this.old());
     show(stamp, !there);
-    say(stamp, this.pattern !== null ? "not given by this model" : "no contact yet");
+    say(stamp, this.pattern !== null ? "not given by this model" : page.atS === null ? "no contact yet" : "no contact then");
     if (!there) {
       deviation.getContext("2d").clearRect(0, 0, deviation.width, deviation.height);
       return say(this.part["deviation-high"], this.unit());
@@ -372,8 +369,12 @@ class Sensor {
     const newtons = known(this.result?.force_n);
     const span = page.spanS;
     say(this.part.span, `last ${span}${THIN}s`);
-    paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts");
-    paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2");
+    paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts", page.atS, this.limits.of("force"));
+    if (page.shear && this.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force", page.atS);
+    else paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2", page.atS, this.limits.of("area"));
+    show(this.part.shear_toggle, this.hello.wrench);
+    this.part.shear_toggle.setAttribute("aria-pressed", String(page.shear));
+    this.limits.paint();
     say(this.part["force-now"], newtons ? amount(this.result.force_n, 2, "N") : amount(this.result?.force_counts, 0, "counts"));
     say(this.part["area-now"], amount(this.made()?.area_mm2, 0, "mm\u00b2"));
   }
@@ -388,7 +389,7 @@ class Sensor {
       if (!LOSSES.has(key)) say(element, texts[key]);
       else {
         say(element, String(counters[key] ?? 0));
-        element.classList.toggle("warn", counters[key] > 0);
+        element.classList.toggle("warn", counters[key] > LOSS_SHARE * (counters.scans ?? 0));
       }
     }
     this.fields.trusted.classList.toggle("warn", made.trusted === false);

@@ -1,15 +1,15 @@
 // ---- Traces ----
 
-const LONGEST_S = 60;
+const LONGEST_S = 180; // as the history
 const STEP_S = 0.01; // closer scans share a point, which keeps the larger value
 const GAP_S = 0.3;
 const POINTS = Math.ceil(1.1 * LONGEST_S / STEP_S);
 
-/** Ring buffer of the last minute of force and area. */
+/** Ring buffer of the last minutes of force, area and shear. */
 class Trace {
   constructor() {
     this.time = new Float64Array(POINTS);
-    this.series = { force_counts: new Float32Array(POINTS), area_mm2: new Float32Array(POINTS), force_n: new Float32Array(POINTS) };
+    this.series = { force_counts: new Float32Array(POINTS), area_mm2: new Float32Array(POINTS), force_n: new Float32Array(POINTS), shear_ratio: new Float32Array(POINTS) };
     this.next = this.count = 0;
     this.newestS = -Infinity;
     this.heldS = null;
@@ -37,8 +37,8 @@ class Trace {
   }
 
   /** Call visit(time, value) for each point of the last `spanS` seconds, oldest first. */
-  each(name, spanS, visit) {
-    const [series, endS] = [this.series[name], this.endS];
+  each(name, spanS, visit, endS = this.endS) {
+    const series = this.series[name];
     for (let back = this.count; back > 0; back--) {
       const place = (this.next + POINTS - back) % POINTS;
       const atS = this.time[place];
@@ -53,7 +53,7 @@ const sizes = new ResizeObserver((entries) => {
     const ratio = window.devicePixelRatio;
     [target.width, target.height] = [Math.round(contentRect.width * ratio), Math.round(contentRect.height * ratio)];
   }
-  painter.all();
+  painter.resized();
 });
 
 function blank(canvas) {
@@ -66,15 +66,17 @@ function blank(canvas) {
 
 const FONT = '11px system-ui, "DejaVu Sans", sans-serif';
 
-function paintTrace(canvas, trace, name, spanS, least, ink, unit) {
+/** Paint a trace up to now; or around a moment looked back at, which is marked. */
+function paintTrace(canvas, trace, name, spanS, least, ink, unit, markS = null, limit = null) {
   const [context, width, height] = blank(canvas);
   const [left, right, top, bottom] = [40, width - 6, 7, height - 17];
   if (right <= left) return;
-  let [low, high] = [0, least];
-  trace.each(name, spanS, (_, value) => { if (value > high) high = value; if (value < low) low = value; });
+  const endS = markS === null ? trace.endS : Math.min(trace.newestS, markS + spanS / 2);
+  let [low, high] = [0, Math.max(least, limit ?? 0)];
+  trace.each(name, spanS, (_, value) => { if (value > high) high = value; if (value < low) low = value; }, endS);
   high = roundUp(1.03 * high);
   low = low < -0.02 * high ? -roundUp(-low) : 0;
-  const x = (atS) => right - ((trace.endS - atS) / spanS) * (right - left);
+  const x = (atS) => right - ((endS - atS) / spanS) * (right - left);
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
   context.font = FONT;
   context.fillStyle = colour("quiet");
@@ -90,21 +92,23 @@ function paintTrace(canvas, trace, name, spanS, least, ink, unit) {
   }
   context.textBaseline = "alphabetic";
   for (let part = 0; part <= 2; part++) {
-    const ago = (spanS * part) / 2;
-    const at = Math.round(right - (ago / spanS) * (right - left)) - 0.5;
+    const ago = (spanS * part) / 2 + (markS === null ? 0 : trace.newestS - endS);
+    const at = Math.round(right - (part / 2) * (right - left)) - 0.5;
     context.moveTo(at, top);
     context.lineTo(at, bottom);
     context.textAlign = part === 0 ? "right" : part === 2 ? "left" : "center";
-    context.fillText(part === 0 ? "now" : `${MINUS}${ago}${THIN}s`, at, height - 4);
+    context.fillText(ago < 0.05 ? "now" : `${MINUS}${short(Math.round(10 * ago) / 10)}${THIN}s`, at, height - 4);
   }
   context.stroke();
   context.textAlign = "left";
   context.fillText(unit, left + 4, top + 9);
-  paintLine(context, trace, name, spanS, x, y, ink);
+  paintLine(context, trace, name, spanS, x, y, ink, endS);
+  paintLimit(context, limit, y, left, right);
+  if (markS !== null) haloed(context, [colour("text"), colour("card")], 1, () => { context.moveTo(x(markS), top); context.lineTo(x(markS), bottom); });
 }
 
 /** Draw a line through all points; those on one column are one stroke from the least to the largest. */
-function paintLine(context, trace, name, spanS, x, y, ink) {
+function paintLine(context, trace, name, spanS, x, y, ink, endS) {
   context.strokeStyle = ink;
   context.lineWidth = 1.6;
   context.lineJoin = "round";
@@ -123,6 +127,6 @@ function paintLine(context, trace, name, spanS, x, y, ink) {
       column = at;
     }
     beforeS = atS;
-  });
+  }, endS);
   context.stroke();
 }
