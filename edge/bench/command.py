@@ -51,6 +51,7 @@ class Settings:
         by_surface: True to show PSNR by surface.
         only: names of the subjects to measure, or None for all.
         system: True to measure the whole program, and nothing else.
+        sensors: number of sensors with which alone it is measured, or None.
         soak_minutes: of the whole program afterwards, in [min], or None.
         command: command line of the bench.
     """
@@ -66,6 +67,7 @@ class Settings:
     by_surface: bool
     only: list[str] | None
     system: bool
+    sensors: int | None
     soak_minutes: float | None
     command: str
 
@@ -102,7 +104,7 @@ def run(settings: Settings, out: TextIO, err: TextIO) -> int:
     page.say(f"# Error against run time\n\n{tables.about(record)}")
     try:
         if settings.system:
-            show_system(settings.ticks, settings.soak_minutes, record, page)
+            show_system(settings.ticks, settings.sensors, settings.soak_minutes, record, page)
         else:
             record.facts += [_facts(subject) for subject in measured_ones]
             _errors(everyone, frozen, record, page, by_surface=settings.by_surface)

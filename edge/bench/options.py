@@ -1,4 +1,4 @@
-"""Options of `edge-sr bench`, and its help; narrow enough for 40 columns."""
+"""Options of `edge-sr bench`, and its help."""
 
 import argparse
 from pathlib import Path
@@ -7,10 +7,8 @@ from typing import Final
 from edge.terminal.argument_types import Parser, positive, whole
 
 BENCH_HELP: Final = """\
-Run time is measured back to back, and
-paced: one inference a tick, as on a
-robot. A row takes half a minute. No
-other program should run meanwhile.
+Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \
+program should run meanwhile.
 
 examples:
   edge-sr bench --out today
@@ -18,8 +16,7 @@ examples:
   edge-sr bench --threads 1 \\
           --compare before/bench.json
 
-Ctrl-C ends it with exit code 130, after
-the rows measured so far are written.
+Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """
 
 
@@ -28,7 +25,7 @@ def bench_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="edge-sr bench",
         usage="edge-sr bench [options]",
-        description="Error against run time of the\nbundled models and of methods without a\nnetwork.",
+        description="Measures error against run time of the bundled models and of methods without a network.",
         epilog=BENCH_HELP,
     )
     add = parser.add_argument
@@ -51,10 +48,16 @@ def bench_parser() -> argparse.ArgumentParser:
     add("--by-surface", action="store_true", help="report the PSNR of each surface")
     add("--system", action="store_true", help="measure the whole program only: 6 minutes with 3000 ticks")
     add(
+        "--sensors",
+        metavar="N",
+        type=whole(3),
+        help="measure the whole program with so many sensors only: 2 minutes with 3000 ticks",
+    )
+    add(
         "--soak",
         metavar="MINUTES",
         type=positive,
-        help="with --system: also run it this long, for growth of memory and drift of latency",
+        help="with --system or --sensors: also run it this long, for growth of memory and drift of latency",
     )
     add("--only", metavar="NAME", nargs="+", help="measure only these methods")
     return parser

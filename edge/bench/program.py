@@ -5,8 +5,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,8 +21,16 @@ from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 SEED: Final = 0
-CONTROLLERS: Final = ("4", "6")
-"""Names of the sensors."""
+CONTROLLERS: Final = ("4", "6", "8", "10")
+"""Names of the sensors on a bus."""
+FINGERS: Final = CONTROLLERS[:2]
+"""Names of two of them."""
+SENSORS_PER_BUS: Final = 4
+"""Most sensors on one bus: at 1 Mbit/s it carries 480 scans a second."""
+FRAME_US: Final = 130.0
+"""Time of a frame on a bus of 1 Mbit/s, in [us]."""
+FULL_BUS: Final = 0.9
+"""Share of the time that frames may take on a bus."""
 REST_COUNTS: Final = (16_000, 16_400, 38_600)
 PRESS_COUNTS: Final = 3000
 NOISE_COUNTS: Final = 3
@@ -37,40 +46,68 @@ PROGRAM_SOURCES: Final = (
     "firmware_bridge/scans/scan_assembler.py",
 )
 """Sources of a report on the whole program: they import most of what a run executes."""
+Emulate = Callable[..., AbstractContextManager[str]]
+"""Function from the arguments of an emulator to its port, within a with statement."""
 _SCANS: Final = 500
 _ROOT: Final = Path(__file__).parents[2]
 _MAPS: Final = b',"pattern":'
 _PLAIN_LOOP: Final = """
-import sys, time, serial
-port = serial.Serial(sys.argv[1], 3_000_000, rtscts=True, timeout=0.1)
-for command in (b"C\\r", b"S8\\r", b"O\\r"):
-    port.write(command)
-    time.sleep(0.05)
+import os, select, sys, time, serial
+poll, ports = select.poll(), [serial.Serial(name, 3_000_000, rtscts=True, timeout=0.1) for name in sys.argv[1:]]
+for port in ports:
+    for command in (b"C\\r", b"S8\\r", b"Z1\\r", b"O\\r"):
+        port.write(command)
+        time.sleep(0.05)
+    poll.register(port.fileno(), select.POLLIN)
 while True:
-    port.read(port.in_waiting or 1)
+    for descriptor, _ in poll.poll():
+        os.read(descriptor, 4096)
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """Scans that emulated sensors on one bus play.
+    """Scans that emulated sensors play, up to four on each bus.
 
     Attributes:
         rate_hz: scans a second of each, in [Hz].
-        sensors: 1 or 2.
+        sensors: number of sensors.
         pressed: of 500 scans, the number in contact; the others come first.
         moving: the contact moves, so that each scan differs from the one before.
+        touched: number of sensors that are ever in contact, spread over the buses; None for all.
+        waits: the adapter waits for a reader that is late, rather than lose frames.
     """
 
     rate_hz: float = 100.0
     sensors: int = 1
     pressed: int = 0
     moving: bool = False
+    touched: int | None = None
+    waits: bool = False
+
+    @property
+    def buses(self) -> int:
+        """Number of buses, each with an adapter of its own."""
+        return -(-self.sensors // SENSORS_PER_BUS)
+
+    def names(self, bus: int) -> tuple[str, ...]:
+        """Return the names of the sensors on a bus, as records have them."""
+        return tuple(self.prefix(bus) + name for name in CONTROLLERS[: len(range(bus, self.sensors, self.buses))])
+
+    def prefix(self, bus: int) -> str:
+        """Return the beginning of the names of the sensors on a bus."""
+        return "" if self.buses == 1 else f"bus{bus}/"
+
+    @property
+    def touching(self) -> range:
+        """Numbers of the sensors that are ever in contact."""
+        return range(self.sensors)[: self.touched]
 
     @property
     def frame_us(self) -> float:
-        """Time of a frame, in [us]: as on a bus of 1 Mbit/s, or as little as the rate leaves."""
-        return min(130.0, 0.5e6 / (16 * self.sensors * self.rate_hz))
+        """Time between frames of a sensor, in [us]: as on a shared bus of 1 Mbit/s, or as little as the rate leaves."""
+        frame_us, period_us = FRAME_US * len(self.names(0)), 1e6 / self.rate_hz
+        return frame_us if 16 * frame_us < FULL_BUS * period_us else period_us / 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +121,7 @@ class Line:
 class Program:
     """Process that reads emulated sensors, and its records where it writes any."""
 
-    def __init__(self, process: subprocess.Popen[bytes], spawned_ns: int, stamps: Path) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], spawned_ns: int, stamps: Mapping[str, Path]) -> None:
         self.spawned_ns = spawned_ns
         self._process = process
         self._stamps = stamps
@@ -96,21 +133,37 @@ class Program:
         Raises:
             BenchError: the program ended.
         """
+        got: list[tuple[int, bytes]] = []
+        for time_ns, line in self._read(seconds):
+            # Parsing waits until the end: it would take the program's processor time away. An event has no maps.
+            head, maps, _ = line.partition(_MAPS)
+            if maps:
+                got.append((time_ns, head + b"}"))
+                if len(got) == most:
+                    break
+        return [Line(time_ns, json.loads(head)) for time_ns, head in got]
+
+    def skip(self, seconds: float) -> None:
+        """Read the records of so long and forget them: a pause to parse them would fill the pipe.
+
+        Raises:
+            BenchError: the program ended.
+        """
+        for _ in self._read(seconds):
+            pass
+
+    def _read(self, seconds: float) -> Iterator[tuple[int, bytes]]:
+        """Yield what the program writes for so long, line by line, with the time of arrival in [ns]."""
         if self._process.stdout is None:
             raise ValueError("the program's stdout is not a pipe")
-        got: list[tuple[int, bytes]] = []
         end_ns = time.monotonic_ns() + int(seconds * 1e9)
         now_ns = 0
-        while now_ns < end_ns and (most is None or len(got) < most):
+        while now_ns < end_ns:
             line = self._process.stdout.readline()
             now_ns = time.monotonic_ns()
             if not line:
                 raise BenchError(f"edge-sr ended with {self._process.wait()} while it was measured")
-            # Parsing waits until the end: it would take the program's processor time away. An event has no maps.
-            head, maps, _ = line.partition(_MAPS)
-            if maps:
-                got.append((now_ns, head + b"}"))
-        return [Line(time_ns, json.loads(head)) for time_ns, head in got]
+            yield now_ns, line
 
     def first_pattern_s(self) -> float:
         """Return the time from its spawn to the record of its first pattern, in [s]."""
@@ -139,38 +192,70 @@ class Program:
 
     def stamps_ns(self) -> dict[str, list[int]]:
         """Return the time of the last byte of each scan, by sensor, once the emulator has ended, in [ns]."""
-        times: dict[str, list[int]] = {name: [] for name in CONTROLLERS}
-        for line in self._stamps.read_text().splitlines():
-            controller, time_ns = line.split()
-            times[controller].append(int(time_ns))
+        times: dict[str, list[int]] = defaultdict(list)
+        for prefix, stamps in self._stamps.items():
+            for line in stamps.read_text().splitlines():
+                controller, time_ns = line.split()
+                times[prefix + controller].append(int(time_ns))
         return times
 
 
 @contextmanager
 def plain_loop(folder: Path, play: Play) -> Iterator[Program]:
-    """Run a program that reads the same bytes with pyserial and does nothing with them."""
-    with _emulator(folder, play) as (port, stamps), _process(["-c", _PLAIN_LOOP, port], stamps) as program:
+    """Run a program that reads the same bytes by poll and os.read, on pyserial's port, and decodes nothing."""
+    with (
+        _emulators(folder, play, emulating) as (ports, stamps),
+        _process(["-c", _PLAIN_LOOP, *ports], stamps) as program,
+    ):
         yield program
 
 
 @contextmanager
-def edge_sr(folder: Path, play: Play, *options: str, sink: str = "jsonl:-") -> Iterator[Program]:
-    """Run `edge-sr` with stored baselines; its files lie in `folder` meanwhile."""
-    with _emulator(folder, play) as (port, stamps):
-        command = ["-m", "edge.cli.main", "--source", f"slcan:{port}", "--baseline", str(folder / "zero.json")]
-        with _process([*command, "--sink", sink, *options], stamps) as program:
+def edge_sr(
+    folder: Path,
+    play: Play,
+    *options: str,
+    sink: str = "jsonl:-",
+    cores: Collection[int] = (),
+    emulate: Emulate | None = None,
+) -> Iterator[Program]:
+    """Run `edge-sr` with stored baselines; its files lie in `folder`.
+
+    Args:
+        folder: for all files.
+        play: what it reads.
+        options: further ones of edge-sr.
+        sink: of the records.
+        cores: the only ones that it may use; any without.
+        emulate: runs the emulator of a bus instead of `emulating`.
+    """
+    with _emulators(folder, play, emulate) as (ports, stamps):
+        command = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json"), "--sink", sink]
+        for bus, port in enumerate(ports):
+            command += ["--source", f"slcan:{port}" if play.buses == 1 else f"bus{bus}=slcan:{port}"]
+        with _process([*command, *options], stamps, cores) as program:
             yield program
 
 
 @contextmanager
-def _emulator(folder: Path, play: Play) -> Iterator[tuple[str, Path]]:
-    stamps = folder / "stamps.txt"
-    files = [_recording(folder, play, sensor) for sensor in range(play.sensors)]
+def _emulators(folder: Path, play: Play, emulate: Emulate | None = None) -> Iterator[tuple[list[str], dict[str, Path]]]:
+    """Run an emulator for each bus; yields the ports, and by bus the files with the times of its scans."""
+    names = [name for bus in range(play.buses) for name in play.names(bus)]
     rest = _rest_counts().astype(np.float32)
-    save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in CONTROLLERS])
-    options = ["--loop", "--rate-hz", str(play.rate_hz), "--frame-us", str(play.frame_us), "--stamps", str(stamps)]
-    with emulating(*options, *map(str, files)) as port:
-        yield port, stamps
+    save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in names])
+    ports: list[str] = []
+    stamps: dict[str, Path] = {}
+    with ExitStack() as closing:
+        for bus in range(play.buses):
+            stamps[play.prefix(bus)] = file = folder / f"stamps{bus}.txt"
+            numbers = range(bus, play.sensors, play.buses)
+            played = [
+                _recording(folder, play, number, name) for number, name in zip(numbers, CONTROLLERS, strict=False)
+            ]
+            options = ["--loop", "--rate-hz", str(play.rate_hz), "--frame-us", str(play.frame_us)]
+            options += ["--stamps", str(file), "--seed", str(bus), *(["--waits"] if play.waits else [])]
+            ports.append(closing.enter_context((emulate or emulating)(*options, *map(str, played))))
+        yield ports, stamps
 
 
 @contextmanager
@@ -195,8 +280,8 @@ def emulating(*arguments: str, program: Sequence[str] = EMULATOR) -> Iterator[st
 
 
 @contextmanager
-def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
-    with uncollected():  # or a pause of our own collector would count as the program's
+def _process(arguments: Sequence[str], stamps: Mapping[str, Path], cores: Collection[int] = ()) -> Iterator[Program]:
+    with uncollected(), _held_to(cores) as held:  # or a pause of our own collector would count as the program's
         spawned_ns = time.monotonic_ns()
         with subprocess.Popen(
             [sys.executable, *arguments],
@@ -206,10 +291,21 @@ def _process(arguments: Sequence[str], stamps: Path) -> Iterator[Program]:
             env=environment(),
             start_new_session=True,
         ) as process:
+            held.close()
             try:
                 yield Program(process, spawned_ns, stamps)
             finally:
                 process.kill()  # its last records are of no interest
+
+
+@contextmanager
+def _held_to(cores: Collection[int]) -> Iterator[ExitStack]:
+    """Hold processes that are started from here on to some cores, until the stack is closed; to any without cores."""
+    with ExitStack() as held:
+        if cores:
+            held.callback(os.sched_setaffinity, 0, os.sched_getaffinity(0))
+            os.sched_setaffinity(0, cores)
+        yield held
 
 
 def environment() -> dict[str, str]:
@@ -222,21 +318,21 @@ def _rest_counts() -> NDArray[np.int64]:
     return np.asarray(REST_COUNTS)[:, None, None] + 37 * np.arange(16).reshape(4, 4)
 
 
-def _recording(folder: Path, play: Play, sensor: int) -> Path:
-    rng = np.random.default_rng([SEED, sensor])
+def _recording(folder: Path, play: Play, number: int, name: str) -> Path:
+    rng = np.random.default_rng([SEED, number])
     counts = _rest_counts() + rng.integers(-NOISE_COUNTS, NOISE_COUNTS + 1, (_SCANS, 3, 4, 4))
     turn = 2 * np.pi * np.arange(_SCANS) / 100 * play.moving
     row, col = (1.5 + np.array([np.sin(turn), np.cos(turn)]))[:, :, None, None]
     rows, cols = np.indices((4, 4))
     press = np.rint(PRESS_COUNTS * np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 2)).astype(int)
-    press[: _SCANS - play.pressed] = 0
+    press[: _SCANS - (play.pressed if number in play.touching else 0)] = 0
     counts[:, 2] += press
-    path = folder / f"played{sensor}.npz"
+    path = folder / f"played{number}.npz"
     np.savez(
         path,
         format=np.array(NPZ_FORMAT),
         version=np.array(NPZ_VERSION),
-        sensor=np.array([CONTROLLERS[sensor]] * _SCANS),
+        sensor=np.array([name] * _SCANS),
         scan=np.arange(_SCANS),
         time_ns=np.arange(_SCANS) * 10_000_000,
         counts=counts.astype(np.int32),

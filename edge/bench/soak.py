@@ -1,6 +1,6 @@
 """The whole program for minutes, taking turns between rest and contact, for growth of memory and drift of latency.
 
-    python -m edge.bench.soak MINUTES
+    python -m edge.bench.soak MINUTES [SENSORS]
 
 writes the result as JSON.
 """
@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from edge.bench.errors import BenchError
 from edge.bench.program import Play, Program, edge_sr
+from edge.terminal.argument_types import whole
 from edge.terminal.progress_bar import tracked
 
 WARM_UP_S: Final = 6.0
@@ -27,6 +28,8 @@ WARM_UP_S: Final = 6.0
 WINDOW_S: Final = 5.0
 """Length of one turn of rest and contact, in [s], so that windows can be compared."""
 _PLAY: Final = Play(pressed=250, moving=True)
+THIRD_FROM: Final = 3
+"""Number of sensors from which a third of them is touched; all of fewer are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,14 +73,15 @@ class Soak:
     windows: tuple[Window, ...]
 
 
-def soak(minutes: float) -> Soak:
-    """Run the program for so long, with a progress bar; at least three windows.
+def soak(minutes: float, sensors: int = 1) -> Soak:
+    """Run the program for so long with so many sensors, with a progress bar; at least three windows.
 
     Raises:
         BenchError: the program ended early.
     """
-    with tempfile.TemporaryDirectory() as folder, edge_sr(Path(folder), _PLAY) as program:
-        program.lines(WARM_UP_S)
+    play = replace(_PLAY, sensors=sensors, touched=-(-sensors // 3) if sensors >= THIRD_FROM else None)
+    with tempfile.TemporaryDirectory() as folder, edge_sr(Path(folder), play) as program:
+        program.skip(WARM_UP_S)
         count = max(3, round(60 * minutes / WINDOW_S))
         windows = list(tracked(_windows(program, count), "soak", "window", count))
     return evaluated(windows)
@@ -115,11 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 when done, 1 on a clear error."""
     parser = argparse.ArgumentParser(prog="python -m edge.bench.soak", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("minutes", type=float, metavar="MINUTES", help="length of the run, .25 at least")
-    minutes: float = parser.parse_args(arguments).minutes
+    parser.add_argument("sensors", type=whole(1), nargs="?", default=1, metavar="SENSORS", help="default: 1")
+    options = parser.parse_args(arguments)
+    minutes: float = options.minutes
     if not 0 < minutes < math.inf:
         parser.error(f"MINUTES is {minutes:g}, expected a positive number")
     try:
-        sys.stdout.write(json.dumps(asdict(soak(minutes))))
+        sys.stdout.write(json.dumps(asdict(soak(minutes, options.sensors))))
     except BenchError as error:
         sys.stderr.write(f"soak: {error}\n")
         return 1

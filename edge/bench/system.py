@@ -2,7 +2,7 @@
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,17 +10,20 @@ from typing import Final
 
 import numpy as np
 
-from edge.bench.processes import STARTS, busy_core
+from edge.bench.processes import STARTS, busy_core, usable_cores
 from edge.bench.program import Line, Play, Program, edge_sr, plain_loop
 from edge.bench.timing import Times, summary
 
 SETTLE_S: Final = 2.0
 ALL: Final = 500
-PLAIN, PLAIN_FAST = "plain loop, 100 Hz", "plain loop, 1000 Hz"
-IDLE, FAST = "at rest", "at rest, 1000 Hz"
+PLAIN, IDLE, IDLE_RECORDED = "plain loop", "at rest", "at rest, recorded"
+FAST_HZ: Final = 5000.0
+FAST: Final = f"at rest, {FAST_HZ:g} Hz"
 HELD, MOVING = "held still", "every scan new"
 TWO, TWO_RECORDED = "two sensors, every scan new", "two sensors, every scan new, recorded"
 TWO_BUSY = "two sensors, every scan new, recorded, other core busy"
+HAND: Final = 16
+"""Sensors of a hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +50,7 @@ class SystemRow:
     Attributes:
         name: of the row.
         scans: number of scans in the run.
+        rate_hz: scans a second, of all sensors together, in [Hz].
         cpu_percent: processor time of all its threads, in [% of one core].
         thread_percent: the same of each thread that takes any, the most first.
         resident_mb: memory at the end, in [MB].
@@ -61,6 +65,7 @@ class SystemRow:
 
     name: str
     scans: int
+    rate_hz: float
     cpu_percent: float
     thread_percent: tuple[float, ...]
     resident_mb: float
@@ -82,10 +87,18 @@ class StartUp:
 
 ROWS: Final = 9
 """Number of rows that `rows` yields."""
+HAND_ROWS: Final = 4
+"""Number of rows that `hand_rows` yields."""
+
+
+def hand_names(sensors: int) -> tuple[str, str, str, str]:
+    """Return the names of the rows of many sensors: the plain loop, at rest, a third in contact, and recorded."""
+    contact = f"{sensors} sensors, a third in contact, two cores"
+    return f"plain loop of {sensors} sensors", f"{sensors} sensors at rest", contact, f"{contact}, recorded"
 
 
 def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
-    """Yield every row, of so many scans at 100 Hz and as much time at 1000; `tell` gets the name of each row first.
+    """Yield every row, of so many scans at 100 Hz and as much time at 5000; `tell` gets the name of each row first.
 
     Raises:
         BenchError: a process ended.
@@ -95,28 +108,75 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
     moving, two = Play(pressed=ALL, moving=True), Play(sensors=2, pressed=ALL, moving=True)
     with tempfile.TemporaryDirectory() as folder_name:
         folder = Path(folder_name)
-        for name, play in ((PLAIN, Play()), (PLAIN_FAST, Play(rate_hz=1000.0)), (IDLE, Play()), (TWO, two)):
-            tell(name)
-            plain, options = name in (PLAIN, PLAIN_FAST), ("--every-scan",) if play.moving else ()
-            with plain_loop(folder, play) if plain else edge_sr(folder, play, *options, sink="status") as program:
-                time.sleep(SETTLE_S)
-                usage = _Usage(program)
-                time.sleep(seconds)
-                yield _row(name, round(seconds * play.rate_hz * play.sensors), usage.since())
+        yield from _at_rest(folder, (PLAIN, IDLE), Play(), scans, tell)
+        tell(TWO)
+        yield _unrecorded(folder, TWO, two, scans)
         for name, play, options, busy in (
+            (IDLE_RECORDED, Play(), (), False),
             (HELD, Play(pressed=ALL), (), False),
             (MOVING, moving, ("--every-scan",), False),
             (TWO_RECORDED, two, ("--every-scan",), False),
             (TWO_BUSY, two, ("--every-scan",), True),
-            (FAST, Play(rate_hz=1000.0), (), False),
+            (FAST, Play(rate_hz=FAST_HZ, waits=True), (), False),
         ):
             tell(name)
-            with busy_core() if busy else nullcontext(), edge_sr(folder, play, *options) as program:
-                program.lines(60.0, most=1)
-                program.lines(SETTLE_S)
-                usage, lines = _Usage(program), program.lines(seconds)
-                used = usage.since()
-            yield _recorded(name, lines, used, program.stamps_ns())
+            with busy_core() if busy else nullcontext():
+                yield _measured(folder, name, play, seconds, *options)
+
+
+def hand_rows(sensors: int, scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
+    """Yield the rows of many sensors, of so many scans of each; `tell` gets the name of each row first.
+
+    Raises:
+        BenchError: a process ended.
+    """
+    plain, rest, contact, recorded = hand_names(sensors)
+    third = Play(sensors=sensors, pressed=ALL, moving=True, touched=-(-sensors // 3))
+    cores = usable_cores()[-2:]
+    with tempfile.TemporaryDirectory() as folder_name:
+        folder = Path(folder_name)
+        yield from _at_rest(folder, (plain, rest), Play(sensors=sensors), scans, tell)
+        tell(contact)
+        yield _unrecorded(folder, contact, third, scans, cores)
+        tell(recorded)
+        yield _measured(folder, recorded, third, scans / third.rate_hz, "--every-scan", cores=cores)
+
+
+def _at_rest(
+    folder: Path, names: tuple[str, str], play: Play, scans: int, tell: Callable[[str], None]
+) -> Iterator[SystemRow]:
+    """Yield the rows of a plain loop and of the program, with the status line alone."""
+    tell(" and ".join(names))
+    apart = [folder / "plain", folder / "idle"]
+    for one in apart:
+        one.mkdir()
+    # At the same time, since what else runs on the machine moves both, and their ratio is the target.
+    with plain_loop(apart[0], play) as plain, edge_sr(apart[1], play, sink="status") as idle:
+        time.sleep(SETTLE_S)
+        usages = [_Usage(plain), _Usage(idle)]
+        time.sleep(scans / play.rate_hz)
+        used = [usage.since() for usage in usages]
+    for name, one in zip(names, used, strict=True):
+        yield _row(name, scans * play.sensors, one)
+
+
+def _unrecorded(folder: Path, name: str, play: Play, scans: int, cores: Sequence[int] = ()) -> SystemRow:
+    with edge_sr(folder, play, "--every-scan", sink="status", cores=cores) as program:
+        time.sleep(SETTLE_S)
+        usage = _Usage(program)
+        time.sleep(scans / play.rate_hz)
+        return _row(name, scans * play.sensors, usage.since())
+
+
+def _measured(
+    folder: Path, name: str, play: Play, seconds: float, *options: str, cores: Sequence[int] = ()
+) -> SystemRow:
+    with edge_sr(folder, play, *options, cores=cores) as program:
+        program.lines(60.0, most=1)
+        program.skip(SETTLE_S)
+        usage, lines = _Usage(program), program.lines(seconds)
+        since = usage.since()
+    return _recorded(name, lines, since, program.stamps_ns())
 
 
 def start_up() -> StartUp:
@@ -133,6 +193,7 @@ def start_up() -> StartUp:
 
 @dataclass(frozen=True, slots=True)
 class _Used:
+    seconds: float
     cpu_percent: float
     thread_percent: tuple[float, ...]
     resident_mb: float
@@ -158,6 +219,7 @@ class _Usage:
             100 * (after - before) / took_s for after, before in zip(_machine_s(), self._machine, strict=True)
         )
         return _Used(
+            took_s,
             sum(percent),
             tuple(share for share in percent if share >= 0.01),
             self._program.resident_mb(),
@@ -206,6 +268,7 @@ def _row(
     return SystemRow(
         name=name,
         scans=scans,
+        rate_hz=scans / used.seconds,
         cpu_percent=used.cpu_percent,
         thread_percent=used.thread_percent,
         resident_mb=used.resident_mb,

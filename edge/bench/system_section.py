@@ -1,12 +1,13 @@
 """Section of the bench on the whole program."""
 
+from itertools import chain
 from typing import Final
 
 from edge.bench.live_report import Page
 from edge.bench.record import Record, SystemRecord
 from edge.bench.report import head, line
 from edge.bench.soak import Soak, soak
-from edge.bench.system import ROWS, SystemRow, rows, start_up
+from edge.bench.system import HAND, HAND_ROWS, ROWS, SystemRow, hand_rows, rows, start_up
 from edge.bench.targets import Verdict, verdicts
 from edge.bench.timing import Times
 
@@ -20,13 +21,21 @@ _TEXT: Final = (
     "edge-sr in a process of its own reads emulated sensors, a process too, over a pseudo-terminal; STSR, on one "
     "thread. CPU is of all its threads, by the scheduler, in % of one core. Times are from the moment the last byte of "
     "a scan is handed on to the moment the bench has read its record, some 25 kB of JSON, from a pipe; rows without "
-    "them have the status line alone. The plain loop reads the same bytes with pyserial and does nothing with them. "
-    "Others: what all else on this machine took, emulator and bench included."
+    "them have the status line alone. The plain loop reads the same bytes by poll and os.read, decodes nothing, and "
+    "runs at the same time as the row at rest. Many sensors send on buses of four, which are full to five sixths; with "
+    "two cores, the program may use no other. Others: what all else on this machine took, emulator and bench included."
 )
 
 
-def show_system(scans: int, soak_minutes: float | None, record: Record, page: Page) -> None:
+def show_system(scans: int, sensors: int | None, soak_minutes: float | None, record: Record, page: Page) -> None:
     """Measure the whole program, show it and keep it in the record.
+
+    Args:
+        scans: of each sensor, a row.
+        sensors: number of sensors, of which alone rows are measured; None for one, two and a hand.
+        soak_minutes: length of a soak afterwards, in [min]; None for none.
+        record: keeps what was measured.
+        page: shows it.
 
     Raises:
         BenchError: a process ended.
@@ -34,19 +43,26 @@ def show_system(scans: int, soak_minutes: float | None, record: Record, page: Pa
     """
     system = record.system = SystemRecord()
     page.section("The whole program", _TEXT, head(COLUMNS))
-    for row in page.tracked(rows(scans, page.progress), "the program", total=ROWS):
+    hand = hand_rows(HAND if sensors is None else sensors, scans, page.progress)
+    measured, count = (
+        (chain(rows(scans, page.progress), hand), ROWS + HAND_ROWS) if sensors is None else (hand, HAND_ROWS)
+    )
+    for row in page.tracked(measured, "the program", total=count):
         system.rows.append(row)
         page.say(row_line(row))
-    page.progress("start-up")
-    system.start_up = start_up()
-    starts = ", ".join(f"{took_s:.2f}" for took_s in system.start_up.first_pattern_s)
-    page.say(f"\nStart to the record of the first pattern: {starts} s; {system.start_up.resident_mb:.0f} MB by then.")
+    if sensors is None:
+        page.progress("start-up")
+        system.start_up = start_up()
+        starts = ", ".join(f"{took_s:.2f}" for took_s in system.start_up.first_pattern_s)
+        memory = f"{system.start_up.resident_mb:.0f} MB by then"
+        page.say(f"\nStart to the record of the first pattern: {starts} s; {memory}.")
     system.verdicts += verdicts({row.name: row for row in system.rows}, system.start_up)
-    page.section("Targets", "Measured in this run.", head(("target", "measured", "held", "limited by")))
+    if system.verdicts:
+        page.section("Targets", "Measured in this run.", head(("target", "measured", "held", "limited by")))
     for verdict in system.verdicts:
         page.say(verdict_line(verdict))
     if soak_minutes is not None:
-        system.soak = soak(soak_minutes)
+        system.soak = soak(soak_minutes, 1 if sensors is None else sensors)
         page.say(f"\n## Soak\n\n{soak_text(system.soak)}")
 
 

@@ -53,6 +53,7 @@ def bench(tmp_path_factory):
         by_surface=True,
         only=["mine/tiny", "mine/coarse"],
         system=False,
+        sensors=None,
         soak_minutes=None,
         command="edge-sr bench",
     )

@@ -18,21 +18,25 @@ from edge.cli.main import main
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 
-QUICK = summary([800_000] * 1000)
-ROW = SystemRow(system.IDLE, 1000, 1.0, (0.6, 0.4), 70.0, None, None, None, 3, 20.0, 0.5)
+HAND = system.hand_names(system.HAND)
+QUICK = summary([700_000] * 1000)
+ROW = SystemRow(system.IDLE, 1000, 5000.0, 1.0, (0.6, 0.4), 70.0, None, None, None, 3, 20.0, 0.5)
 ROWS = {
     row.name: row
     for row in (
         ROW,
         replace(ROW, name=system.PLAIN, cpu_percent=2.0),
-        replace(ROW, name=system.TWO, cpu_percent=7.0),
         replace(ROW, name=system.TWO_RECORDED, run_time=QUICK, latency=QUICK, losses=Losses(0, 0, 0, 0)),
         replace(ROW, name=system.MOVING, run_time=QUICK, latency=QUICK, losses=Losses(0, 0, 0, 0)),
+        replace(ROW, name=HAND[0], cpu_percent=5.0),
+        replace(ROW, name=HAND[1], cpu_percent=20.0),
+        replace(ROW, name=HAND[2]),
+        replace(ROW, name=HAND[3], run_time=QUICK, latency=QUICK, losses=Losses(0, 0, 0, 0), resident_mb=110.0),
         replace(ROW, name=system.FAST, latency=QUICK, losses=Losses(0, 0, 0, 0)),
     )
 }
-STARTED = StartUp((0.9, 0.3, 0.4), 75.0)
-SLOW = summary([5_000_000] * 1000)
+STARTED = StartUp((0.9, 0.2, 0.3), 75.0)
+SLOW = summary([9_000_000] * 1000)
 
 
 def test_a_run_is_measured_from_the_last_byte_of_each_scan(tmp_path):
@@ -69,19 +73,19 @@ def test_who_lost_scans_has_no_latency():
     lines = [
         Line(9, {"sensor": "4", "scan": 0, "run_time_us": 5.0, "counters": counters | {"overruns": n}}) for n in (0, 1)
     ]
-    used = system._Used(1.0, (1.0,), 70.0, 0, 0.0, 0.0)
+    used = system._Used(1.0, 1.0, (1.0,), 70.0, 0, 0.0, 0.0)
     row = system._recorded("x", lines, used, {"4": [1]})
     assert row.latency is None and row.losses == Losses(0, 0, 1, 0)
     assert system._recorded("x", lines[:1], used, {"4": [1]}).latency == summary([8])
 
 
 def test_every_target_is_judged_and_a_missed_one_says_why():
-    assert [(verdict.held, verdict.limited_by) for verdict in verdicts(ROWS, STARTED)] == [(True, "")] * 8
+    assert [(verdict.held, verdict.limited_by) for verdict in verdicts(ROWS, STARTED)] == [(True, "")] * 13
     worse = {
         name: replace(
             row,
-            cpu_percent=9.0,
-            resident_mb=101.0,
+            cpu_percent=10.0 if name == system.PLAIN else 130.0,
+            resident_mb=121.0,
             run_time=row.run_time and SLOW,
             latency=row.latency and SLOW,
             losses=row.losses and Losses(1, 2, 0, 0),
@@ -89,27 +93,43 @@ def test_every_target_is_judged_and_a_missed_one_says_why():
         for name, row in ROWS.items()
     }
     missed = list(verdicts(worse, StartUp((0.8, 0.9, 0.1), 75.0)))
-    assert len(missed) == 8 and not any(verdict.held for verdict in missed)
-    assert missed[0].limited_by == "the plain loop alone takes 9.0 %; ours, by threads: 0.6 + 0.4 %"
-    assert missed[3].limited_by == "inference alone takes 50.0 % at 100 Hz"
+    assert len(missed) == 13 and not any(verdict.held for verdict in missed)
+    assert missed[0].limited_by == "the plain loop alone takes 10.0 %; ours, by threads: 0.6 + 0.4 %"
+    assert missed[3].limited_by == "inference alone takes 90.0 % at 100 Hz"
     assert list(verdicts({}, None)) == []
 
 
 def test_the_page_the_json_and_the_table_tell_it(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(system_section, "rows", lambda scans, tell: iter(ROWS.values()))
+    monkeypatch.setattr(system_section, "rows", lambda scans, tell: (r for r in ROWS.values() if r.name not in HAND))
+    monkeypatch.setattr(system_section, "hand_rows", lambda sensors, scans, tell: (ROWS[name] for name in HAND))
     monkeypatch.setattr(system_section, "start_up", lambda: STARTED)
     soaked = Soak(1.0, 0.01, 0.02, 1.1, (Window(5.0, 70.0, 900.0, 2, 9, 0),))
-    monkeypatch.setattr(system_section, "soak", lambda minutes: soaked if minutes == 0.5 else None)
+    monkeypatch.setattr(
+        system_section, "soak", lambda minutes, sensors: soaked if (minutes, sensors) == (0.5, 1) else None
+    )
     assert main(["bench", "--system", "--soak", "0.5", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert out.count("| yes |") == 8 and "+0.010 MB a minute" in out and "0.90, 0.30, 0.40 s" in out
+    assert out.count("| yes |") == 13 and "+0.010 MB a minute" in out and "0.90, 0.20, 0.30 s" in out
     told = json.loads((tmp_path / "bench.json").read_text())
-    assert [row["name"] for row in told["system"]["rows"]] == list(ROWS)
-    assert told["system"]["soak"]["latency_ratio"] == 1.1 and len(told["system"]["verdicts"]) == 8
+    assert {row["name"] for row in told["system"]["rows"]} == set(ROWS)
+    assert told["system"]["soak"]["latency_ratio"] == 1.1 and len(told["system"]["verdicts"]) == 13
     table = (tmp_path / "bench.csv").read_text().splitlines()
     assert len(table) == 1 + len(ROWS) and "latency_p999_us" in table[0]
     assert main(["bench", "--soak", "1"]) == 2
     assert "--soak is a part of --system: add it" in capsys.readouterr().err
+
+
+def test_a_hand_is_measured_alone_and_row_by_row(tmp_path, monkeypatch, capsys):
+    """Six sensors on two buses, for a moment each."""
+    monkeypatch.setattr(system, "SETTLE_S", 0.5)
+    assert main(["bench", "--sensors", "6", "--ticks", "30", "--out", str(tmp_path)]) == 0
+    told = json.loads((tmp_path / "bench.json").read_text())["system"]
+    names = system.hand_names(6)
+    assert [row["name"] for row in told["rows"]] == list(names) and told["start_up"] is None
+    assert f"| {names[3]} |" in capsys.readouterr().out
+    recorded = told["rows"][3]
+    assert recorded["run_time"] is not None and recorded["resident_mb"] > 20
+    assert told["verdicts"] == [], "the targets are of one, two and sixteen sensors"
 
 
 def test_each_thing_left_out_spares_inferences(monkeypatch):

@@ -38,7 +38,7 @@ class Forged:
         )
         counters |= {"frames": 16 * (number + 1), "readings": 16 * (number + 1), "scans": number + 1}
         head = {"sensor": "4", "scan": number, "time_ns": time_ns, "fresh": ALL, "renewed": ALL, "dead": {}}
-        head["device_time_ns"] = time_ns - 1_000_000
+        head |= {"device_time_ns": time_ns - 1_000_000, "latency_us": 1000.0, "note": None}
         return Seen(time_ns + 1_000_000, head | {"counters": counters} | changes, counts.astype(np.int32), True)
 
     def change(self, number: int, **changes) -> None:

@@ -1,5 +1,6 @@
 """Evaluation of the records of a run among faults against the injector's truth, reading by reading."""
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +14,11 @@ STALE_US: Final = 100_000
 """Longest time on the bus between the readings that a record gives as one scan of the pad."""
 HELD_US: Final = 150_000
 """Longest time for which the last reading of a missing taxel is held, by times of arrival."""
+READY_US: Final = 150_000
+"""Longest time from when the newest reading of a pattern was handed on until the pattern is ready, where no note states
+its age: 70 ms unread, which a reader may not notice, and 50 ms in the program, which need no note; the rest is for the
+terminal of a busy kernel."""
+_SAYS_ITS_AGE: Final = re.compile(r"\d s (old when it|after its newest reading) arrived")
 ALL_FRESH: Final = 0xFFFF
 """Mask of a whole scan, in which no taxel is missing."""
 
@@ -42,6 +48,8 @@ class Found:
         missing: taxels that records report as missing.
         spread_ms: time from the first to the last of each pattern's fresh readings on the bus, in [ms].
         held_ms: ages of held readings when a pattern was made of them, in [ms].
+        ready_ms: ages of the newest readings when their patterns were ready, in [ms].
+        left_out: records left out between others, since their reader was too slow.
         arrivals: times of records with a fresh reading: when the newest one was handed on, and its time of arrival by
             the record, in [ns].
         latencies: for each pattern, when the scan's last frame was handed on, in [ns], and how much later its record
@@ -70,6 +78,8 @@ class Found:
     missing: int = 0
     spread_ms: list[float] = field(default_factory=list)
     held_ms: list[float] = field(default_factory=list)
+    ready_ms: list[float] = field(default_factory=list)
+    left_out: int = 0
     arrivals: list[tuple[int, int]] = field(default_factory=list)
     latencies: list[tuple[int, float]] = field(default_factory=list)
     first_us: dict[str, int] = field(default_factory=dict)
@@ -81,11 +91,19 @@ def judge(seen: Sequence[Seen], told: Told) -> Found:
     """Evaluate the records against the truth."""
     taxels = handed_on(told)
     found = Found()
+    numbers: dict[str, int] = {}
     for one in seen:
         found.last_counters = one.head["counters"]
         if one.counts is None:
             continue
         found.records += 1
+        sensor, number = one.head["sensor"], one.head["scan"]
+        left_out = number - numbers.get(sensor, -1) - 1
+        numbers[sensor] = number
+        if left_out:
+            found.left_out += left_out
+            for (name, _), rows in taxels.items():
+                rows.left_out |= name == sensor
         _follow(one, taxels, found)
     for rows in taxels.values():
         found.open_at_end += len(rows.rows) - rows.next
@@ -120,6 +138,7 @@ def _follow(one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], found: Found
         unheard += fate == STUCK and bool(renewed >> taxel & 1) and str(taxel) not in one.head["dead"]
     bus_us = [rows.rows[rows.shown][1] for rows in shown.values()]
     handed = [rows.rows[rows.shown][2] for rows in shown.values()]
+    written = [rows.rows[rows.shown][3] for rows in shown.values()]
     if bus_us:
         found.first_us.setdefault(sensor, min(bus_us))
         found.last_us[sensor] = max(bus_us)
@@ -137,7 +156,8 @@ def _follow(one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], found: Found
         found.spread_ms.append(spread_us / 1e3)
         if spread_us > STALE_US:
             trouble.append(f"its readings are {found.spread_ms[-1]:.0f} ms apart")
-        trouble += _held(one, taxels, max(bus_us), max(handed), found)
+        trouble += _held(one, taxels, (min(bus_us), max(bus_us)), max(handed), found)
+        trouble += _ready(one, max(written), found)
     else:
         trouble.append("no reading is fresh")
     found.flipped_patterns += fates[FLIPPED] > 0
@@ -169,21 +189,36 @@ def _count_cycles(one: Seen, shown: Mapping[int, SentTaxel], found: Found) -> No
 
 
 def _held(
-    one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], newest_us: int, newest_ns: int, found: Found
+    one: Seen, taxels: Mapping[tuple[str, int], SentTaxel], bus_us: tuple[int, int], newest_ns: int, found: Found
 ) -> list[str]:
-    """Return what is wrong with readings that a pattern was made from although they did not come with its scan."""
+    """Return what is wrong with readings that a pattern was made from although they did not come with its scan.
+
+    `bus_us` are the times of the scan's first and last reading on the bus, and `newest_ns` is when the last was handed
+    on.
+    """
+    oldest_us, newest_us = bus_us
     trouble: list[str] = []
     for taxel in range(16):
         if one.head["fresh"] >> taxel & 1 or str(taxel) in one.head["dead"]:
             continue
         rows = taxels.get((one.head["sensor"], taxel))
-        if rows is None or rows.shown < 0:
+        newest = None if rows is None else rows.newest(oldest_us)
+        if newest is None:
             trouble.append(f"taxel {taxel} is held, but was never received")
             continue
         # An emulator that does not get the processor between looking at the clock and writing is late itself.
-        _, at_us, _, at_ns = rows.rows[rows.shown]
+        _, at_us, _, at_ns = newest
         held_us = min(newest_us - at_us, (newest_ns - at_ns) / 1e3)
         found.held_ms.append(held_us / 1e3)
         if held_us > HELD_US:
             trouble.append(f"taxel {taxel} is held for {held_us / 1e3:.0f} ms")
     return trouble
+
+
+def _ready(one: Seen, newest_ns: int, found: Found) -> list[str]:
+    """Return what is wrong with a pattern that was ready long after its newest reading was handed on."""
+    ready_ms = (one.head["time_ns"] + 1e3 * one.head["latency_us"] - newest_ns) / 1e6
+    found.ready_ms.append(ready_ms)
+    if 1e3 * ready_ms <= READY_US or _SAYS_ITS_AGE.search(one.head["note"] or ""):
+        return []
+    return [f"it was ready {ready_ms:.0f} ms after its newest reading, and no note states that"]

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 from fault_accounts import CONSISTENT, DIFFERENT, EQUAL, Account, accounts
-from fault_judge import Found
+from fault_judge import READY_US, Found
 from fault_log import Told
 from fault_outages import LONGEST_BACK_S, seconds_to_use
 from fault_records import Ran
@@ -152,10 +152,14 @@ def _promise_line(promise: Promise) -> str:
 
 def _patterns(found: Found) -> str:
     spread_ms, held_ms = max(found.spread_ms, default=0.0), max(found.held_ms, default=0.0)
+    ready_ms = max(found.ready_ms, default=0.0)
     return (
         f"\n{found.records} records, {found.patterns} patterns: {found.whole_patterns} from sixteen readings as they "
         f"were sent, {found.told_patterns} from fewer, and the record says so. The readings of one pattern were on the "
-        f"bus at most {spread_ms:.0f} ms apart; one that `fresh` says is held was at most {held_ms:.0f} ms older.\n\n"
+        f"bus at most {spread_ms:.0f} ms apart; one that `fresh` says is held was at most {held_ms:.0f} ms older. A "
+        f"pattern was ready at most {ready_ms:.0f} ms after its newest reading was handed on; above "
+        f"{READY_US / 1e3:.0f} ms its note says so. {found.left_out} records between others were left out, since the "
+        f"evaluation read too slowly.\n\n"
         f"What no reader can know: {found.flipped_patterns} patterns hold a reading in which a digit was changed on "
         f"the way, which the wire has no checksum against; {found.stuck_patterns} one of a stuck taxel that was lost "
         f"when it was sent first, so that it looked new. Of {found.whole} whole scans, those without a missing taxel, "

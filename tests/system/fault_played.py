@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bench.program import CONTROLLERS, PRESS_COUNTS, REST_COUNTS, emulating
+from edge.bench.program import FINGERS, PRESS_COUNTS, REST_COUNTS, emulating
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
 
 TELLING: Final = 70
@@ -35,7 +35,7 @@ def telling_counts(sensor: int) -> NDArray[np.int32]:
 def playing_emulator(folder: Path, faults: str, seed: int) -> Iterator[str]:
     """Yield the port of an emulator that plays them over and over, and logs the truth in folder/truth."""
     files: list[str] = []
-    for sensor, name in enumerate(CONTROLLERS):
+    for sensor, name in enumerate(FINGERS):
         counts = telling_counts(sensor)
         path = folder / f"played{name}.npz"
         np.savez(

@@ -19,7 +19,8 @@ from fault_sinks import failing_sinks, fill_up, look_into_files, read_and_go, re
 from fault_stretches import parse_stretches
 
 from edge.bench.errors import BenchError
-from edge.bench.program import CONTROLLERS, REST_COUNTS, environment
+from edge.bench.program import FINGERS, REST_COUNTS, environment
+from edge.pipeline.pump import uncollected
 from edge.terminal.progress_bar import SECONDS, Progress
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
@@ -54,12 +55,17 @@ def run_among_faults(faults: str, seed: int, folder: Path, *, options: Sequence[
         BenchError: the emulator or edge-sr did not start.
     """
     ran = Ran()
-    with playing_emulator(folder, faults, seed) as port, _program(folder, port, options) as process:
+    errors: list[bytes] = []
+    sinks = failing_sinks(folder)
+    # They wait for the program, which would not wait for them.
+    slow, gone = in_thread(read_slowly, folder / "slow.fifo", ran), in_thread(read_and_go, folder / "gone.fifo")
+    with (
+        uncollected(),  # a full collection lets no thread read for a tenth of a second, and the pipe runs over
+        playing_emulator(folder, faults, seed) as port,
+        _program(folder, port, sinks, options) as process,
+    ):
         reader = in_thread(read_records, process.stdout, ran.seen)
-        errors: list[bytes] = []
         talker = in_thread(keep_lines, process.stderr, errors)
-        slow = in_thread(read_slowly, folder / "slow.fifo", ran)
-        gone = in_thread(read_and_go, folder / "gone.fifo")
         last = parse_stretches(faults, seed)[-1]
         with Progress("faults", last.start_s, SECONDS) as bar:
             _watch(process, f'"stretch": "{last}"', folder / "truth" / EVENTS, ran, bar)
@@ -68,9 +74,13 @@ def run_among_faults(faults: str, seed: int, folder: Path, *, options: Sequence[
             ran.exit_code = process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
-        for thread in (reader, talker, slow, gone):
+        for thread in (reader, talker):
             thread.join(END_TIMEOUT_S)
         ran.said = b"".join(errors).decode(errors="replace")
+        if not ran.seen:
+            raise BenchError(f"edge-sr gave no record, exit code {ran.exit_code}: {ran.said}")
+        for thread in (slow, gone):
+            thread.join(END_TIMEOUT_S)
     ran.told = read_truth(folder / "truth")
     ran.clock_steps_s = _clock_steps_s(ran.seen)
     look_into_files(folder, ran)
@@ -87,10 +97,12 @@ def _clock_steps_s(seen: Sequence[Seen]) -> list[float]:
 
 
 @contextmanager
-def _program(folder: Path, port: str, options: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+def _program(
+    folder: Path, port: str, sinks: Sequence[str], options: Sequence[str]
+) -> Iterator[subprocess.Popen[bytes]]:
     rest = np.asarray(REST_COUNTS)[:, None, None] + np.zeros((3, 4, 4))
     rest[2] += 37 * np.arange(16).reshape(4, 4)
-    baselines = [Baseline.of(name, rest.astype(np.float32), time.time(), 100, "file") for name in CONTROLLERS]
+    baselines = [Baseline.of(name, rest.astype(np.float32), time.time(), 100, "file") for name in FINGERS]
     save_baselines(folder / "zero.json", baselines)
     (folder / "clock").mkdir()
     (folder / "clock" / "sitecustomize.py").write_text(_CLOCK)
@@ -105,7 +117,7 @@ def _program(folder: Path, port: str, options: Sequence[str]) -> Iterator[subpro
         "--baseline",
         str(folder / "zero.json"),
     ]
-    for sink in ("jsonl:-", *failing_sinks(folder)):
+    for sink in ("jsonl:-", *sinks):
         command += ["--sink", sink]
     with subprocess.Popen(
         [*command, *options],
@@ -127,18 +139,18 @@ def _watch(process: subprocess.Popen[bytes], last_fault: str, events: Path, ran:
     start_s = time.monotonic()
     while process.poll() is None and not ran.seen:
         if time.monotonic() - start_s > END_TIMEOUT_S:
-            raise BenchError("edge-sr gave no record")
+            return
         time.sleep(0.01)
     proc = Path(f"/proc/{process.pid}")
     start_s = looked_s = time.monotonic()
     over = False
     while process.poll() is None and not (over and time.monotonic() > ran.seen[-1].read_ns / 1e9 + QUIET_S):
         time.sleep(0.05)
+        over = over or last_fault in events.read_text()
         if over or time.monotonic() < looked_s + WATCH_S:
             continue
         looked_s = time.monotonic()
         bar.reach(looked_s - start_s)
-        over = last_fault in events.read_text()
         try:
             resident_mb = int((proc / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
             threads, descriptors = (len(list((proc / name).iterdir())) for name in ("task", "fd"))

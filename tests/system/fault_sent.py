@@ -22,6 +22,7 @@ class SentTaxel:
         rows: fate, time on the bus in [us], times before and after handing on in [ns].
         next: the first row that no record can have shown yet.
         shown: the row that was shown last; -1 before.
+        left_out: a record that may have shown a later one was left out, since its reader was too slow.
     """
 
     def __init__(self) -> None:
@@ -31,6 +32,7 @@ class SentTaxel:
         self._readings: list[tuple[int, int, int]] = []
         self.next = 0
         self.shown = -1
+        self.left_out = False
         self._places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
 
     def add(
@@ -48,8 +50,19 @@ class SentTaxel:
         at = bisect_left(places, self.next)
         if at == len(places):
             return False
-        self.shown, self.next = places[at], places[at] + 1
+        self.shown, self.next, self.left_out = places[at], places[at] + 1, False
         return True
+
+    def newest(self, bus_us: int) -> tuple[int, int, int, int] | None:
+        """Return the row that was received last; None before the first.
+
+        Of the rows that a record which was left out may have shown, it is the newest before a time on the bus in [us]:
+        the reading is at least that old.
+        """
+        at = self.shown
+        while self.left_out and at + 1 < len(self.rows) and self.rows[at + 1][1] < bus_us:
+            at += 1
+        return None if at < 0 else self.rows[at]
 
     def catch_up(self, bus_us: int) -> None:
         """Skip readings of a stuck taxel that are alike, since one that an outage lost looks like the next.

@@ -10,7 +10,7 @@ import numpy as np
 import orjson
 from fault_records import Ran
 
-from edge.bench.program import CONTROLLERS
+from edge.bench.program import FINGERS
 from edge.errors import SinkError
 from edge.sinks.npz import gather, parts_dir
 
@@ -78,7 +78,7 @@ def look_into_files(folder: Path, ran: Ran) -> None:
     try:
         rows = gather(path) if parts_dir(path).exists() else 0
         with np.load(path, allow_pickle=False) as recorded:
-            for name in CONTROLLERS:
+            for name in FINGERS:
                 mine = recorded["scan"][recorded["sensor"] == name].tolist()
                 if mine != list(range(len(mine))):
                     ran.broken.append(f"full.npz: {len(mine)} of {rows} scans are of sensor {name}, not all in order")

@@ -147,9 +147,9 @@ def mcap_seeds() -> list[bytes]:
     path.unlink(missing_ok=True)
     file = McapFile(path, "ros2", "fuzz")
     file.add_metadata("mounting", {"sensor": "4", "mounting": json.dumps(asdict(Mounting()))})
-    baseline = encode_baseline(Baseline.of("4", REST, 1000.0, 100, "file"), 1.0, 5)
+    baseline = encode_baseline(Baseline.of("4", REST, 1000.0, 100, "file"), "4", 1.0, 5)
     scans = [Scan("4", n, n, np.int32(REST + n), FRESH, FRESH) for n in range(2)]
-    messages = [(BASELINE, baseline), *((SCAN, encode_scan(scan, 5, 0xFFFF, 0xFFFF)) for scan in scans)]
+    messages = [(BASELINE, baseline), *((SCAN, encode_scan(scan, "4", 5, 0xFFFF, 0xFFFF)) for scan in scans)]
     plain = RecordBuilder()
     channels: dict[str, int] = {}
     for kind, message in messages:

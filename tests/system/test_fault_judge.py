@@ -1,11 +1,15 @@
 """Evaluation of records among faults: each break of a promise is detected."""
 
+from dataclasses import replace
+
 import pytest
+from edge_samples import make_scan
 from fault_accounts import CONSISTENT, EQUAL, accounts
 from fault_forged import ALL, Forged, differing
 from fault_page import vanished_scans
 from fault_truth import FATES
 
+from edge.perception.scan_notes import age_notes, waited_note
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 
@@ -66,6 +70,57 @@ def test_a_reading_that_the_emulator_wrote_late_is_held_from_then_on():
     for cycle in range(5):
         forged.rows["written_ns"][16 * cycle + at] += 200_000_000
     assert not forged.judged().false_patterns
+
+
+def test_a_reading_that_came_in_a_record_which_was_left_out_is_no_older_than_that():
+    """The evaluation itself read too slowly for a while: what it missed, the program had received."""
+    forged = Forged(cycles=60)
+    torn = {"fresh": 0b1110, "renewed": 0b1110}
+    forged.change(40, **torn)
+    assert not forged.judged().false_patterns
+    del forged.seen[10:40]
+    found = forged.judged()
+    assert found.left_out == 30 and not found.false_patterns and max(found.held_ms) < 20
+    forged.change(10, scan=10)  # scan 40, after 9: nothing was left out
+    found = forged.judged()
+    assert len(found.false_patterns) == 1 and "scan 10: taxel 0 is held for 31" in found.false_patterns[0]
+    forged.change(10, scan=40)
+    forged.rows["fate"][16 * 15 : 16 * 40] = FATES.index("lost")  # nor can those records hold what never came
+    assert "scan 40: taxel 0 is held for 26" in forged.judged().false_patterns[0]
+
+
+def test_of_the_first_records_left_out_nothing_is_known_but_what_was_sent():
+    forged = Forged()
+    forged.change(5, fresh=ALL & ~2, renewed=ALL & ~2)
+    del forged.seen[:5]
+    assert not forged.judged().false_patterns
+    forged.rows["fate"][: 16 * 5] = FATES.index("lost")
+    assert "taxel 1 is held, but was never received" in forged.judged().false_patterns[0]
+
+
+@pytest.mark.parametrize(
+    ("note", "false"),
+    [
+        (None, 1),
+        ("taxel 3 silent: estimated from its neighbours", 1),
+        (waited_note(200_000_000).text, 0),
+        (f"{waited_note(200_000_000).text}; drift", 0),
+        (age_notes(replace(make_scan(0), device_ns=make_scan(0).time_ns - 200_000_000))[0].text, 0),
+        (age_notes(replace(make_scan(0), unread_ns=200_000_000))[0].text, 0),
+    ],
+)
+def test_a_pattern_that_was_ready_late_says_so(note, false):
+    forged = Forged()
+    forged.change(7, latency_us=145_000.0)
+    assert not forged.judged().false_patterns
+    forged.change(7, latency_us=200_000.0, note=note)
+    found = forged.judged()
+    assert len(found.false_patterns) == false and max(found.ready_ms) == pytest.approx(200, abs=2)
+    forged.change(7, latency_us=1000.0)
+    forged.seen[7] = forged.seen[7]._replace(
+        head=forged.seen[7].head | {"time_ns": forged.seen[7].head["time_ns"] + 200_000_000}
+    )
+    assert len(forged.judged().false_patterns) == false, "it arrived late"
 
 
 def test_readings_that_lie_apart_are_found():

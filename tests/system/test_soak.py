@@ -10,12 +10,16 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import hand_soak
 import pytest
 from edge_samples import ROOT
 
+from edge.bench.program import Line
 from edge.bench.soak import Window, evaluated
 
 MINUTES = float(os.environ.get("EDGE_SOAK_MINUTES", "1"))
+
+HAND_MINUTES = 0.1
 
 STILL = [Window(5.0 * (n + 1), 78.0 + 0.1 * (n % 2), 1000.0 + 100 * (n % 3), 3, 9, 0) for n in range(12)]
 
@@ -38,6 +42,48 @@ def test_memory_stays_flat_and_latency_does_not_drift():
         (windows[0]["threads"], windows[0]["descriptors"])
     }
     assert windows[-1]["overruns"] == 0
+
+
+def test_accounts_of_a_hand_among_faults_are_consistent():
+    """Sixteen sensors on four buses; each scan is in a record or in a counter, each frame in a scan or in a counter."""
+    found, accounts, counters = hand_soak.soak(HAND_MINUTES, 16, seed=1)
+    assert accounts.broken == []
+    assert len(accounts.records) == 16 and sum(accounts.records.values()) > 1000
+    assert counters["frames"] > 16 * 1000 and max(window.resident_mb for window in found.windows) < hand_soak.MOST_MB
+    assert counters["torn_wire"] + counters["outages"] + counters["duplicates"] > 0, "there were faults"
+
+
+def counted(scan, **counters):
+    names = (
+        "unwritten",
+        "overruns",
+        "foreign",
+        "missing_taxels",
+        "duplicates",
+        "abandoned",
+        "unconfirmed",
+        "resynchronised",
+    )
+    usual = {"scans": scan + 1, "readings": 16 * scan + 16, "frames": 16 * scan + 16} | dict.fromkeys(names, 0)
+    return Line(0, {"sensor": "4", "scan": scan, "counters": usual | counters})
+
+
+@pytest.mark.parametrize(
+    ("lines", "what"),
+    [
+        ([counted(0), counted(1)], None),
+        ([counted(0), counted(3, unwritten=2)], None),
+        ([counted(0), counted(3, unwritten=1)], "left no trace"),
+        ([counted(0), counted(0)], "came twice"),
+        ([counted(0, frames=17)], "17 frames are not 16 readings"),
+        ([counted(0, readings=70, frames=70)], "54 readings are of no scan"),
+        ([counted(0, resynchronised=1)], "-1 readings are of no scan"),
+    ],
+)
+def test_an_account_that_does_not_fit_is_seen(lines, what):
+    accounts = hand_soak.Accounts()
+    accounts.follow(lines)
+    assert (what is None and accounts.broken == []) or what in accounts.broken[0]
 
 
 def test_what_does_not_change_is_flat():

@@ -1,54 +1,87 @@
-"""The wheel alone, in an environment that holds nothing else."""
+"""Both wheels as a release has them: the runtime in an environment that holds nothing else, then both."""
 
 import json
 import os
+import re
 import subprocess
 import sys
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
 
+from edge import __version__
+from edge.cli.main import COMMANDS
+
 ROOT = Path(__file__).parents[2]
 OURS = {"edge", "firmware_bridge", "train", "export"}
+ANY_LICENCE = "Apache License\n                           Version 2.0, January 2004"
 IN_THE_WHEEL = {"edge", "firmware_bridge"}
 NOT_IN_THE_RUNTIME = {"torch", "onnx", "onnxscript", "trimesh", "scipy", "shapely"}
 
 
 @pytest.fixture(scope="module")
-def fresh(tmp_path_factory):
-    """Folder bin of a new environment with the wheel, which pip makes on the way, and its dependencies."""
+def wheels(tmp_path_factory):
+    """Paths of the runtime's wheel and of the second one, made by the command of a release."""
+    folder = tmp_path_factory.mktemp("dist")
+    made = run([sys.executable, str(ROOT / "release/wheels.py"), str(folder)], PYTHONPATH=str(ROOT)).splitlines()
+    assert {Path(path) for path in made} == set(folder.iterdir())
+    return made
+
+
+@pytest.fixture(scope="module")
+def fresh(tmp_path_factory, wheels):
+    """Folder bin of a new environment with the runtime's wheel and its dependencies."""
     folder = tmp_path_factory.mktemp("wheel") / "env"
     venv.create(folder)
-    # The pip of this environment works in the other: to install one there takes longer than all that follows.
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "--python", str(folder)]
-    run([*pip, "install", "--no-compile", str(ROOT)], PIP_CONSTRAINT=str(ROOT / "constraints.txt"))
+    run(
+        [*pip_for(folder), "install", "--quiet", "--no-compile", wheels[0]],
+        PIP_CONSTRAINT=str(ROOT / "constraints.txt"),
+    )
     return folder / "bin"
 
 
+@pytest.fixture(scope="module")
+def demo(fresh, tmp_path_factory):
+    """The installed runtime's demo, which plays while other tests run, and the file of its records."""
+    records = tmp_path_factory.mktemp("demo") / "records.jsonl"
+    command = [str(fresh / "edge-sr"), "--source", "demo", "--sink", f"jsonl:{records}"]
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, env=without_checkout(), **pipes) as process:
+        yield process, records
+        process.kill()
+
+
+@pytest.fixture(scope="module")
+def both(fresh, wheels):
+    """The same environment with the second wheel as well, without torch and the like: used by the last tests alone."""
+    run([*pip_for(fresh.parent), "install", "--quiet", "--no-compile", "--no-deps", wheels[1]])
+    return fresh
+
+
+def pip_for(environment):
+    # The pip of this environment works in the other: to install one there takes longer than all that follows.
+    return [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", str(environment)]
+
+
+def without_checkout():
+    """The environment without PYTHONPATH: a checkout on it would lend what the wheel lacks."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+
 def run(command, **environment):
-    # Without PYTHONPATH: a checkout on it would lend what the wheel lacks.
-    inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env={**inherited, **environment})
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=240, env={**without_checkout(), **environment}
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_the_runtime_installs_without_the_training_libraries(fresh):
-    pip = [sys.executable, "-m", "pip", "--python", str(fresh.parent)]
-    installed = json.loads(run([*pip, "list", "--format", "json"]))
+def test_the_runtime_installs_without_the_training_libraries(fresh, demo):
+    installed = json.loads(run([*pip_for(fresh.parent), "list", "--format", "json"]))
     assert "tactile-edge-sr" in {package["name"] for package in installed}
     assert not NOT_IN_THE_RUNTIME & {package["name"].lower() for package in installed}
-
-
-def test_the_demo_runs_from_the_wheel(fresh, tmp_path):
-    records = tmp_path / "records.jsonl"
-    out = run([str(fresh / "edge-sr"), "--source", "demo", "--sink", f"jsonl:{records}"])
-    assert "PSNR" in out
-    lines = [json.loads(line) for line in records.read_text().splitlines()]
-    assert {line["source"] for line in lines} == {"emulated"}
-    assert max(line["taps_used"] or 0 for line in lines) == 4
-    assert any(line["pattern"] for line in lines)
 
 
 def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
@@ -57,9 +90,11 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert {path.parent.name for path in packages.glob("*/py.typed") if path.parent.name in OURS} == IN_THE_WHEEL
     assert not (packages / "edge" / "bench").exists()
     emulation = {path.stem for path in (packages / "firmware_bridge" / "emulation").glob("[!_]*.py")}
-    assert emulation == {"pty_port", "slcan_emulator", "slcan_main", "xela_controller"}, "what the demo needs"
+    assert emulation == {"pty_port", "robot_main", "slcan_emulator", "slcan_main", "xela_controller"}, (
+        "what the demo needs"
+    )
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
-        *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
+        *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "mtsr7-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
         *("contacts.npz", "demo.npz", "grips.npz", "taxels.npz"),
     }
 
@@ -89,22 +124,21 @@ print(len(names))
         (
             ["--source", "demo", "--model", "stsr"],
             4,
-            "edge-sr: model 'stsr' is in float32, which this installation lacks: take stsr-int8, or install a checkout "
-            "(pip install --editable .), which has all models",
+            "edge-sr: model 'stsr' is in float32, which this installation lacks: take stsr-int8, or install the wheel "
+            "tactile-edge-sr-train as well, which has all models",
         ),
         (
             ["bench"],
             2,
-            "edge-sr: the wheel leaves edge-sr bench out: install a checkout (pip install --editable '.[bench]')",
+            "edge-sr: edge-sr bench is in another wheel, which is not installed: install tactile-edge-sr-train as well",
         ),
     ],
 )
 def test_what_is_left_out_is_one_line(fresh, tmp_path, arguments, code, line):
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
         [str(fresh / "edge-sr"), *arguments],
         cwd=tmp_path,
-        env=environment,
+        env=without_checkout(),
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -116,3 +150,87 @@ def test_what_is_left_out_is_one_line(fresh, tmp_path, arguments, code, line):
 def test_the_models_are_in_the_wheel(fresh):
     out = run([str(fresh / "edge-sr"), "models"])
     assert all(name in out for name in ("stsr", "mtsr2", "mtsr4"))
+
+
+def test_licence_and_version_are_in_the_wheel(fresh):
+    (about,) = fresh.parent.glob("lib/python*/site-packages/tactile_edge_sr-*.dist-info")
+    assert ANY_LICENCE in (about / "licenses/LICENSE").read_text()
+    metadata = (about / "METADATA").read_text()
+    assert "\nLicense-Expression: Apache-2.0\n" in metadata and f"\nVersion: {__version__}\n" in metadata
+    assert f"\n## {__version__}" in (ROOT / "docs/changelog.md").read_text()
+    assert run([str(fresh / "edge-sr"), "--version"]) == f"edge-sr {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("edge-sr re", {"record", "replay"}),
+        ("edge-sr doctor --no", {"--no-press", "--no-grip"}),
+        ("edge-sr --model stsr-s", {"stsr-small", "stsr-small-int8"}),
+        ("edge-sr replay pre", {"press.mcap"}),
+    ],
+)
+def test_bash_completes(fresh, tmp_path, typed, offered):
+    (tmp_path / "press.mcap").touch()
+    words = " ".join(f"'{word}'" for word in typed.split())
+    last = len(typed.split()) - 1
+    program = f"""
+cd '{tmp_path}'; complete() {{ [[ "$*" == *" edge-sr" ]] && completer=${{@: -2:1}}; }}
+. '{fresh.parent}/share/bash-completion/completions/edge-sr'
+COMP_WORDS=({words}); COMP_CWORD={last}
+$completer edge-sr "${{COMP_WORDS[{last}]}}"
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+    assert set(run(["bash", "--norc", "-c", program]).split()) == offered
+
+
+def test_the_man_page_has_every_command_and_option(fresh, capsys):
+    page = (fresh.parent / "share/man/man1/edge-sr.1").read_text()
+    requests = {line.split()[0] for line in page.splitlines() if line.startswith(".")}
+    assert requests <= {*(".TH", ".SH", ".SS", ".B", ".TP", ".nf", ".fi", ".br", ".sp"), r".\""}, (
+        "a word in their place"
+    )
+    plain = page.replace("\\-", "-")
+    for name in COMMANDS:
+        assert f"edge-sr {name}" in plain
+        with pytest.raises(SystemExit, match="0"):
+            COMMANDS[name](["--help"])
+        assert all(one in plain for one in re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
+    assert (fresh.parent / "share/zsh/site-functions/_edge-sr").read_text().startswith("#compdef edge-sr")
+
+
+def test_both_wheels_together_are_the_packages_of_a_checkout(wheels):
+    held = [set(zipfile.ZipFile(path).namelist()) for path in wheels]
+    of_packages = [{name for name in names if name.partition("/")[0] in OURS} for names in held]
+    assert not of_packages[0] & of_packages[1]
+    kept = subprocess.run(["git", "ls-files", *sorted(OURS)], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert of_packages[0] | of_packages[1] >= set(kept.stdout.splitlines())
+
+
+def test_the_demo_runs_from_the_wheel(demo):
+    process, records = demo
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err
+    assert "PSNR" in out
+    lines = [json.loads(line) for line in records.read_text().splitlines()]
+    assert {line["source"] for line in lines} == {"emulated"}
+    assert max(line["taps_used"] or 0 for line in lines) >= 4
+    assert any(line["pattern"] for line in lines)
+
+
+def test_the_second_wheel_adds_models_bench_and_emulation(both, tmp_path):
+    listed = run([str(both / "edge-sr"), "models"]).splitlines()
+    assert any(line.startswith("stsr ") for line in listed)
+    assert "--by-surface" in run([str(both / "edge-sr"), "bench", "--help"])
+    assert "usage" in run([str(both / "python"), "-I", "-m", "firmware_bridge.emulation.xela_server_main", "--help"])
+    done = subprocess.run(
+        [str(both / "python"), "-m", "train.generate", "x.npz"],
+        cwd=tmp_path,
+        env=without_checkout(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    # Its dependencies were left out here: one line says what is missing and how to install it.
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1 and line.startswith("not installed: ") and "torch" in line and "pip install" in line
