@@ -1,9 +1,10 @@
-"""The runtime as a library: open a source, make a runtime, iterate over results.
+"""The runtime as a library: open a source, make a runtime, take every result or the newest.
 
     with open_source("slcan:serial=D30BL366") as source:
         for result in Stream(source, open_runtime("stsr-int8", source)):
             print(result.force_counts)
 
+A control loop calls `stream.latest()` instead, which returns the newest result with its age and never waits.
 A source reads in a thread of its own; everything else happens in the thread that iterates and that makes the runtime. A
 request that cannot be met raises a BridgeError or an EdgeError with one clear line.
 
@@ -12,37 +13,47 @@ request that cannot be met raises a BridgeError or an EdgeError with one clear l
 
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge.doctor.unattended import examine
-from edge.errors import EdgeError, MessageError, ModelError, SinkClosedError, SinkError, UsageError, WindowError
-from edge.inference.bundled import DEFAULT_MODEL, DEMO_MODEL, TAXELS, bundled_models, demo_recording, find_model
+from edge.errors import (
+    EdgeError,
+    MessageError,
+    ModelError,
+    NoResultError,
+    SinkClosedError,
+    SinkError,
+    UsageError,
+    WindowError,
+)
+from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, demo_recording, find_model
 from edge.inference.contract import Contract
 from edge.inference.model_interface import Model
 from edge.inference.timed_loading import unfinished_load
 from edge.mapping.sink import MapSink, ObjectMap
-from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
-from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.event import Event, Note
-from edge.perception.gain_learning import load_contact_model
 from edge.perception.result import NextTap, Result
 from edge.perception.runtime import Runtime
 from edge.perception.wrench import Wrench
+from edge.pipeline.array_results import infer
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands
+from edge.pipeline.latest import Latest
+from edge.pipeline.pairing import paired
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.pump import pump
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.runtime_setup import load_model, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.pipeline.source_setup import links_to, references, settled, with_recorded
+from edge.pipeline.source_setup import links_to, settled, with_recorded
 from edge.pose_sources.open_poses import PoseSource, open_poses
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
-from edge.validation import check_positive, check_whole
+from edge.validation import check_positive
 from firmware_bridge.errors import (
     BaselineRefusedError,
     BridgeError,
@@ -72,8 +83,8 @@ if TYPE_CHECKING:
 __all__ = [
     "DEFAULT_MODEL",
     "DEMO_LOOP",
-    "DEMO_MODEL",
     "ID_MAPS",
+    "POSED_MODEL",
     "USPA44",
     "USPA46",
     "Baseline",
@@ -86,6 +97,7 @@ __all__ = [
     "EdgeError",
     "Event",
     "Fan",
+    "Latest",
     "LinkLostError",
     "MapSink",
     "MessageError",
@@ -94,6 +106,7 @@ __all__ = [
     "ModelMap",
     "NextTap",
     "NoDeviceError",
+    "NoResultError",
     "Note",
     "ObjectMap",
     "Pad",
@@ -124,6 +137,7 @@ __all__ = [
     "demo_recording",
     "devices",
     "examine",
+    "infer",
     "layout_c",
     "load_baselines",
     "load_model",
@@ -133,6 +147,7 @@ __all__ = [
     "open_runtime",
     "open_sink",
     "open_source",
+    "paired",
     "pump",
     "save_baselines",
     "take_baselines",
@@ -179,24 +194,6 @@ def open_source(
     return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
 
 
-def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
-    """Load a model and its contract; call it in the thread that will run the model.
-
-    Args:
-        model: a file, or the name of a bundled one.
-        threads: number of threads that share the work of one run.
-        stop: event that ends the loading early.
-
-    Raises:
-        ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.
-        UsageError: the number of threads is out of range.
-    """
-    check_whole("threads", threads, 1)
-    from edge.inference.onnx_session import ModelSession
-
-    return ModelSession(find_model(model), threads, stop)
-
-
 def choose_model(
     model: str | Path,
     budget_us: float,
@@ -240,71 +237,6 @@ def choose_model(
     )
 
 
-def open_runtime(
-    model: str | Path | Model,
-    source: Source,
-    *,
-    baselines: Mapping[str, Baseline] | str | Path | None = None,
-    counts_per_newton: float | Mapping[str, float] | None = None,
-    pad: Pad | Mapping[str, Pad] | None = None,
-    contact_on_counts: float = ON_COUNTS,
-    contact_off_counts: float = OFF_COUNTS,
-    idle_reset_s: float = IDLE_RESET_S,
-    every_scan: bool = False,
-    every_tap: bool = False,
-    follow_drift: bool = True,
-    fallback: bool = True,
-    learn: bool = True,
-    taps: int | None = None,
-) -> Runtime:
-    """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
-
-    Args:
-        model: name of a bundled one, a file, or a model that `load_model` returned.
-        source: open source of the scans.
-        baselines: stored ones, or their file; they take precedence over those of the source's sensor file. A sensor
-            without one is zeroed from its first 100 scans, during which its pad must be still and free.
-        counts_per_newton: summed z per [N], of all sensors or by name; by default as in the sensor file. A name from
-            which no scan arrives is reported as an event.
-        pad: properties of the pad of all sensors, or of each by name, for models that use them; by default as in the
-            sensor file.
-        contact_on_counts: summed z at which a tap begins.
-        contact_off_counts: summed z at which it ends.
-        idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
-        every_scan: infer also where nothing has changed since the last pattern.
-        every_tap: use also taps that are not expected to reduce the error.
-        follow_drift: let the rest level follow the readings of a free pad.
-        fallback: replace a pattern that is not to be believed by the smooth one.
-        learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
-        taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
-            none: taps then follow the paper's schedule, each turned by 5 degrees from the one before.
-
-    Raises:
-        ModelError: the model does not exist, cannot be used, or is for another sensor.
-        RecordingError: the baseline file cannot be used, or its taxel order is not that of the sensor file.
-        UsageError: the source is not open; a baseline is of another grid; a number is out of range; `taps` is more than
-            the model takes.
-    """
-    known, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
-    return Runtime(
-        load_model(model) if isinstance(model, (str, Path)) else model,
-        source=source.kind,
-        estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if nominal else None,
-        contacts=load_contact_model() if nominal and learn else None,
-        geometry=known.geometry,
-        baselines=references(baselines, known),
-        counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
-        mountings=known.mountings,
-        pad=known.pads if pad is None else pad,
-        measured=known.measured_pads if pad is None else None,
-        options=RuntimeOptions(
-            *(contact_on_counts, contact_off_counts, idle_reset_s),
-            *(every_scan, every_tap, follow_drift, fallback, learn, taps),
-        ),
-        unix_time_s=source.unix_time_s,
-    )
-
-
 def open_recording(
     path: str | Path,
     *,
@@ -334,7 +266,14 @@ def open_recording(
     return recordings.open_recording(path, sensor=sensor, zero=zero, paced=paced, rate_hz=rate_hz)
 
 
-def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.Event | None = None) -> Sink:
+def open_sink(
+    text: str,
+    contract: Contract,
+    source: Source,
+    *,
+    stop: threading.Event | None = None,
+    commands: Commands | None = None,
+) -> Sink:
     """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
     Args:
@@ -342,6 +281,7 @@ def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.
         contract: contract of the model that makes the results.
         source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
         stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
+        commands: those of the stream, for "ros2:TOPIC?commands", which takes zeroing and reset from the robot.
 
     Raises:
         UsageError: the form does not exist (the message lists the forms), or the source is not open.
@@ -352,11 +292,13 @@ def open_sink(text: str, contract: Contract, source: Source, *, stop: threading.
         contract,
         lossless=source.kind == "replay",
         mountings=source.sensor_file.mountings,
+        frames=source.sensor_file.frames,
         geometry=source.sensor_file.geometry,
         unix_offset_ns=source.unix_offset_ns,
         source=source.kind,
         origin=source.origin,
         stop=stop,
+        commands=commands,
     )
 
 

@@ -5,6 +5,7 @@ EdgeError
 +-- WindowError (ValueError)  an input that cannot be inferred from: wrong shape or type, or not finite
 +-- UsageError (ValueError)   a request of the caller that cannot be met
 +-- MessageError (ValueError) bytes that are not a packed message
++-- NoResultError (TimeoutError)  no new result in time
 +-- SinkError (OSError)       a sink that cannot be opened or written
     +-- SinkClosedError       the reader of the sink has gone
 """
@@ -28,6 +29,10 @@ class UsageError(EdgeError, ValueError):
 
 class MessageError(EdgeError, ValueError):
     """Bytes that are not a packed message."""
+
+
+class NoResultError(EdgeError, TimeoutError):
+    """No new result in the time that the caller gave."""
 
 
 class SinkError(EdgeError, OSError):

@@ -1,7 +1,34 @@
 """Conditions that hold in every test."""
 
 import signal
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+MEMORY_LIMIT_BYTES = 60_000_000
 
 # A shell ignores Ctrl-C in what it starts in the background, and programs that a test interrupts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items):
+    """Take a file of each folder in turn.
+
+    Those that wait then run beside those that compute; the last are of the folders with many files, which are short.
+    """
+    turns: dict[Path, dict[Path, int]] = {}
+    for item in items:
+        files = turns.setdefault(item.path.parent, {})
+        files.setdefault(item.path, len(files))
+    items.sort(key=lambda item: (turns[item.path.parent][item.path], item.path))
+
+
+@pytest.fixture
+def bounded_memory():
+    tracemalloc.start()
+    yield
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < MEMORY_LIMIT_BYTES

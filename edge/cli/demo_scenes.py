@@ -12,11 +12,19 @@ from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 
 _FREE: Final = -1
-_FOREIGN, _MAGNET = 0, 1
+_FOREIGN, _MAGNET, SLIDE = 0, 1, 2
 _BEGINS: Final = {
     _FOREIGN: "demo: now another surface is tapped, and then the first one again: no pattern may be made from both",
     _MAGNET: "demo: now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
+    SLIDE: "demo: now the pad slides along another object, a long letter: a map is made of its patterns",
 }
+
+
+def scene_of(recording: Path) -> dict[bytes, int]:
+    """Return the scene of each scan of a recording, by its counts."""
+    with np.load(recording, allow_pickle=False) as data:
+        pairs = zip(data["counts"], data["scene"].tolist(), strict=True)
+        return {counts.astype(np.int32).tobytes(): scene for counts, scene in pairs}
 
 
 class DemoScenes(Sink):
@@ -25,17 +33,17 @@ class DemoScenes(Sink):
     A result is matched to its scene by its raw counts, as in `DemoScore`.
     """
 
-    def __init__(self, recording: Path, tell: Callable[[Event], object]) -> None:
+    def __init__(self, recording: Path, tell: Callable[[Event], object], reset: Callable[[], object]) -> None:
         """Load the scenes.
 
         Args:
             recording: .npz that has, in addition to `counts` (n, 3, rows, cols), `scene` (n,): -1 outside of scenes.
             tell: called with each event.
+            reset: called where the robot goes on to another object, whose taps do not belong to those before.
         """
-        with np.load(recording, allow_pickle=False) as data:
-            pairs = zip(data["counts"], data["scene"].tolist(), strict=True)
-            self._scenes = {counts.astype(np.int32).tobytes(): scene for counts, scene in pairs}
+        self._scenes = scene_of(recording)
         self._tell = tell
+        self._reset = reset
         self._scene = _FREE
         self._patterns = self._untrusted = self._dropped = 0
 
@@ -47,6 +55,8 @@ class DemoScenes(Sink):
             self._scene = scene
             if scene in _BEGINS:
                 self._say(_BEGINS[scene])
+            if scene == SLIDE:
+                self._reset()
         self._dropped += sum(event.kind == "tap_dropped" for event in result.events)
         if result.pattern is not None:
             self._patterns += 1
@@ -58,7 +68,7 @@ class DemoScenes(Sink):
     def _end(self) -> None:
         """Announce the outcome of the scene, and count from 0."""
         if self._scene == _FOREIGN:
-            none = "no tap was dropped: this model takes one tap, or does not check earlier ones"
+            none = "no tap was dropped: this model takes one tap, or has not noticed the other surface"
             self._say(f"demo: {f'earlier taps were dropped {self._dropped} times' if self._dropped else none}")
         elif self._scene == _MAGNET:
             self._say(f"demo: {self._untrusted} of {self._patterns} patterns with the magnet were not to be believed")

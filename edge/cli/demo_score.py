@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
+from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.inference.contract import Contract
+from edge.inference.pose_input import scheduled_rows
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from edge.terminal.heatmap import Palette, Panel, draw
@@ -22,21 +24,36 @@ class TapScore:
 
     Attributes:
         tap: number of the tap, from 0.
-        angle_deg: angle at which the surface was tapped, in [deg].
+        pose: x and y in [mm] and turn in [deg] of the pad, as the robot stated them.
         result: result at the peak frame.
         truth: (H, W) in the model's output unit.
         psnr_db: in [dB].
-        ssim: structural similarity, mean over Gaussian windows.
         rmse_percent: in [% of full scale].
+        alone_percent: the same of a pattern from this tap alone.
     """
 
     tap: int
-    angle_deg: float
+    pose: tuple[float, float, float]
     result: Result
     truth: NDArray[np.float32]
     psnr_db: float
-    ssim: float
     rmse_percent: float
+    alone_percent: float
+
+
+class Scored(Protocol):
+    """Model as the score needs it."""
+
+    contract: Contract
+
+    def run(
+        self,
+        window: NDArray[np.float32],
+        pad: NDArray[np.float32] | None = None,
+        poses: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Infer the pattern of one window."""
+        ...
 
 
 class DemoScore(Sink):
@@ -46,97 +63,143 @@ class DemoScore(Sink):
 
     Attributes:
         surface: name of the tapped surface.
+        taps: number of taps in the recording.
         complete: True once the last tap is over.
     """
 
     def __init__(
-        self, recording: Path, contract: Contract, on_complete: Callable[["DemoScore"], object] = lambda score: None
+        self, recording: Path, model: Scored, on_complete: Callable[["DemoScore"], object] = lambda score: None
     ) -> None:
         """Load the truth.
 
         Args:
-            recording: .npz that has, in addition to `counts` (n, 3, rows, cols): `tap` (n,), -1 without
-                contact; `indentation_mm` (n,); `unit_patterns` (taps, H, W), the truth per
-                indentation; `angles_deg` (taps,); `surface`.
-            contract: contract of the scored model.
+            recording: .npz that has, in addition to `counts` (n, 3, rows, cols): `tap` (n,), -1 without contact;
+                `scene` (n,), -1 outside of scenes; `indentation_mm` (n,); `unit_patterns` (taps, H, W), the truth per
+                indentation; `tap_pose` (taps, 5); `surface`; and of the taps that may be played in place of those after
+                the first `option_counts` (o, f, 3, rows, cols), `option_indentation_mm` (o, f), `option_unit_patterns`
+                and `option_pose`.
+            model: that is scored.
             on_complete: called with this, once, when the last tap is over; later results are not scored.
         """
-        self._full_scale = contract.output_full_scale
+        self._model = model
         with np.load(recording, allow_pickle=False) as data:
             self.surface = str(data["surface"])
-            self._angles_deg = data["angles_deg"].astype(float).tolist()
-            self._unit_patterns = data["unit_patterns"].astype(np.float32)
-            self._frames = {
-                counts.astype(np.int32).tobytes(): (int(tap), float(indentation_mm))
-                for counts, tap, indentation_mm in zip(data["counts"], data["tap"], data["indentation_mm"], strict=True)
-                if tap >= 0
-            }
-        self._peaks: dict[int, _Peak] = {}
+            self.taps = len(data["tap_pose"])
+            self._poses = np.concatenate([data["tap_pose"], data["option_pose"]])[:, :3].tolist()
+            self._unit_patterns = np.concatenate([data["unit_patterns"], data["option_unit_patterns"]]).astype(
+                np.float32
+            )
+            shown = zip(data["tap"].tolist(), data["indentation_mm"].tolist(), data["counts"], strict=True)
+            self._frames = {_key(counts): _Frame(tap, mm) for tap, mm, counts in shown if tap >= 0}
+            options = zip(data["option_counts"], data["option_indentation_mm"].tolist(), strict=True)
+            for place, (counts, depths_mm) in enumerate(options, self.taps):
+                self._frames |= {_key(one): _Frame(place, mm) for one, mm in zip(counts, depths_mm, strict=True)}
+            self._scenes = {_key(counts) for counts in data["counts"][data["scene"] >= 0]}
+        self._peaks: list[_Peak] = []
+        self._between = True
         self._on_complete = on_complete
         self.complete = False
-
-    @property
-    def taps(self) -> int:
-        """Number of taps in the recording."""
-        return len(self._angles_deg)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Keep the result if it is the strongest of its tap."""
         if self.complete:
             return
-        if result.contact is False and self.taps - 1 in self._peaks:
+        key = result.scan.counts.tobytes()
+        self._between |= result.contact is False
+        if (self._between and len(self._peaks) == self.taps) or (self._peaks and key in self._scenes):
             self.complete = True
             self._on_complete(self)
             return
-        frame = self._frames.get(result.scan.counts.tobytes())
+        frame = self._frames.get(key)
         if frame is None or result.pattern is None or result.force_counts is None:
             return
-        tap, indentation_mm = frame
-        if tap not in self._peaks or result.force_counts > self._peaks[tap].force_counts:
-            self._peaks[tap] = _Peak(result, result.pattern, result.force_counts, indentation_mm)
+        peak = _Peak(result, result.pattern, result.force_counts, frame)
+        if self._between or frame.place != self._peaks[-1].frame.place:
+            self._peaks.append(peak)
+            self._between = False
+        elif peak.force_counts > self._peaks[-1].force_counts:
+            self._peaks[-1] = peak
 
     def close(self) -> None:
         """Do nothing, since there is nothing to finish."""
 
     def scores(self) -> list[TapScore]:
         """Return the scores of the taps that got a pattern."""
-        return [self._score(tap, self._peaks[tap]) for tap in sorted(self._peaks)]
+        return [self._score(tap, peak) for tap, peak in enumerate(self._peaks)]
 
     def _score(self, tap: int, peak: "_Peak") -> TapScore:
-        truth = self._unit_patterns[tap] * peak.indentation_mm
-        compared = (peak.pattern, truth, self._full_scale)
+        truth = self._unit_patterns[peak.frame.place] * peak.frame.indentation_mm
+        full_scale = self._model.contract.output_full_scale
+        x_mm, y_mm, turn_deg = self._poses[peak.frame.place]
+        alone = peak.pattern if peak.result.taps_used < 2 else self._alone(peak.result)
         return TapScore(
             tap=tap,
-            angle_deg=self._angles_deg[tap],
+            pose=(x_mm, y_mm, turn_deg),
             result=peak.result,
             truth=truth,
-            psnr_db=float(psnr_db(*compared)),
-            ssim=float(ssim(*compared)),
-            rmse_percent=float(rmse_percent(*compared)),
+            psnr_db=float(psnr_db(peak.pattern, truth, full_scale)),
+            rmse_percent=float(rmse_percent(peak.pattern, truth, full_scale)),
+            alone_percent=float(rmse_percent(alone, truth, full_scale)),
         )
+
+    def _alone(self, result: Result) -> NDArray[np.float32]:
+        """Return the pattern of a result's newest tap alone."""
+        contract = self._model.contract
+        if result.window is None:
+            raise ValueError("result has no window, expected one with a pattern")
+        window = contract.scale_window(result.window)
+        if contract.takes_poses:
+            return self._model.run(window[:1], poses=scheduled_rows(1, contract.angle_step_deg))
+        padded = np.zeros((contract.taps, *window.shape[1:]), dtype=np.float32)
+        padded[0] = window[0]
+        return self._model.run(padded)
+
+
+class _Frame(NamedTuple):
+    """Frame of a tap: number of its place, and indentation in [mm]."""
+
+    place: int
+    indentation_mm: float
 
 
 class _Peak(NamedTuple):
     result: Result
     pattern: NDArray[np.float32]
     force_counts: float
-    indentation_mm: float
+    frame: _Frame
+
+
+def _key(counts: NDArray[np.integer]) -> bytes:
+    return counts.astype(np.int32).tobytes()
 
 
 def score_table(scores: Sequence[TapScore]) -> str:
-    """Return the scores as a table with a line for each tap, 40 columns wide.
+    """Return the scores as a table with a line for each tap, 50 columns wide, and what the taps together are worth.
 
-    RMSE in [% of full scale]; "+-" is the model's own estimate of it, half the 90 % interval of touched pixels in [um].
+    RMSE in [% of full scale], of the pattern and of one from the same tap alone; "+-" is the model's own estimate, half
+    the 90 % interval of touched pixels in [um].
     """
-    lines = ["tap deg use   PSNR  SSIM   RMSE  +- time", "       taps     dB          %fs  um   us"]
+    lines = ["tap    x    y turn use   PSNR  RMSE alone  +- time", "      mm   mm  deg taps    dB   %fs   %fs  um   us"]
     for score in scores:
         interval_mm = score.result.interval_mm
         interval = "-" if interval_mm is None else f"{1000 * interval_mm:.0f}"
-        lines.append(
-            f"{score.tap + 1:3d} {score.angle_deg:3.0f} {score.result.taps_used:3d} {score.psnr_db:6.2f}"
-            f" {score.ssim:5.3f} {score.rmse_percent:6.2f} {interval:>3s} {score.result.run_time_us or 0:4.0f}"
-        )
-    return "\n".join(lines)
+        x_mm, y_mm, turn_deg = score.pose
+        figures = f"{score.psnr_db:6.2f} {score.rmse_percent:5.2f} {score.alone_percent:5.2f}"
+        place = f"{score.tap + 1:3d} {x_mm:4.1f} {y_mm:4.1f} {turn_deg:4.0f} {score.result.taps_used:3d}"
+        lines.append(f"{place} {figures} {interval:>3s} {score.result.run_time_us or 0:4.0f}")
+    return "\n".join([*lines, _gained(scores)])
+
+
+def _gained(scores: Sequence[TapScore]) -> str:
+    """Return what the earlier taps have changed, also where it is nothing good."""
+    last = scores[-1]
+    if last.result.taps_used < 2:
+        return "Each pattern is of one tap: the model takes one, or the earlier ones were dropped."
+    change = "fell" if last.rmse_percent < last.alone_percent else "did not fall"
+    errors = f"{last.rmse_percent:.2f} % of full scale, {last.alone_percent:.2f} % with it alone"
+    risen = [str(one.tap + 1) for before, one in pairwise(scores) if one.rmse_percent > before.rmse_percent]
+    rose = f"\nFrom tap to tap it rose at tap {' and '.join(risen)}." if risen else ""
+    return f"With {last.result.taps_used} taps the last one's error {change}: {errors}.{rose}"
 
 
 def score_picture(score: TapScore, columns: int, palette: Palette) -> str:

@@ -31,6 +31,7 @@ from edge.api import (
 )
 from edge.cli.run_options import (
     baseline_parser,
+    demo_parser,
     devices_parser,
     map_parser,
     models_parser,
@@ -41,6 +42,7 @@ from edge.cli.run_options import (
 )
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
+from firmware_bridge.in_place import BACKUP_SUFFIX
 
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
@@ -84,11 +86,8 @@ def _exit_code(error: BridgeError | EdgeError) -> int:
 
 
 def _demo(arguments: Sequence[str]) -> int:
-    options = understood(run_parser(), arguments)
-    if options.source:
-        raise UsageError(f"the demo is a source itself: leave out --source {options.source[0]}")
-    # A person may look at a page for long; a program that reads our output waits for its end.
-    options.source = [DEMO_LOOP if options.view is not None and sys.stdout.isatty() else "demo"]
+    options = understood(demo_parser(), arguments)
+    options.source = ["demo"]
     _follow(options)
     return 0
 
@@ -116,6 +115,8 @@ def _map(arguments: Sequence[str]) -> int:
 
 
 def _follow(options: argparse.Namespace, statistics: Statistics | None = None, mapping: MapSink | None = None) -> None:
+    if options.source == ["demo"] and options.view is not None and not set(options.sink) - {"status"}:
+        options.source = [DEMO_LOOP]  # a person may look at a page for long; a sink gets one round
     if options.recalibrate and options.budget_us is None:
         raise UsageError("--recalibrate requires --budget-us")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
@@ -136,19 +137,22 @@ def _record(arguments: Sequence[str]) -> int:
 def _replay(arguments: Sequence[str]) -> int:
     options = understood(replay_parser(), arguments)
     from edge.cli.run_command import run
-    from edge.pipeline.replay_setup import open_recording
+    from edge.pipeline.replay_setup import Player, open_recording
 
-    paced = options.paced or options.view is not None  # else it is over before a browser has connected
+    # A person looks for as long as he likes; a sink gets each result once.
+    player = Player() if options.view is not None and not set(options.sink) - {"status"} else None
+    paced = options.paced or options.view is not None
     source = open_recording(
-        options.file,
+        *options.file,
         sensor=options.sensor,
-        zero=options.zero,
+        zero=options.zero or options.baseline is not None,
         paced=paced,
         rate_hz=options.rate_hz,
         bar=not paced and "status" not in options.sink,
+        player=player,
     )
 
-    run(options, source)
+    run(options, source, player=player)
     return 0
 
 
@@ -175,12 +179,24 @@ def _baseline(arguments: Sequence[str]) -> int:
     options = baseline_parser().parse_args(arguments)
     from edge.terminal.stop_signals import stop_on_signals
 
-    with stop_on_signals() as stop, _open_source(options, give_up_s=0) as source:
-        baselines = take_baselines(source, scans=options.scans, skip=options.skip, stop=stop)
-    save_baselines(options.out, baselines.values(), source.sensor_file.orders)
+    replaced = options.out.exists()
+    if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
+        from edge.pipeline.replay_setup import recorded_baselines, settled
+
+        kind, known = "replay", settled(options.sensor, options.id_map)
+        baselines, notes = recorded_baselines(options.source[0].removeprefix("replay:"), known, options.rate_hz)
+        print("\n".join(notes), file=sys.stderr)
+    else:
+        with stop_on_signals() as stop, _open_source(options, give_up_s=0) as source:
+            kind, known = source.kind, source.sensor_file
+            asked = {name: value for name in ("scans", "skip") if (value := getattr(options, name)) is not None}
+            baselines = take_baselines(source, **asked, stop=stop)
+    save_baselines(options.out, baselines.values(), known.orders)
     for name, baseline in sorted(baselines.items()):
-        emulated = "" if source.kind == "device" else f" ({source.kind.upper()})"
+        emulated = "" if kind == "device" else f" ({kind.upper()})"
         print(f"sensor {name}: baseline {baseline.id} of {baseline.scans} scans{emulated} -> {options.out}")
+    if replaced:
+        print(f"the former file is now {options.out}{BACKUP_SUFFIX}")
     return 0
 
 
@@ -189,11 +205,11 @@ def _bench(arguments: Sequence[str]) -> int:
         from edge.bench.options import bench_parser
     except ModuleNotFoundError as error:
         raise UsageError(
-            "the wheel leaves edge-sr bench out: install a checkout (pip install --editable '.[bench]')"
+            "edge-sr bench is in another wheel, which is not installed: install tactile-edge-sr-train as well"
         ) from error
 
     options = bench_parser().parse_args(arguments)
-    if options.soak is not None and not options.system:
+    if options.soak is not None and not (options.system or options.sensors):
         raise UsageError("--soak is a part of --system: add it")
     from edge.bench.command import Settings, run
 
@@ -209,7 +225,8 @@ def _bench(arguments: Sequence[str]) -> int:
         earlier=options.compare,
         by_surface=options.by_surface,
         only=options.only,
-        system=options.system,
+        system=options.system or options.sensors is not None,
+        sensors=options.sensors,
         soak_minutes=options.soak,
         command=shlex.join(["edge-sr", "bench", *arguments]),
     )

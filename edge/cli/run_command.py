@@ -6,23 +6,21 @@ Modules that only some runs need are imported where they are used.
 import argparse
 import contextlib
 import os
-import shlex
-import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import TYPE_CHECKING, Final
 
 from edge.api import (
     DEFAULT_MODEL,
     DEMO_LOOP,
-    DEMO_MODEL,
+    POSED_MODEL,
     Commands,
     Contract,
     DeviceError,
-    Event,
     Fan,
     MapSink,
     Sink,
@@ -31,7 +29,6 @@ from edge.api import (
     Statistics,
     UsageError,
     choose_model,
-    demo_recording,
     load_baselines,
     load_model,
     open_poses,
@@ -40,17 +37,20 @@ from edge.api import (
     pump,
 )
 from edge.cli.run_options import runtime_options
+from edge.cli.silence_hint import silence_hint
 from edge.cli.user_commands import user_commands
 from edge.sinks.event_printer import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from edge.cli.demo_score import DemoScore
+    from edge.cli.demo_sinks import Demo
+    from edge.pipeline.replay_setup import Player
     from edge.view.live_view import LiveView
 
+DAY_S: Final = 86_400
 DEMO_HZ: Final = 100.0
 DEMO_REST_SCANS: Final = 100
-"""Scans without contact after which a repeating demo is at its first tap: 174 lie before it, 24 between taps."""
+"""Scans without contact after which a repeating demo is at its first tap: 180 lie before it, 34 between taps."""
 
 
 def run(
@@ -58,6 +58,7 @@ def run(
     source: Source,
     statistics: Statistics | None = None,
     mapping: MapSink | None = None,
+    player: "Player | None" = None,
 ) -> None:
     """Run `edge-sr` without a command, or a command that runs the same way.
 
@@ -66,6 +67,7 @@ def run(
         source: not open yet.
         statistics: filled on the way, so that they are available however the run ends.
         mapping: takes the results into a map, which the live page shows; closed here.
+        player: of the recording that is the source, for the page.
 
     Raises:
         EdgeError: an option, a model or a sink cannot be used.
@@ -77,7 +79,8 @@ def run(
     with stop_on_signals() as stop, user_commands() as commands:
         loops = options.source == [DEMO_LOOP]
         demo = loops or options.source == ["demo"]
-        name = (DEMO_MODEL if demo else DEFAULT_MODEL) if options.model is None else options.model
+        posed = mapping is None and (source.states_poses or bool(options.poses))  # a map fuses taps itself
+        name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
         if options.budget_us is None:
             model = None if stop.is_set() else load_model(name, stop=stop)
         else:
@@ -92,7 +95,7 @@ def run(
         if model is None:
             return
         scores = sys.stderr if stdout_taken else sys.stdout
-        score = None
+        played: Demo | None = None
         statistics = Statistics() if statistics is None else statistics
         with (
             _open_view(options, model.contract, commands) as view,
@@ -100,19 +103,23 @@ def run(
             source,
             contextlib.ExitStack() as closing,
         ):
-            hint = _silence_hint(options.source)
-            messages = MessageSink(hint=hint)
-            opener = partial(open_sink, contract=model.contract, source=source, stop=stop)
+            hint = partial(silence_hint, options.source, source.counters)
+            messages = MessageSink(hint=None if source.patient else hint)
+            opener = partial(open_sink, contract=model.contract, source=source, stop=stop, commands=commands)
             if view is not None:
-                view.begin(source.name, source.kind, model.name, opener, messages.say)
-                print(f"live page: {view.url}", file=sys.stderr, flush=True)
+                view.begin(source.name, source.kind, model.name, opener, messages.say, player)
+                print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)
+                if player is not None:
+                    print("the recording begins when the page is opened, and repeats until Ctrl-C", file=sys.stderr)
             if demo:
-                score = _open_score(model.contract, partial(_go_on, scores, view) if loops else lambda score: None)
+                from edge.cli import demo_sinks
+
+                played = demo_sinks.Demo(model, source, scores, view, loops=loops, maps=mapping is None)
             asked = runtime_options(options)
             if loops:
                 rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
                 asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
-            if score is not None:  # the demo shows the run time of every scan, and the gain of every tap
+            if played is not None:  # the demo shows the run time of every scan, and the gain of every tap
                 asked = replace(asked, every_scan=True, every_tap=True)
             runtime = open_runtime(
                 model,
@@ -122,13 +129,15 @@ def run(
                 **asdict(asked),
             )
             sinks: list[Sink] = []
-            if score is not None:
-                watching = [messages, *(() if view is None else view.sinks)]
-                sinks += [score, _open_scenes(watching)]
+            if played is not None:
+                sinks += played.sinks([messages, *(() if view is None else view.sinks)], commands)
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)
-            for text in _with_status(options.sink, source):
+            wanted = _with_status(options.sink, source)
+            if "status" in wanted and sys.stdin is not None and sys.stdin.isatty():
+                _tell("keys: r forgets earlier taps, z zeroes the free pad, Z zeroes even in contact")
+            for text in wanted:
                 sink = opener(text)
                 if text != "status":
                     fan.add(sink)
@@ -139,14 +148,12 @@ def run(
                 sinks.append(fan)
             if mapping is not None:
                 closing.callback(mapping.close)
-                mapping.show = None if view is None else view.show_map
+                mapping.show, mapping.origin = None if view is None else view.show_map, source.origin
                 sinks.append(mapping)
             if view is not None:
                 sinks += view.sinks
             for text in options.poses:
                 closing.callback(open_poses(text, commands.poses).close)
-            if options.poses and not getattr(model.contract, "takes_poses", False):
-                commands.poses.warn("model", f"model {model.name} takes no poses: they are only counted and recorded")
             if options.realtime:  # last, so that it does not affect what the page and the sinks have started
                 from edge.cli.realtime import realtime
 
@@ -162,9 +169,9 @@ def run(
             )
         # A run that its user ends before the first scan was due is no fault of the sensor.
         if not statistics.scans and (statistics.events or not stop.is_set()):
-            raise DeviceError(f"no scan came from {source.name}: {hint}")
-        if score is not None and not (loops and score.complete):
-            _print_score(score, scores)
+            raise DeviceError(f"no scan came from {source.name}: {hint()}")
+        if played is not None:
+            played.finish()
 
 
 def _open_view(
@@ -185,37 +192,6 @@ def _open_view(
     return LiveView(options.view_host or LOOPBACK, options.view, options.view_token, directory, contract, commands)
 
 
-def _open_score(contract: Contract, on_complete: "Callable[[DemoScore], object]") -> "DemoScore":
-    from edge.cli.demo_score import DemoScore
-
-    score = DemoScore(demo_recording(), contract, on_complete)
-    print(f"demo: an emulated sensor taps {score.surface!r} {score.taps} times, zeroed first", file=sys.stderr)
-    return score
-
-
-def _open_scenes(watching: Sequence[Sink]) -> Sink:
-    """Return the sink that announces the scenes of the demo to the sinks that show events."""
-    from edge.cli.demo_scenes import DemoScenes
-
-    def tell(event: Event) -> None:
-        for sink in watching:
-            sink.tell(event, {})
-
-    return DemoScenes(demo_recording(), tell)
-
-
-def _silence_hint(sources: Sequence[str]) -> str:
-    source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
-    return f"is the sensor powered and its cable in? edge-sr doctor{source} shows what is wrong"
-
-
-def _go_on(stream: TextIO, view: "LiveView | None", score: "DemoScore") -> None:
-    """Print the score of a complete round while the demo goes on, and where else to look."""
-    _print_score(score, stream)
-    page = "" if view is None else f"live page: {view.url}; "
-    print(f"\n{page}the demo continues until Ctrl-C", file=sys.stderr)
-
-
 @contextlib.contextmanager
 def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
     """Print the summary of a run at its end; a reader that has gone is an ordinary end, like Ctrl-C."""
@@ -229,6 +205,17 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
                 print(statistics.summary(source=name, wanted_rate_hz=source.rate_hz), file=sys.stderr)
                 received = ", ".join(f"{name} {count}" for name, count in source.counters().items() if count)
                 print(f"received: {received or 'nothing'}", file=sys.stderr)
+                if source.unix_offset_ns and statistics.scans:
+                    print(recorded_text(source.unix_time_s(), time.time()), file=sys.stderr)
+
+
+def recorded_text(made_s: float, now_s: float) -> str:
+    """Return when a recording was made, both in [s] since 1970: a pad wears, and its rest level moves."""
+    days = max(now_s - made_s, 0.0) / DAY_S
+    ago = (
+        f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
+    )
+    return f"recorded on {time.strftime('%Y-%m-%d at %H:%M', time.localtime(made_s))}, {ago}"
 
 
 def _tell(line: str) -> None:
@@ -239,18 +226,3 @@ def _with_status(sinks: Sequence[str], source: Source) -> list[str]:
     """The sinks asked for, and on a terminal the live line; not where records may go there, or it is over at once."""
     apart = source.patient or sys.stderr is None or not sys.stderr.isatty()
     return list(sinks) if apart or {"status", "jsonl:-"} & set(sinks) else [*sinks, "status"]
-
-
-def _print_score(score: "DemoScore", stream: TextIO) -> None:
-    from edge.cli.demo_score import score_picture, score_table
-    from edge.terminal.heatmap import choose_palette
-
-    scores = score.scores()
-    if not scores:
-        print(f"\nnone of {score.taps} taps scored: the run ended before a tap had a pattern", file=stream)
-        return
-    print(f"\n{len(scores)} of {score.taps} taps scored at their peak, against the simulated truth:", file=stream)
-    palette = choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)
-    columns = shutil.get_terminal_size().columns
-    print(score_table(scores), file=stream)
-    print(f"\ntap {scores[-1].tap + 1}:\n{score_picture(scores[-1], columns, palette)}", file=stream)

@@ -17,6 +17,7 @@ from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import LinkLostError, SensorFileError
+from firmware_bridge.in_place import BACKUP_SUFFIX
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorFile
 
@@ -85,13 +86,14 @@ def run(
         if lost is not None:
             examined.findings.append(Finding("link", "wrong", f"lost: {lost}", "", "check plug and cable"))
         kept = unwritten = None
-        if options.out is not None and lost is None and not stop.is_set():
+        replaced = options.out is not None and options.out.exists()
+        if options.out is not None and lost is None and visit.watched:
             try:
                 kept = keep(
                     options.out,
                     watch.known,
                     watched.facts.port,
-                    examined.baselines,
+                    {name: one for name, one in examined.baselines.items() if name not in examined.loaded},
                     mountings,
                     visit.newtons,
                     visit.gains,
@@ -100,14 +102,16 @@ def run(
             except SensorFileError as error:
                 unwritten = error
         stopped_s = clock_s() - start_s if stop.is_set() else None
-        _tell(options, watch, stopped_s, examined.findings, kept, out)
+        _tell(options, watch, stopped_s, examined.findings, kept, out, replaced=replaced)
         if lost is not None:
             raise lost
         if unwritten is not None:
             raise unwritten
         if stop.is_set():
+            if options.out is not None and kept is None:
+                print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
             return EXIT_STOPPED
-    return EXIT_WRONG if worst(examined.findings) == "wrong" else 0
+    return EXIT_WRONG if visit.unfinished or worst(examined.findings) == "wrong" else 0
 
 
 def _tell(
@@ -117,6 +121,8 @@ def _tell(
     findings: list[Finding],
     kept: SensorFile | None,
     out: TextIO,
+    *,
+    replaced: bool,
 ) -> None:
     link = watch.link
     if options.json:
@@ -137,5 +143,7 @@ def _tell(
     print(page(findings, columns()), file=out)
     if kept is not None:
         print(f"kept in {options.out}", file=out)
+        if replaced:
+            print(f"the former file is now {options.out}{BACKUP_SUFFIX}", file=out)
     early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
     print(*wrapped(early + summary(findings), columns()), sep="\n", file=out)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +60,25 @@ class Watched:
     mountings: Mapping[str, Mounting] = field(default_factory=dict)
 
 
+_PRESSED: Final = (
+    "something presses: free the pad, and repeat; this baseline is not stored. If it is free, the earlier baseline is "
+    "too old: zero again, with edge-sr baseline"
+)
+
+
 @dataclass(frozen=True)
 class Examined:
-    """Findings, and baselines of the pads that may be zeroed, by sensor."""
+    """Findings, and baselines of the pads that may be zeroed, by sensor.
+
+    Attributes:
+        findings: of link and sensors.
+        baselines: of the pads as they are.
+        loaded: sensors whose pads something presses, as an earlier baseline shows: theirs are not those of free pads.
+    """
 
     findings: list[Finding]
     baselines: dict[str, Baseline]
+    loaded: frozenset[str] = frozenset()
 
 
 def examine(watched: Watched, unix_time_s: float) -> Examined:
@@ -107,7 +121,8 @@ def examine(watched: Watched, unix_time_s: float) -> Examined:
         if baseline is not None:
             baselines[name] = baseline
         findings += [_of(name, finding) for finding in of_sensor]
-    return Examined(findings, baselines)
+    loaded = {one.sensor for one in findings if one.name == "load" and one.remedy == _PRESSED and one.sensor}
+    return Examined(findings, baselines, frozenset(loaded))
 
 
 def check_baseline(
@@ -166,11 +181,7 @@ def check_load(
     measured = f"z {z[taxel]:+.0f} counts on taxel {taxel} against baseline {reference.id}"
     if abs(z[taxel]) <= LOAD_LIMIT_COUNTS:
         return Finding("load", "ok", measured, norm)
-    remedy = (
-        "something presses: free the pad; if it is free, the baseline is too old: zero again"
-        if z[taxel] > 0
-        else "the baseline was taken of a loaded pad, or is too old: zero again"
-    )
+    remedy = _PRESSED if z[taxel] > 0 else "the baseline was taken of a loaded pad, or is too old: zero again"
     return Finding("load", "wrong", measured, norm, remedy)
 
 

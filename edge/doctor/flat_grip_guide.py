@@ -35,6 +35,7 @@ class GuidedGrips(Guide):
     def __init__(self, geometry: SensorGeometry = USPA44) -> None:
         self.grips: list[NDArray[np.float32]] = []
         self.refused = ""
+        self.enough_counts = FIRM_COUNTS * geometry.taxel_count
         super().__init__(geometry)
 
     def _all(self) -> Dialogue[None]:

@@ -54,6 +54,10 @@ class Answer:
     counts_per_newton: float | None = None
 
 
+class SkippedError(Exception):
+    """Raised in a dialogue where the person skips the request."""
+
+
 T = TypeVar("T")
 Dialogue = Generator[str | None, Reading, T]
 
@@ -63,7 +67,10 @@ class Guide(ABC):
 
     Attributes:
         done: True when there are no more requests.
+        enough_counts: load at which a press is measured.
     """
+
+    enough_counts: float
 
     def __init__(self, geometry: SensorGeometry) -> None:
         self.done = False
@@ -82,12 +89,24 @@ class Guide(ABC):
             zeroed: (3, rows, cols), over the baseline, in counts; where it is NaN the taxel's last reading stands.
             time_s: of its scan, in [s].
         """
+        self._held = np.where(np.isnan(zeroed), self._held, zeroed)
+        return self._go_on(lambda: self._dialogue.send(Reading(self._held, time_s)))
+
+    def skip(self) -> str | None:
+        """Leave the open request out; returns the next one, or None."""
+        return self._go_on(lambda: self._dialogue.throw(SkippedError()))
+
+    @property
+    def felt_counts(self) -> float:
+        """Load on the pad by the last reading."""
+        return float(np.abs(self._held[2]).sum())
+
+    def _go_on(self, step: Callable[[], str | None]) -> str | None:
         if self.done:
             return None
         try:
-            self._held = np.where(np.isnan(zeroed), self._held, zeroed)
-            return self._dialogue.send(Reading(self._held, time_s))
-        except StopIteration:
+            return step()
+        except (StopIteration, SkippedError):  # a dialogue without another way ends where it is skipped
             self.done = True
             return None
 
@@ -99,6 +118,8 @@ class GuidedPress(Guide):
         answer: results so far; complete when `done`.
     """
 
+    enough_counts = ON_COUNTS
+
     def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
         """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
         self._corners = geometry.corners
@@ -108,7 +129,13 @@ class GuidedPress(Guide):
 
     def _all(self) -> Dialogue[None]:
         for place, name in zip(self._corners, CORNERS, strict=True):
-            press = yield from _corner(place, name)
+            try:
+                press = yield from _corner(place, name)
+            except SkippedError:
+                # A finger that is still there would be taken for one on the next corner.
+                if (yield from wait("Skipped. Let go.", free, FREE_SCANS)) is None:
+                    break
+                continue
             if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
                 break
             self.answer.presses.append(press)
@@ -117,7 +144,7 @@ class GuidedPress(Guide):
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
-    ask = f"Press the {name} corner with a finger and hold it."
+    ask = f"Press the {name} corner with a finger, about as hard as a stiff doorbell, and hold it."
     for _ in range(TRIES):
         held = yield from wait(ask, _touched, HOLD_SCANS)
         if held is None:

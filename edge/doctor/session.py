@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TextIO
 
 from edge.doctor.examine import Examined
+from edge.doctor.felt_line import FeltLine, enter_pressed
 from edge.doctor.findings import Finding
 from edge.doctor.flat_grip_guide import GuidedGrips
 from edge.doctor.grip_findings import judge_grips
@@ -29,6 +30,8 @@ class Visit:
     Attributes:
         newtons: counts per newton of the sensors that were weighed.
         gains: pads with the gains of the sensors that were gripped.
+        watched: True when the free pads were watched for the whole time.
+        unfinished: True when a measurement was asked of a person, and not made.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class Visit:
         """
         self.newtons: dict[str, float] = {}
         self.gains: dict[str, Pad] = {}
+        self.watched = self.unfinished = False
         self._options = options
         self._err = err
         self._stop = stop
@@ -73,6 +77,7 @@ class Visit:
                 bar.reach(min(passed_s, length_s))
 
             self._watch.run(length_s, show)
+        self.watched = not self._stop.is_set()
 
     def press(self, examined: Examined) -> dict[str, Mounting]:
         """Ask for presses and grips on every pad that may be zeroed; returns the corrections of their mountings.
@@ -103,7 +108,7 @@ class Visit:
         self._lead(guide, name, examined, whose)
         weighed = self._options.weight_g is not None
         findings, found = judge_press(guide.answer, self._options.out is not None, weighed, geometry)
-        examined.findings.extend(replace(finding, sensor=name) for finding in findings)
+        self._add(findings, name, examined)
         if guide.answer.counts_per_newton is not None:
             self.newtons[name] = guide.answer.counts_per_newton
         return found
@@ -112,9 +117,14 @@ class Visit:
         guide = GuidedGrips(self._watch.known.geometry)
         self._lead(guide, name, examined, f"Sensor {name}: " if several else "")
         finding, gains = judge_grips(guide, found, self._options.out is not None)
-        examined.findings.append(replace(finding, sensor=name))
+        self._add([finding], name, examined)
         if gains is not None:
             self.gains[name] = gains
+
+    def _add(self, findings: list[Finding], name: str, examined: Examined) -> None:
+        """Add findings of what was asked of a person."""
+        self.unfinished |= any(finding.verdict == "not known" for finding in findings)
+        examined.findings.extend(replace(finding, sensor=name) for finding in findings)
 
     def _lead(self, guide: Guide, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
@@ -122,6 +132,15 @@ class Visit:
         if not (self._stop.is_set() or self._link.ended):
             self._say(whose + guide.first)
         received_s = self._clock_s()
+        line = FeltLine(self._err, self._clock_s)
+        enter_pressed()  # one of before is no answer to this request
+
+        def ask(request: str | None) -> None:
+            if request is not None:
+                line.clear()
+                self._say(whose + request)
+                line.asked()
+
         while not (guide.done or self._stop.is_set() or self._link.ended):
             if self._clock_s() - received_s > GIVEN_UP_S:
                 why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
@@ -132,9 +151,11 @@ class Visit:
                     continue
                 received_s = self._clock_s()
                 zeroed = deformation(scan.counts, baseline, mounting)
-                ask = guide.push(zeroed, scan.time_ns / NS_PER_S)
-                if ask is not None:
-                    self._say(whose + ask)
+                ask(guide.push(zeroed, scan.time_ns / NS_PER_S))
+            if enter_pressed():
+                ask(guide.skip())
+            line.show(guide)
+        line.clear()
 
     def _why_no_press(self) -> str | None:
         if self._options.no_press:

@@ -98,6 +98,7 @@ def keep(
             *pads,
             assumed=entry.assumed - renewed,
             emulated=entry.emulated | renewed if emulated else entry.emulated - renewed,
+            frame=entry.frame,
         )
     # A sensor of a named source is one of several, each with an adapter of its own.
     serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
@@ -142,6 +143,7 @@ def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
         *["counts per newton"] * lost("force", entry.counts_per_newton is not None, bool(written.counts_per_newton)),
         *["constants of the pad"] * lost("gains", entry.pad is not None, written.pad is not None),
         *["learned gains"] * (entry.learned is not None and written.learned is None and written.pad is None),
+        *["place on the robot"] * (entry.frame is not None and written.frame is None),
         *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),
     ]
 

@@ -2,7 +2,9 @@
 
 import struct
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -17,14 +19,22 @@ _LEAST_PX: Final = 480
 _NOTHING: Final = (255, 255, 255)
 _DOUBTED: Final = (200, 40, 30)
 _GAP_PX: Final = 8
+_WORD_PX: Final = 6
+_EMULATED: Final = (
+    "### #   # #  # #    ##  ### ### ## ",
+    "#   ## ## #  # #   #  #  #  #   # #",
+    "##  # # # #  # #   ####  #  ##  # #",
+    "#   #   # #  # #   #  #  #  #   # #",
+    "### #   #  ##  ### #  #  #  ### ## ",
+)
+"""Rows of a word that a picture of emulated data bears, since it may be shown without its name."""
 
 
 def save_npz(path: Path, whole: ObjectMap, **facts: str) -> None:
     """Write the layers of a map, its place and its counts; facts are added as texts."""
     layers = whole.layers()
     arrays: dict[str, Any] = {name: getattr(layers, name) for name in MapLayers.__dataclass_fields__}
-    counts = {name: getattr(whole, name) for name in ("fused", "doubted", "light", "outside")}
-    arrays |= {f"{name}_patterns": np.array(count) for name, count in counts.items()}
+    arrays |= {f"{name}_patterns": np.array(count) for name, count in whole.counts.items()}
     arrays |= {name: np.array(text) for name, text in facts.items()}
     arrays |= {"px_per_mm": np.array(whole.grid.px_per_mm), "centre_mm": np.array(whole.grid.centre_mm)}
     np.savez_compressed(path, format=np.array(FORMAT), version=np.array(VERSION), **arrays)
@@ -38,10 +48,11 @@ def check_npz(path: Path) -> None:
             raise ValueError(f"{path} is not a map")
 
 
-def save_png(path: Path, whole: ObjectMap) -> None:
+def save_png(path: Path, whole: ObjectMap, **facts: str) -> None:
     """Write the contact layer as a picture, and beside it the height from its lowest part to the map's top.
 
-    White is not covered, or in the height not touched; red was covered by patterns alone that were not believed.
+    White is not covered, or in the height not touched; red was covered by patterns alone that were not believed. Facts
+    are added as texts; where one is that the map is of an emulated sensor, a line above the picture states that.
     """
     layers = whole.layers()
     heights_mm = layers.height_mm
@@ -51,7 +62,18 @@ def save_png(path: Path, whole: ObjectMap) -> None:
     panels = [_coloured(layers.contact, doubted), _coloured(1 - heights_mm / lowest_mm, doubted)]
     large = [np.repeat(np.repeat(panel, times, axis=0), times, axis=1) for panel in panels]
     gap = np.full((len(large[0]), _GAP_PX, 3), 255, dtype=np.uint8)
-    path.write_bytes(png(np.concatenate([large[0], gap, large[1]], axis=1)))
+    picture = np.concatenate([large[0], gap, large[1]], axis=1)
+    if facts.get("origin") == "emulated":
+        picture = np.concatenate([_emulated_line(picture.shape[1]), picture])
+    path.write_bytes(png(picture, facts))
+
+
+def _emulated_line(width: int) -> NDArray[np.uint8]:
+    """Return a line (height, width, 3) with the word EMULATED, white on black."""
+    word = np.array([[mark == "#" for mark in row] for row in _EMULATED]).repeat(_WORD_PX, 0).repeat(_WORD_PX, 1)
+    line = np.zeros((len(word) + 2 * _GAP_PX, width, 3), dtype=np.uint8)
+    line[_GAP_PX:-_GAP_PX, _GAP_PX : _GAP_PX + word.shape[1]][word] = _NOTHING
+    return line
 
 
 def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -64,13 +86,14 @@ def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArr
     return pixels
 
 
-def png(pixels: NDArray[np.uint8]) -> bytes:
-    """Return a PNG of pixels (H, W, 3), red, green and blue: three chunks, so that no library is needed."""
+def png(pixels: NDArray[np.uint8], facts: Mapping[str, str] = MappingProxyType({})) -> bytes:
+    """Return a PNG of pixels (H, W, 3), red, green and blue, with texts: so few chunks that no library is needed."""
     height, width = pixels.shape[:2]
     # Every line begins with its filter, 0 for none.
     lines = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits a channel, true colour
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
+    texts = [(b"iTXt", f"{name}\0\0\0\0\0{text}".encode()) for name, text in facts.items()]
+    chunks = ((b"IHDR", header), *texts, (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from edge.errors import UsageError
 from edge.mapping.evidence import CONTACT_LEVEL, weigh
 from edge.mapping.footprint import MOST_PX, Grid, footprint
+from edge.perception.pattern_check import LEAST_COUNTS
 from edge.perception.result import Result
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
@@ -120,6 +121,16 @@ class ObjectMap:
         self._checks = False
         self._presses: dict[str, _Press] = {}
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Patterns by their fate: fused, doubted, light and outside."""
+        return {"fused": self.fused, "doubted": self.doubted, "light": self.light, "outside": self.outside}
+
+    def blank(self) -> "ObjectMap":
+        """Return an empty map of the same size at the same place, for another object."""
+        pixels, px_per_mm, centre_mm = self.grid
+        return ObjectMap(pixels / px_per_mm, px_per_mm, centre_mm=centre_mm, contact_level=self._level)
+
     def add(self, result: Result, pose: PadPose | None) -> None:
         """Take a result and the pose of its pad at that time.
 
@@ -201,7 +212,7 @@ class ObjectMap:
             doubts[under.pixels] += self._worth(pose)
             return "doubted"
         evidence = weigh(pattern, result.deviation, pose, pixel_mm, self._level)
-        if evidence is None or (self._checks and result.trusted is None):
+        if evidence is None or (result.trusted is None and (self._checks or _too_light(result))):
             return "light"
         seen, before = under.read(evidence.layers), sums[under.pixels]
         offset_mm = self._offset_mm(seen, before, evidence.top_mm)
@@ -228,6 +239,11 @@ class ObjectMap:
         turned_mm = _RADIUS_MM * 2 * np.sin((turn_rad - radians(pose.turn_deg)) / 2)
         away_mm = np.sqrt((x_mm - pose.x_mm) ** 2 + (y_mm - pose.y_mm) ** 2 + turned_mm**2)
         return min(1.0, max(LEAST_SHARE, float(away_mm.min()) / INDEPENDENT_MM))
+
+
+def _too_light(result: Result) -> bool:
+    """Return whether a press is lighter than any that a model with checks would check, before it has checked one."""
+    return result.window is not None and float(result.window[0, 2].max()) < LEAST_COUNTS
 
 
 def _contact(covered: NDArray[np.float32], odds: NDArray[np.float32]) -> NDArray[np.float32]:

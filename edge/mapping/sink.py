@@ -1,8 +1,13 @@
-"""Sink that fuses the results of a run into a map, shows it now and then, and writes its files at the end."""
+"""Sink that fuses the results of a run into a map, shows it now and then, and writes its files at the end.
+
+A reset stands for a new object, so that it ends the map and begins the next.
+"""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping
 from functools import partial
+from math import hypot
 from pathlib import Path
 from typing import Final
 
@@ -13,22 +18,31 @@ from edge.mapping.object_map import ObjectMap
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from firmware_bridge.in_place import check_writable, write_in_place
+from firmware_bridge.links.base import SourceKind
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.pose_track import PoseTrack
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses.pose_track import GAP_NS
+from firmware_bridge.silence import SENSOR_SILENT_NS
 
+APART_MM: Final = USPA44.rows * USPA44.pitch_mm / 2
+"""Half a pad, in [mm]: the centres of two pads are never that near to each other."""
 SHOW_NS: Final = 250_000_000
 """Time between two states that are shown, in [ns], of a map of SHOWN_PX pixels; larger ones are shown less often."""
 SHOWN_PX: Final = 240 * 240
 
 
 class MapSink(Sink):
-    """Fusion of results at the poses that belong to them.
+    """Fusion of results at their poses.
 
     Attributes:
-        whole: the map.
+        whole: the map; after a reset the next one.
+        fused: patterns on all maps.
         without_pose: patterns without a pose, which are left out.
+        together: patterns of pads that are at one place by their poses, which are left out, too.
+        origin: kind of source that the scans come from, where results are of a recording; else that of the results.
     """
+
+    uses_poses = True
 
     def __init__(
         self,
@@ -37,24 +51,29 @@ class MapSink(Sink):
         npz: Path | None = None,
         png: Path | None = None,
         show: Callable[[MapState], object] | None = None,
+        origin: SourceKind | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Check that the files can be written.
 
         Args:
             whole: the map to fuse into.
-            npz: file of the layers, written on `close`.
-            png: picture, written on `close`.
+            npz: file of the layers, written on `close`, and at a reset; later maps have a number in their names.
+            png: picture, written likewise.
             show: called with the map's state a few times a second; it must not wait.
+            origin: kind of source that the scans come from, where a recording names it.
             clock_ns: monotonic, in [ns].
 
         Raises:
             SinkError: a file exists, or cannot be written.
         """
         self.whole = whole
-        self.without_pose = 0
-        self.show = show
+        self.without_pose = self.together = 0
+        self.show, self.origin = show, origin
+        self._before: Counter[str] = Counter()
+        self._written: list[Path] = []
         self._files = [(path, save) for path, save in ((npz, self._save_npz), (png, self._save_png)) if path]
+        self._first_files = self._files
         for path, _ in self._files:
             if path.exists():
                 raise SinkError(f"{path} exists: give another name, or delete it first")
@@ -63,8 +82,7 @@ class MapSink(Sink):
             except OSError as error:
                 raise SinkError(f"cannot write {path}: {error.strerror}") from error
         self._facts: dict[str, str] = {}
-        self._tracks: dict[str | None, PoseTrack] = {}
-        self._pads: dict[str, PadPose] = {}
+        self._pads: dict[str, tuple[PadPose, int]] = {}
         self._live = LiveMap(whole.grid)
         self._clock_ns = clock_ns
         self._pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // SHOWN_PX)
@@ -72,31 +90,38 @@ class MapSink(Sink):
         self._unseen = False
 
     @property
+    def fused(self) -> int:  # noqa: D102 - above
+        return self._before["fused"] + self.whole.fused
+
+    @property
     def trouble(self) -> str | None:  # noqa: D102 - of Sink
-        if self.without_pose and not self.whole.fused:
+        if self.without_pose and not self.fused:
             return f"{self.without_pose} patterns came without a pose, so the map is empty: send poses of the pad"
+        if self.together:
+            why = "each pose needs the name of its sensor"
+            return f"{self.together} patterns of two pads at one place are left out: {why}"
         return None
 
-    def pose(self, poses: Sequence[TimedPose]) -> None:
-        """Take poses, before the results that belong to them."""
-        for one in poses:
-            self._tracks.setdefault(one.sensor, PoseTrack()).add(one.time_ns, one.pose, holds=one.holds)
-
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Fuse a result at the pose that its pad had at its scan.
+        """Fuse a result at its pose, on the next map if taps were forgotten as for a new object.
 
         Raises:
             UsageError: its pattern is not in [mm].
+            SinkError: a file of the map before cannot be written.
         """
+        if any(event.kind == "reset" for event in result.events):
+            self._begin_next()
         sensor = result.scan.sensor
-        track = self._tracks.get(sensor) or self._tracks.get(None)
-        pose = None if track is None else track.at(result.scan.time_ns)
+        pose = result.pose
         if pose is None:
             self._pads.pop(sensor, None)
             self.without_pose += result.pattern is not None
         else:
-            self._pads[sensor] = pose
-        self._facts = {"model": result.model, "source": result.source}
+            self._pads[sensor] = pose, result.scan.time_ns
+            if len(self._pads) > 1 and self._is_shared(sensor, pose, result.scan.time_ns):
+                self.together += result.pattern is not None
+                pose = None
+        self._facts = {"model": result.model, "source": result.source, "origin": self.origin or result.source}
         self.whole.add(result, pose)
         self._unseen = True
         self._show()
@@ -111,37 +136,69 @@ class MapSink(Sink):
         Raises:
             SinkError: a file cannot be written.
         """
-        self.whole.finish()
+        self._save()
         self._due_ns, self._unseen = 0, True
         self._show()
-        if not self.whole.fused:
-            return
-        for path, save in self._files:
+
+    def summary(self) -> str:
+        """Return what the map holds, in a line."""
+        counts = self._before + Counter(self._counts)
+        parts = [f"{counts['fused']} patterns fused"]
+        left_out = {"doubted": "not believed", "light": "too light", "outside": "outside the map"}
+        left_out |= {"without_pose": "without a pose", "together": "of two pads at one place"}
+        parts += [f"{counts[name]} {why}" for name, why in left_out.items() if counts[name]]
+        emulated = " (EMULATED)" if self._facts.get("origin") == "emulated" else ""
+        return f"map{emulated}: {', '.join(parts)}; {' and '.join(map(str, self._written)) or 'no file'} written"
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        return self.whole.counts | {"without_pose": self.without_pose, "together": self.together}
+
+    def _is_shared(self, sensor: str, pose: PadPose, time_ns: int) -> bool:
+        """Return whether another pad is at this place by its pose: then one has poses that are not its own."""
+        near = (
+            abs(time_ns - at_ns) <= GAP_NS and hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm) < APART_MM
+            for name, (other, at_ns) in self._pads.items()
+            if name != sensor
+        )
+        return any(near)
+
+    def _begin_next(self) -> None:
+        self._save()
+        self._before += Counter(self.whole.counts)
+        self.whole = self.whole.blank()
+        number = 1 + len(self._written) // max(1, len(self._files))
+        while any(_numbered(path, number).exists() for path, _ in self._first_files):
+            number += 1
+        self._files = [(_numbered(path, number), save) for path, save in self._first_files]
+
+    def _save(self) -> None:
+        """Take the presses that have not ended, and write the files of the map; nothing fused, no file."""
+        self.whole.finish()
+        for path, save in self._files if self.whole.fused else ():
+            if path in self._written:
+                continue
             try:
                 write_in_place(path, save, check_npz if path.suffix == ".npz" else partial(Path.stat))
             except (OSError, ValueError, KeyError) as error:
                 raise SinkError(f"cannot write {path}: {error}") from error
-
-    def summary(self) -> str:
-        """Return what the map holds, in a line."""
-        whole = self.whole
-        parts = [f"{whole.fused} patterns fused"]
-        left_out = {"not believed": whole.doubted, "too light": whole.light, "outside the map": whole.outside}
-        left_out["without a pose"] = self.without_pose
-        parts += [f"{count} {why}" for why, count in left_out.items() if count]
-        written = " and ".join(str(path) for path, _ in self._files if path.exists())
-        return f"map: {', '.join(parts)}; {written or 'no file'} written"
+            self._written.append(path)
 
     def _save_npz(self, path: Path) -> None:
         save_npz(path, self.whole, **self._facts)
 
     def _save_png(self, path: Path) -> None:
-        save_png(path, self.whole)
+        save_png(path, self.whole, **self._facts)
 
     def _show(self) -> None:
         if self.show is None or not self._unseen or self._clock_ns() < self._due_ns:
             return
         self._due_ns, self._unseen = self._clock_ns() + self._pause_ns, False
         whole = self.whole
-        counts = {"fused": whole.fused, "doubted": whole.doubted, "light": whole.light, "outside": whole.outside}
-        self.show(self._live.next(*whole.contact(), self._pads, counts | {"without_pose": self.without_pose}))
+        seen_ns = max((time_ns for _, time_ns in self._pads.values()), default=0)
+        pads = {name: pose for name, (pose, at_ns) in self._pads.items() if seen_ns - at_ns <= SENSOR_SILENT_NS}
+        self.show(self._live.next(*whole.contact(), pads, self._counts))
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path if number == 1 else path.with_stem(f"{path.stem}-{number}")

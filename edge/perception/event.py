@@ -119,7 +119,7 @@ class Note:
             is zeroed; "not_in_sensor_file".
 
             Of the rest level: "rest_level", it has stepped; "all_alike", a contact looks like drift. Of time: "late",
-            the reading was old when it arrived.
+            the reading was old when it arrived, or the pattern was ready long after that.
         text: in a user's words.
 
     Raises:

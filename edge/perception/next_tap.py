@@ -1,4 +1,4 @@
-"""Where to touch next: the pose whose readings are expected to take most of the pattern's error away.
+"""Proposal of the next tap: the pose whose readings are expected to take most of the pattern's error away.
 
 The pattern is a Gaussian field on cells, with the covariance of training patterns. Each tap measures it through the
 model's forward operator, with errors that all taps of a sensor share, and errors of its own. What the taps so far leave
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from edge.inference.forward_model import GRID, ForwardModel, pooling
 from edge.perception.result import NextTap, Result
+from edge.perception.tap_tracker import TapState
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
 _RIM: Final = 2
 """Cells around the pattern that are estimated as well, because taps next to the newest one measure them."""
@@ -28,8 +30,7 @@ _LENGTHS_MM: Final = np.array([1.0, 2.0, 3.0, 7.0, 40.0])
 _WEIGHTS: Final = np.array([0.0044, 0.0164, 0.0066, 0.0215, 0.0071])
 """Gaussians whose sum is the covariance of patterns by distance, over the square of the readings' amplitude, fitted by
 train.experiments.support.kalman_fusion."""
-_GAIN_SPREAD: Final = 0.075
-_SHARED: Final = 0.45
+SHARED: Final = 0.45
 """Share of the operator's error that all taps have in common: one pad, one shape."""
 _FINE: Final = 0.56
 """Squared error of detail finer than a cell, which no tap takes away, over that which one tap leaves of cells."""
@@ -48,24 +49,22 @@ class TapAdvice:
     def __init__(self, finder: "NextTapFinder", taps: int) -> None:
         self._finder, self._taps = finder, taps
         self._strongest: Result | None = None
+        self._tap = -1
         self._proposed: NextTap | None = None
 
-    def see(self, made: Result) -> None:
-        """Take a result with a pattern: the strongest one of a tap counts."""
+    def see(self, made: Result, tap: int) -> None:
+        """Take a result with a pattern: the strongest one of a tap, by its number, counts."""
         before = self._strongest
+        if tap != self._tap:  # also after a reset within a tap, which goes on with another number
+            self._tap, before = tap, None
         if before is None or (made.force_counts or 0.0) >= (before.force_counts or 0.0):
             self._strongest = made
 
-    def proposal(self, *, contact: bool, remembered: bool) -> NextTap | None:
-        """Return where to touch next; None during a tap, and where nothing can be proposed.
-
-        Args:
-            contact: a tap goes on.
-            remembered: the tap before is not forgotten.
-        """
-        if contact or not remembered:
+    def proposal(self, tap: TapState) -> NextTap | None:
+        """Return where to touch next; None during a tap, and where nothing can be proposed or the tap is forgotten."""
+        if tap.contact or not tap.peaks or tap.peaks[0].tap != self._tap:
             self._proposed = None
-            if not contact:
+            if not tap.contact:
                 self._strongest = None
             return None
         if (made := self._strongest) is not None:
@@ -109,11 +108,11 @@ class NextTapFinder:
         self._reach_mm = reach_mm
         self._operator = forward.operator[0, at * _READINGS : (at + 1) * _READINGS, : GRID**2]
         error = float(forward.model_error[at]) ** 2
-        self._own = np.float32((1 - _SHARED) * error + float(forward.noise[at]) ** 2)
+        self._own = np.float32((1 - SHARED) * error + float(forward.noise[at]) ** 2)
         self._prior = np.zeros((_STATES, _STATES), dtype=np.float32)
         self._prior[: _WIDE**2, : _WIDE**2] = _covariance()
         shared = np.arange(_WIDE**2, _STATES)
-        self._prior[shared, shared] = _SHARED * error + _GAIN_SPREAD**2
+        self._prior[shared, shared] = SHARED * error + GAIN_SPREAD**2
         inner = np.zeros((_WIDE, _WIDE), dtype=bool)
         inner[_RIM:-_RIM, _RIM:-_RIM] = True
         self._inner = np.flatnonzero(inner)

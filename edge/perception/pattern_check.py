@@ -37,6 +37,8 @@ REPEATS: Final = 5
 longer than 3."""
 SAME_STRENGTH: Final = 0.85
 """Strength of a press, over that of an earlier tap, from which the two are compared for good."""
+NOT_OF_IT: Final = 0.5
+"""Share from which an earlier tap does not belong to the contact."""
 _SUSPICION: Final = 1.5
 _STEP: Final = 4.5
 _LIMIT: Final = 12.0
@@ -163,15 +165,17 @@ class PatternCheck:
             self._strongest, self._score = strength, score
 
 
-def first_stranger(belonging: Sequence[float]) -> int | None:
-    """Return the number, from 1, of the newest earlier tap that does not belong; None if all do."""
-    return next((number for number, share in enumerate(belonging, 1) if share >= 0.5), None)
+def strangers(belonging: Sequence[float], *, posed: bool) -> list[int]:
+    """Return the numbers, from 1, of the earlier taps that a pattern is made without.
 
+    A tap with a pose of its own goes alone. Without poses the taps before it go, too: their turns are counted over it.
 
-def dropped_taps(belonging: Sequence[float]) -> int:
-    """Return the number of earlier taps that a pattern is made without."""
-    stranger = first_stranger(belonging)
-    return 0 if stranger is None else len(belonging) - stranger + 1
+    Args:
+        belonging: of the earlier taps, newest first, see `PatternCheck.belonging`.
+        posed: each has a pose of its own.
+    """
+    found = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
+    return found if posed or not found else list(range(found[0], len(belonging) + 1))
 
 
 def _share(log_odds: float) -> float:

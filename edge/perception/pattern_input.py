@@ -1,12 +1,17 @@
-"""Input of a pattern that is due."""
+"""Inputs of the patterns that are due, and the queue in which they wait for a call of the model."""
 
+import math
 from collections.abc import Hashable, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.result import MADE, Result, replace
 from edge.perception.sensor_state import Sensor
+
+SMOOTHING: Final = 0.1
+"""Share of the newest call in the time that a pattern is expected to take."""
 
 
 class Due(NamedTuple):
@@ -27,3 +32,53 @@ class Due(NamedTuple):
     poses: NDArray[np.float32] | None
     tap: int
     made_by: Hashable
+
+    def unchanged(self, result: Result) -> Result | None:
+        """Return the result with the sensor's last pattern, or None if a new pattern is needed."""
+        before = self.sensor.last
+        if before is None or not self.sensor.last_reading.holds(self.window[0], self.made_by, self.poses):
+            return None
+        made = {name: getattr(before, name) for name in MADE}
+        window = result.window
+        if window is not None and before.window is not None and before.taps_used < len(window):
+            # The pattern is of fewer taps than there are, where one did not belong.
+            window = np.concatenate([window[:1], before.window[1:]])
+        made |= {"taps_used": before.taps_used, "poses": before.poses, "reused_from": before.scan.number}
+        return replace(result, **made, window=window)
+
+
+class DueQueue:
+    """Queue of one pattern a sensor, that of its newest scan: no sensor waits longer because another sends more."""
+
+    def __init__(self) -> None:
+        # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
+        self._waiting: dict[str, tuple[Result, Due]] = {}
+        self._pattern_us = 0.0
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def join(self, sensor: str, result: Result, due: Due) -> list[Result]:
+        """Let a scan's pattern wait in the sensor's place; return the result that it overtakes, if any."""
+        overtaken = self._waiting.get(sensor)
+        self._waiting[sensor] = result, due
+        return [] if overtaken is None else [replace(overtaken[0], state="dropped")]
+
+    def leave(self, sensor: str) -> list[Result]:
+        """Give up the sensor's place, since its newest scan needs none; return the result that waited, if any."""
+        overtaken = self._waiting.pop(sensor, None) if self._waiting else None
+        return [] if overtaken is None else [replace(overtaken[0], state="dropped")]
+
+    def take(self, longest_us: float | None) -> list[tuple[Result, Due]]:
+        """Return those that have waited longest, one at least, as many as are inferred in so long, in [us].
+
+        Of calls that are needed for all of them, each takes as many.
+        """
+        count = len(self._waiting)
+        if longest_us is not None and count:
+            count = math.ceil(count / max(1, math.ceil(count * self._pattern_us / longest_us)))
+        return [self._waiting.pop(sensor) for sensor in list(self._waiting)[:count]]
+
+    def took(self, pattern_us: float) -> None:
+        """Learn the time that each pattern of a call took, in [us]."""
+        self._pattern_us += (SMOOTHING if self._pattern_us else 1.0) * (pattern_us - self._pattern_us)

@@ -1,8 +1,8 @@
 """Result of a scan with a pattern: which taps it is made from, whether it is believed, and what follows from it."""
 
 import math
+import sys
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from edge.inference.contract import Contract
 from edge.inference.expected_error import Expected, expect
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import widening
-from edge.perception.pattern_check import SAME_STRENGTH, first_stranger
-from edge.perception.result import Result
+from edge.perception.pattern_check import SAME_STRENGTH, strangers
+from edge.perception.result import Result, replace
 from edge.perception.sensor_state import Sensor
 from edge.perception.wrench import wrench_of
 from firmware_bridge.pad_geometry import SensorGeometry
@@ -27,7 +27,8 @@ def with_taps_that_belong(
 ) -> Result:
     """Return the result with fewer taps where an earlier one does not belong to the contact.
 
-    A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
+    A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun. Which
+    taps go with it is stated by edge.perception.pattern_check.strangers.
 
     Args:
         result: still without a pattern.
@@ -39,15 +40,29 @@ def with_taps_that_belong(
     if sensor.check is None or result.taps_used < 2:
         return result
     belonging = tuple(sensor.check.belonging(window, result.taps_used, result.poses))
-    stranger = first_stranger(belonging)
-    if stranger is None:
-        return replace(result, tap_mismatch=belonging)
-    if window[0, 2].sum() >= SAME_STRENGTH * window[stranger, 2].sum():
-        sensor.taps.keep(slots[stranger] - 1)
-        which = "the tap before does" if stranger == 1 else f"taps from the {stranger}. before on do"
-        sensor.report("tap_dropped", f"{which} not belong to this contact, and is forgotten")
-    poses = None if result.poses is None else result.poses[:stranger]
-    return replace(result, tap_mismatch=belonging, taps_used=stranger, window=counts[:stranger], poses=poses)
+    posed = result.pose is not None and result.poses is not None
+    dropped = strangers(belonging, posed=posed)
+    if not dropped:
+        return replace(result, tap_mismatch=belonging, taps_dropped=0)
+    settled = [
+        number
+        for number in (dropped if posed else dropped[:1])
+        if window[0, 2].sum() >= SAME_STRENGTH * window[number, 2].sum()
+    ]
+    for number in settled:
+        sensor.report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
+    if settled:
+        sensor.taps.forget([slots[one] for one in settled] if posed else range(slots[settled[0]], sys.maxsize))
+    kept = [number for number in range(result.taps_used) if number not in dropped]
+    poses = None if result.poses is None else result.poses[kept]
+    taps = {"taps_used": len(kept), "taps_dropped": len(dropped)}
+    return replace(result, tap_mismatch=belonging, window=counts[kept], poses=poses, **taps)
+
+
+def _which(number: int, *, alone: bool) -> str:
+    if number == 1:
+        return "the tap before does"
+    return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"
 
 
 def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32], *, fallback: bool) -> Result:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
-from edge.perception.pattern_check import REASONS, dropped_taps
+from edge.perception.pattern_check import REASONS
 from edge.perception.result import NextTap, Result, mask_bits
 from edge.perception.wrench import Wrench
 from firmware_bridge.poses.pad_pose import PadPose
@@ -193,8 +193,8 @@ FIELDS: Final = (
           "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
     Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
           "linear estimate that replaces one that is not to be believed", byte=600),
-    Field("taps_dropped", _SMALL_OR_NOT, "tap_mismatch", "earlier taps that the pattern is made "
-          "without, because they do not belong to this contact; unknown without earlier taps", make=dropped_taps,
+    Field("taps_dropped", _SMALL_OR_NOT, "taps_dropped", "earlier taps that the pattern is made "
+          "without, because they do not belong to this contact; unknown without earlier taps",
           out=_RECORD_NPZ, byte=604),
     Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
           "noise, gains and drift", decimals=4, byte=584),

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
 from edge.perception.next_tap import NextTapFinder, TapAdvice
 from edge.perception.pattern_check import REPEATS, PatternCheck
-from edge.perception.pattern_input import Due
+from edge.perception.pattern_input import Due, DueQueue
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
-from edge.perception.result import MADE, Result
+from edge.perception.result import Result, replace
 from edge.perception.scan_notes import OLD_NS, age_notes, notes_on_missing
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_poses import TapPoses
@@ -32,6 +31,7 @@ from firmware_bridge.poses.pose_track import PoseTrack
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.stillness import STILL_COUNTS
 from firmware_bridge.zeroing.baseline import Baseline
 
 
@@ -90,6 +90,7 @@ class Runtime:
         if options.taps is not None and options.taps > contract.taps:
             raise UsageError(f"taps is {options.taps}, but model '{model.name}' takes {contract.taps} at most")
         self._model = model
+        self.unposed = None if contract.takes_poses else model.name  # it reports to a user who states poses
         self._taps = contract.taps if options.taps is None else options.taps
         self._events: list[Untimed] = []
         self._source: SourceKind = source
@@ -109,11 +110,18 @@ class Runtime:
         # Plain attributes, since every scan reads them.
         self._every_scan, self._every_tap = options.every_scan, options.every_tap
         self._follow_drift, self._fallback = options.follow_drift, options.fallback
+        # Twice what all taxels may change by unseen together, for sensors whose mounting has gains.
+        self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
         self._clock_ns = clock_ns
         self._unix_time_s = unix_time_s
         self._sensors: dict[str, Sensor] = {}
+        self._queue = DueQueue()
         self._tracks: dict[str | None, PoseTrack] = {}
         self._new_tracker()
+
+    def __repr__(self) -> str:
+        sensors = ", ".join(self._sensors) or "none so far"
+        return f"<Runtime of {self._model.name}, {self._source}, sensors: {sensors}>"
 
     @property
     def expected(self) -> frozenset[str]:
@@ -158,6 +166,12 @@ class Runtime:
         """
         return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
 
+    def rests(self, result: Result) -> bool:
+        """Return True if no contact can begin while no reading of the sensor changes by more than noise."""
+        counts = result.force_counts
+        seen_counts = self._options.contact_on_counts - self._hidden_counts
+        return result.state == "idle" and counts is not None and counts < seen_counts
+
     def lose_touch(self, sensors: str = "") -> None:
         """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.
 
@@ -172,36 +186,45 @@ class Runtime:
         self._events.append(Untimed(kind, None, detail))
 
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
-        """Make the result of one scan; see `push_together`."""
-        return self.push_together([(scan, infer)])[0]
+        """Make the result of one scan, inferred at once if it is in contact and `infer` is true; raises as `infer`."""
+        result, due = self._follow(scan)
+        if due is None or not infer:
+            return result if due is None else replace(result, state="dropped")
+        same = None if self._every_scan else due.unchanged(result)
+        return same or self._infer([(result, due)])[0]
 
-    def push_together(self, scans: Sequence[tuple[Scan, bool]]) -> list[Result]:
-        """Make the results of scans, in their order; all patterns that are due are inferred in one call.
+    def take(self, scan: Scan) -> list[Result]:
+        """Take a scan and return the results that are ready, in the order of their scans.
 
-        Args:
-            scans: each with whether it is inferred if it is in contact. A scan that a newer one of its sensor has
-                overtaken is not inferred; its tap is followed all the same.
+        A scan that needs a pattern waits for `infer`. If the next one of its sensor comes first, its result is ready
+        without a pattern, and the newer scan takes its place: no sensor waits longer because it sends more.
 
         Raises:
-            WindowError: a scan is not of this sensor geometry.
+            WindowError: the scan is not of this sensor geometry.
+        """
+        result, due = self._follow(scan)
+        same = None if due is None or self._every_scan else due.unchanged(result)
+        if due is None or same is not None:
+            return [*self._queue.leave(scan.sensor), same or result]
+        return self._queue.join(scan.sensor, result, due)
+
+    @property
+    def waiting(self) -> int:
+        """Number of sensors whose newest scan waits for its pattern."""
+        return len(self._queue)
+
+    def infer(self, longest_us: float | None = None) -> list[Result]:
+        """Infer the patterns of the sensors that have waited longest, in one call, and return their results.
+
+        Args:
+            longest_us: time that the call may take, in [us], None for no limit; those that do not fit wait on.
+
+        Raises:
             ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
                 above zero.
         """
-        results: list[Result] = []
-        due: dict[int, Due] = {}
-        for scan, infer in scans:
-            result, touch = self._follow(scan)
-            if touch is not None:
-                if not infer:
-                    result = replace(result, state="dropped")
-                elif (same := self._unchanged(result, touch)) is not None:
-                    result = same
-                else:
-                    due[len(results)] = touch
-            results.append(result)
-        if due:
-            self._infer(due, results)
-        return results
+        due = self._queue.take(longest_us)
+        return self._infer(due) if due else []
 
     def _follow(self, scan: Scan) -> tuple[Result, Due | None]:
         """Return the result without a pattern, and the input of a pattern if one is due."""
@@ -268,7 +291,7 @@ class Runtime:
             taps_used=taps_used,
             window=None if due is None else due.window[:taps_used],
             poses=None if due is None else due.poses,
-            next_tap=None if advice is None else advice.proposal(contact=tap.contact, remembered=bool(tap.peaks)),
+            next_tap=None if advice is None else advice.proposal(tap),
             force_counts=force_counts,
             force_n=force_n,
             gains_certainty=sensor.gains_certainty,
@@ -287,46 +310,33 @@ class Runtime:
         sensor.events.clear()
         return events
 
-    def _unchanged(self, result: Result, due: Due) -> Result | None:
-        """Return the result with the last pattern, or None if a new pattern is needed."""
-        before = due.sensor.last
-        if self._every_scan or before is None:
-            return None
-        if not due.sensor.last_reading.holds(due.window[0], due.made_by, due.poses):
-            return None
-        made = {name: getattr(before, name) for name in MADE}
-        # The pattern may be of fewer taps than there are, where one did not belong.
-        window = None if result.window is None else result.window[: before.taps_used]
-        made |= {"taps_used": before.taps_used, "poses": before.poses, "reused_from": before.scan.number}
-        return replace(result, **made, window=window)
-
-    def _infer(self, due: Mapping[int, Due], results: list[Result]) -> None:
-        """Put the patterns that are due into their results."""
+    def _infer(self, waiting: Sequence[tuple[Result, Due]]) -> list[Result]:
+        """Return results with the patterns that are due, inferred in one call."""
         contract = self._model.contract
         start_ns = self._clock_ns()
+        results: list[Result] = []
         windows: list[NDArray[np.float32]] = []
-        pads: list[NDArray[np.float32]] = []
-        poses: list[NDArray[np.float32]] = []
-        for index, touch in due.items():
+        for result, touch in waiting:
             window = contract.scale_window(touch.window[: contract.taps], touch.sensor.gains)
-            made = with_taps_that_belong(results[index], touch.sensor, touch.window, window, touch.slots)
-            results[index] = made
+            made = with_taps_that_belong(result, touch.sensor, touch.window, window, touch.slots)
+            results.append(made)
             if made.poses is None:
                 window[made.taps_used :] = 0
             else:
-                window = window[: made.taps_used]
-                poses.append(made.poses)
+                if made.taps_used < len(window) and made.window is not None:
+                    window = contract.scale_window(made.window, touch.sensor.gains)
             windows.append(window)
-            pads.append(touch.sensor.pad_row)
-        given = (windows, pads, poses) if contract.takes_poses else (windows, pads)
-        patterns = self._model.run_together(*given)
+        pads = [touch.sensor.pad_row for _, touch in waiting]
+        poses = [made.poses for made in results if made.poses is not None]
+        patterns = self._model.run_together(windows, pads, *([poses] if contract.takes_poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
+        self._queue.took(run_time_us / len(waiting))
         deviations, tractions = self._model.deviation, self._model.traction
-        for row, (index, touch) in enumerate(due.items()):
+        for row, (_, touch) in enumerate(waiting):
             deviation = None if deviations is None else deviations[row].copy()
             traction = None if tractions is None else tractions[row].copy()
             made = replace(
-                results[index],
+                results[row],
                 state="contact",
                 pattern=patterns[row].copy(),
                 deviation=deviation,
@@ -339,11 +349,12 @@ class Runtime:
             sensor.last = made
             sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
             sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
-            results[index] = made
+            results[row] = made
             if sensor.advice is not None:
-                sensor.advice.see(made)
+                sensor.advice.see(made, touch.tap)
             if sensor.follower is not None and sensor.follower.see(made, touch.window[0]):
                 sensor.learn(contract)
+        return results
 
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor

@@ -1,4 +1,4 @@
-"""Notes on the scans of a sensor: that readings were old when they arrived, or that a stored setting is missing."""
+"""Notes on the scans of a sensor: old readings, patterns that were ready late, and stored settings that are missing."""
 
 from collections.abc import Collection
 from typing import Final
@@ -23,6 +23,11 @@ def age_notes(scan: Scan) -> tuple[Note, ...]:
     if scan.time_ns - scan.device_ns <= OLD_NS:
         return ()
     return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it arrived"),)
+
+
+def waited_note(waited_ns: int) -> Note:
+    """Return the note on a pattern that was ready more than OLD_NS after its newest reading arrived, in [ns]."""
+    return Note("late", f"this pattern was ready {waited_ns / 1e9:.2f} s after its newest reading arrived")
 
 
 def notes_on_missing(sensor: str, mounted: Collection[str], zeroed: Collection[str]) -> tuple[Note, ...]:

@@ -6,6 +6,7 @@ taps are remembered by their peaks.
 """
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -99,11 +100,13 @@ class TapTracker:
         self._tap_scans = 0
         self._peak_counts, self._peak_ns = -math.inf, 0
 
-    def keep(self, earlier: int) -> None:
-        """Forget the earlier taps but for the newest `earlier` ones."""
-        self._earlier = min(self._earlier, earlier)
-        self._window[1 + self._earlier :] = 0
-        self._peaks = self._peaks[: self._earlier]
+    def forget(self, slots: Container[int]) -> None:
+        """Forget the earlier taps at these places of the window; those before them move up."""
+        kept = [slot for slot in range(1, 1 + self._earlier) if slot not in slots]
+        self._earlier = len(kept)
+        self._window[1 : 1 + len(kept)] = self._window[kept]
+        self._window[1 + len(kept) :] = 0
+        self._peaks = tuple(self._peaks[slot - 1] for slot in kept)
 
     def push(
         self,

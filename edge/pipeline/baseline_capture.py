@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable
-from typing import Final
 
 from edge.pipeline.scan_reader import Source
 from edge.terminal.progress_bar import Progress
@@ -13,9 +12,7 @@ from firmware_bridge.links.base import Notice
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
-
-FEWEST_RECORDED: Final = 30
-"""Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
+from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
 
 def take_baselines(

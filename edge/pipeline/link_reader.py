@@ -11,18 +11,21 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from firmware_bridge.links.base import Link, Notice
+from firmware_bridge.links.base import Link, Notice, Pace
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
 SHORTEST_POLL_S: Final = 0.001
 """Shortest time that the system's poll can wait, which counts in milliseconds."""
+UNASKED_S: Final = 0.01
+"""Time between two reads of several links, in [s], until another pace is asked for: while a model loads nobody needs
+their scans at once, and reading frame by frame would slow that down until the kernel had no room for more."""
 _WAKES: Final = 64
 
 HandOver = Callable[[Sequence[Notice | TimedPose], Sequence[Scan]], None]
@@ -30,10 +33,17 @@ HandOver = Callable[[Sequence[Notice | TimedPose], Sequence[Scan]], None]
 
 @dataclass(slots=True)
 class _Shared:
-    """Link that is read in the common thread, and the latest time of its next read on the monotonic clock."""
+    """Link that is read in the common thread.
+
+    Attributes:
+        link: the link.
+        due_s: latest time of its next read, on the monotonic clock.
+        listens: False where it is not read before.
+    """
 
     link: Link
-    due_s: float
+    due_s: float = 0.0
+    listens: bool = True
 
 
 class LinkReader:
@@ -52,6 +62,9 @@ class LinkReader:
             hand_over: takes the notices and poses of one link and then its scans; called from several threads.
             on_end: called when all is handed over, just before `reading` is done.
         """
+        self._links = links
+        if len(links) > 1:
+            self.set_pace(Pace(UNASKED_S))
         self._hand_over = hand_over
         self._on_end = on_end
         self._stop = threading.Event()
@@ -61,20 +74,25 @@ class LinkReader:
         self._poll = select.poll()
         self._poll.register(self._woken, select.POLLIN)
         self._shared: dict[int, _Shared] = {}
-        self._apart: dict[Future[None], tuple[Link, ThreadPoolExecutor, int]] = {}
+        self._apart: dict[Future[None], tuple[Link, threading.Thread]] = {}
         # A single link may wait without regard to others.
         self._alone = links[0] if len(links) == 1 else None
-        self._executor, thread_id = _new_thread("scan-reader")
         for link in links if self._alone is None else ():
             self._place(link)
-        self.thread_ids = (thread_id, *(apart_id for _, _, apart_id in self._apart.values()))
-        self.reading = self._executor.submit(self._read)
+        self.reading, self._thread = _started("scan-reader", self._read)
+        threads = [self._thread, *(thread for _, thread in self._apart.values())]
+        self.thread_ids = tuple(thread.native_id for thread in threads if thread.native_id is not None)
+
+    def set_pace(self, pace: Pace) -> None:
+        """Allow scans to come late."""
+        for link in self._links:
+            link.set_pace(pace)
 
     def close(self) -> None:
         """End all reading and all threads."""
         self._stop.set()
         self._wake()
-        self._executor.shutdown()
+        self._thread.join()
         self._waking.close()
         self._woken.close()
 
@@ -86,8 +104,8 @@ class LinkReader:
                 self._take_turns()
         finally:
             self._stop.set()
-            for _, executor, _ in self._apart.values():
-                executor.shutdown()
+            for _, thread in self._apart.values():
+                thread.join()
             self._on_end()
 
     def _take_turns(self) -> None:
@@ -113,13 +131,17 @@ class LinkReader:
             self._poll.unregister(before)
             del self._shared[before]
         if wait is not None:
-            if wait.descriptor not in self._shared:
+            shared = self._shared.get(wait.descriptor)
+            if shared is None:
                 self._poll.register(wait.descriptor, select.POLLIN)
-            self._shared[wait.descriptor] = _Shared(link, time.monotonic() + wait.longest_s)
+                shared = self._shared[wait.descriptor] = _Shared(link)
+            if wait.listens != shared.listens:
+                shared.listens = wait.listens
+                self._poll.modify(wait.descriptor, select.POLLIN if wait.listens else 0)
+            shared.due_s = time.monotonic() + wait.longest_s
         elif not link.ended:
-            executor, thread_id = _new_thread("link-reader")
-            reading = executor.submit(self._follow, link)
-            self._apart[reading] = link, executor, thread_id
+            reading, thread = _started("link-reader", lambda: self._follow(link))
+            self._apart[reading] = link, thread
             reading.add_done_callback(lambda _: self._wake())
 
     def _welcome_back(self) -> None:
@@ -131,8 +153,8 @@ class LinkReader:
         with suppress(BlockingIOError):
             self._woken.recv(_WAKES)
         for reading in [reading for reading in self._apart if reading.done()]:
-            link, executor, _ = self._apart.pop(reading)
-            executor.shutdown()
+            link, thread = self._apart.pop(reading)
+            thread.join()
             reading.result()
             self._place(link)
 
@@ -148,7 +170,9 @@ class LinkReader:
         try:
             scans = link.read(timeout_s)
         finally:  # its notices come also before its end
-            notices = [*link.notices(), *link.poses()]
+            notices: list[Notice | TimedPose] = [*link.notices()]
+            if link.kind != "device":  # recordings hold poses, and the demo's robot states some
+                notices += link.poses()
             if notices or scans:
                 self._hand_over(notices, scans)
 
@@ -157,7 +181,21 @@ class LinkReader:
             self._waking.send(b"!")
 
 
-def _new_thread(name: str) -> tuple[ThreadPoolExecutor, int]:
-    """Return an executor of one thread, and the system's number of the thread."""
-    executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
-    return executor, executor.submit(threading.get_native_id).result()
+def _started(name: str, read: Callable[[], None]) -> tuple[Future[None], threading.Thread]:
+    """Return the end of a function that a new thread runs, and the thread.
+
+    It is a daemon, unlike one of an executor, for which a program that forgets to close its source would wait for ever.
+    """
+    reading: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            read()
+        except BaseException as error:  # noqa: BLE001 - raised again where the end is awaited
+            reading.set_exception(error)
+        else:
+            reading.set_result(None)
+
+    thread = threading.Thread(target=run, name=name, daemon=True)
+    thread.start()
+    return reading, thread

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
+from edge.inference.bundled import POSED_MODEL
 from edge.perception.event import Event
 from edge.pipeline.pose_fields import PoseError
 from edge.pipeline.pose_queue import PoseQueue
@@ -41,18 +42,23 @@ class PoseIntake:
         dropped: poses that nobody took in time.
     """
 
-    def __init__(self, runtime: Posed, queue: PoseQueue, *, recorded: bool = False) -> None:
+    def __init__(
+        self, runtime: Posed, queue: PoseQueue, *, recorded: bool = False, unused_by: str | None = None
+    ) -> None:
         """Begin without a pose.
 
         Args:
             runtime: takes the poses.
             queue: of the poses that come from outside.
             recorded: scans are of another time than now, so that no pose of now belongs to them.
+            unused_by: name of the model, where neither it nor any sink uses poses.
         """
         self.used = 0
         self._runtime = runtime
         self._queue = queue
         self._recorded = recorded
+        self._unused_by = unused_by
+        self._played: set[str | None] = set()
         self._courses: dict[str | None, _Course] = {}
         self._reported_ns: dict[str, int] = {}
         self._events: list[Event] = []
@@ -74,12 +80,10 @@ class PoseIntake:
             now_ns: time now, or of the newest scan of a recording.
         """
         waiting = self._queue.take()
-        if self._recorded:
-            for _ in waiting:
-                self._queue.refuse(
-                    PoseError("recorded", "its scans are of a recording, which has poses of its own: add --paced")
-                )
-            waiting = []
+        if recorded:
+            self._played.update(one.sensor for one in recorded)
+        if waiting and (self._recorded or self._played):
+            waiting = [one for one in waiting if not self._refused_for_recording(one)]
         taken: list[TimedPose] = []
         for timed in (*recorded, *waiting):
             if self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
@@ -88,6 +92,9 @@ class PoseIntake:
                 earlier = f"that of the pose{_of(timed.sensor)} before"
                 text = f"its time, {timed.time_ns} ns, is not after {earlier}: send them in order"
                 self._queue.refuse(PoseError("order", text))
+        if waiting and self._unused_by is not None:
+            text = f"poses come, but model {self._unused_by} takes none, so that each pattern is of one tap"
+            self._queue.warn("model", f"{text}: give --model {POSED_MODEL} for more")
         self.used += len(taken)
         for timed in taken:
             self._follow(timed, now_ns)
@@ -110,6 +117,16 @@ class PoseIntake:
                 self._events.append(Event(now_ns, "poses_trouble", None, text))
         events, self._events = self._events, []
         return events
+
+    def _refused_for_recording(self, timed: TimedPose) -> bool:
+        if self._recorded:
+            why = "of another time than now: add --paced"
+        elif self._played & {timed.sensor, None}:
+            why = f"which has poses{_of(timed.sensor)} of its own"
+        else:
+            return False
+        self._queue.refuse(PoseError("recorded", f"its scans are of a recording, {why}"))
+        return True
 
     def _follow(self, timed: TimedPose, now_ns: int) -> None:
         before = self._courses.get(timed.sensor)

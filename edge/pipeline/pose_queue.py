@@ -57,7 +57,9 @@ class PoseQueue:
         if not isinstance(parsed, dict):
             self.refuse(PoseError("json", f'{text[:40]!a} is not JSON such as {{"x_mm": 1.5, "y_mm": 0}}'))
             return
-        self.put_fields({"sensor": sensor, **parsed}, now_ns)
+        if parsed.get("sensor") is None:
+            parsed["sensor"] = sensor
+        self.put_fields(parsed, now_ns)
 
     def refuse(self, error: PoseError) -> None:
         """Count a pose that cannot be taken."""

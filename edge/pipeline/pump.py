@@ -3,18 +3,13 @@
 import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from operator import attrgetter
-from typing import Any, Final
+from typing import Any
 
-from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from firmware_bridge.poses.timed_pose import TimedPose
-
-_UNWRITTEN: Final = attrgetter("unwritten")
 
 
 @contextmanager
@@ -37,7 +32,7 @@ def uncollected() -> Iterator[None]:
 
 
 def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: Statistics, **settings: Any) -> None:
-    """Write every result and event of a stream, with the counters, into sinks until it ends.
+    """Run a stream into its sinks until it ends, without pauses for garbage collection.
 
     Args:
         source: open.
@@ -51,29 +46,13 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
         SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
         ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
     """
-
-    def tell(event: Event) -> None:
-        known = stream.counters
-        known["unwritten"] = statistics.unwritten = sum(map(_UNWRITTEN, sinks))
-        for sink in sinks:
-            sink.tell(event, known)
-
-    def pose(poses: Sequence[TimedPose]) -> None:
-        for sink in sinks:
-            sink.pose(poses)
-
-    def wait() -> None:
-        for sink in sinks:
-            sink.wait()
-
-    stream = Stream(source, runtime, on_event=tell, on_poses=pose, on_wait=wait, statistics=statistics, **settings)
+    settings = {"patience_s": min((sink.patience_s for sink in sinks), default=0.0), **settings}
+    stream = Stream(source, runtime, sinks=sinks, statistics=statistics, **settings)
     with uncollected():
         try:
-            for result in stream:
-                known = stream.counters
-                known["unwritten"] = statistics.unwritten = sum(map(_UNWRITTEN, sinks))
-                for sink in sinks:
-                    sink.write(result, known)
+            for _ in stream:
+                pass
         finally:
-            statistics.unwritten = sum(map(_UNWRITTEN, sinks))  # what the last ones left out belongs to the run, too
+            # What the last ones left out belongs to the run, too.
+            statistics.unwritten = sum(sink.unwritten for sink in sinks)
             statistics.sink_trouble = "; ".join(sink.trouble for sink in sinks if sink.trouble is not None) or None

@@ -1,37 +1,65 @@
 """Recording as a source, with what it stores of its sensors."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import Final
 
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import settled, with_recorded
 from edge.terminal.progress_bar import Progress
+from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.links.replay_player import PlayedReplay, Player
 from firmware_bridge.pad_geometry import PADS, SensorGeometry
 from firmware_bridge.recording.formats import npz_baselines
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.sensor_file.model import SensorEntry
-from firmware_bridge.zeroing.baseline import Baseline
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline
+from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
+
+_HELD: Final = (
+    ". Its readings hardly change: either nothing touches the pad, or it holds something all the time. If it does, "
+    "pass --baseline of the free pad, such as edge-sr baseline makes of another recording"
+)
 
 
 def open_recording(
-    path: str | Path,
-    *,
+    *files: str | Path,
     sensor: str | Path | None,
     zero: bool,
     paced: bool,
     rate_hz: float | None,
     bar: bool = False,
+    player: Player | None = None,
 ) -> Source:
-    """Return the source that plays a recording, as edge.api.open_recording does; `bar` shows its progress."""
-    paths = recording_paths(str(path))
-    replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced)
+    """Return the source that plays recordings, as edge.api.open_recording does.
+
+    Args:
+        files: each FILE[,FILE].
+        sensor: sensor file, used instead of the recorded settings.
+        zero: zero as a live run does, instead of using recorded baselines, or those of free stretches.
+        paced: play at the recorded speed, as if live.
+        rate_hz: scans a second of each sensor.
+        bar: show the progress.
+        player: controls it, endless.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+        SourceError: its rate is unknown or out of range.
+        SensorFileError: the sensor file cannot be used.
+    """
+    paths = [path for file in files for path in recording_paths(str(file))]
+    if player is not None:
+        replay = PlayedReplay(paths, player, rate_hz)
+    else:
+        replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     # A sensor file names the pad; without one the recording's grid does.
     pad = tracks[0].geometry
@@ -40,6 +68,8 @@ def open_recording(
     recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
     mountings = known.mountings
+    if not zero:
+        baselines = free_baselines(replay, mountings, baselines) | dict(baselines)
     sensors = {*mountings, *baselines}
     if sensor is None:  # else a note reports the sensors that the file lacks
         sensors |= {track.sensor for track in tracks}
@@ -50,12 +80,80 @@ def open_recording(
             baselines.get(name),
             entry.pad,
             entry.learned,
+            frame=entry.frame,
         )
         for name in sorted(sensors)
         for entry in [known.sensors.get(name, SensorEntry())]
     }
     known = replace(known, sensors=entries)
     return Source(place_recordings(replay, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)
+
+
+def recorded_baselines(text: str, known: SensorFile, rate_hz: float | None) -> tuple[dict[str, Baseline], list[str]]:
+    """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
+
+    Args:
+        text: the files.
+        known: settings of the sensors.
+        rate_hz: scans a second of each sensor, where a file does not state it.
+
+    Raises:
+        BaselineRefusedError: a pad is nowhere free and still.
+        RecordingError: a recording cannot be used.
+        SourceError: its rate is unknown or out of range.
+    """
+    replay = ReplayLink(recording_paths(text), rate_hz)
+    baselines = free_baselines(replay, with_recorded(known, [replay]).mountings, opening=True)
+    sensors = {track.sensor for recording in replay.recordings for track in recording.tracks}
+    notes = [notice.text for notice in replay.notices()]
+    if sensors - baselines.keys():
+        faults = "; ".join(note for note in notes if ": zeroed from " not in note)
+        raise BaselineRefusedError(faults or f"fewer than {FEWEST_RECORDED} scans: expected as many of a free pad")
+    return baselines, notes
+
+
+def free_baselines(
+    replay: ReplayLink,
+    mountings: Mapping[str, Mounting],
+    known: Mapping[str, Baseline] = MappingProxyType({}),
+    *,
+    opening: bool = False,
+) -> dict[str, Baseline]:
+    """Return the baselines of the sensors without one that the recordings are free and still for, and note where.
+
+    Args:
+        replay: of the recordings; gets a note for each sensor.
+        mountings: those of taxels that still have to be put in place.
+        known: baselines that there are.
+        opening: also of a stretch from which a live run would zero by itself: the first scans.
+    """
+    baselines: dict[str, Baseline] = {}
+    for recording in replay.recordings:
+        raw = recording.path.suffix.lower() == ".csv"
+        for track in recording.tracks:
+            name = track.sensor
+            if name in known or len(track.counts) < FEWEST_RECORDED:
+                continue
+            try:
+                stretch = free_stretch(track.counts)
+            except BaselineRefusedError as refusal:
+                replay.notes.append(f"sensor {name}: {refusal}")
+                continue
+            if stretch.opens and not opening:
+                if not stretch.touched:
+                    replay.notes.append(f"sensor {name}: zeroed from its first {FEWEST_SCANS} scans{_HELD}")
+                continue
+            first, last = int(stretch.rows[0]), int(stretch.rows[-1])
+            at_ns = replay.times_ns(name)[[first, last]]
+            replay.notes.append(
+                f"sensor {name}: zeroed from its scans {first + 1} to {last + 1}, {at_ns[0] / 1e9:.1f} to "
+                f"{at_ns[1] / 1e9:.1f} s, where the pad is still and pressed least{'' if stretch.touched else _HELD}"
+            )
+            if raw and name in mountings:
+                stretch = stretch._replace(counts=mountings[name].place_counts(stretch.counts))
+            created_s = (replay.first_ns + int(at_ns[1]) + (recording.unix_offset_ns or 0)) / 1e9
+            baselines[name] = stretch.baseline(name, created_s)
+    return baselines
 
 
 def _named(pad: SensorGeometry) -> str | ModelMap:

@@ -1,40 +1,40 @@
-"""Stream of the results of a source, one for every scan."""
+"""Stream of the results of a source: every one, or the newest."""
 
-import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from numbers import Real
 
-from edge.errors import UsageError
+from edge.errors import NoResultError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.pipeline.commands import Commands, obey
-from edge.pipeline.deadline import Deadline
-from edge.pipeline.gain_keeper import GainKeeper
+from edge.pipeline.commands import Commands
+from edge.pipeline.latest import Latest, NewestResults
 from edge.pipeline.pose_fields import PoseError, pose_of_fields
-from edge.pipeline.pose_intake import PoseIntake
-from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.result_rounds import Rounds
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.silence import Silence
+from edge.pipeline.sink import Sink
 from edge.validation import check_positive
-from firmware_bridge.links.base import Notice
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
-from firmware_bridge.poses.timed_pose import TimedPose
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
 
 class Stream:
-    """Iterator over the results of a source, until it ends, `stop` is set or `duration_s` is over.
+    """Results of a source, one for every scan, until it ends, `stop` is set or `duration_s` is over.
 
+    A loop over it gets every result in order; `latest` and `read` return the newest, and leave out those before it.
     Of the scans that wait, the newest of each sensor gets a pattern; the older ones get their result without one.
-    Everything happens in the thread that iterates: between two results the runtime may be asked to zero or to reset.
+    Patterns of several sensors are made in one call, or in several that are short enough, the sensor that has waited
+    longest first. Results of one sensor stay in the order of its scans.
+    A result is made in the thread that asks for it: between two calls the runtime may be asked to zero or to reset.
     Any thread may state poses. A sensor that has a baseline or counts per newton, and of which no scan arrives, is
-    reported as an event. A loop that was left may be continued by another, from the next result on.
+    reported as an event. A loop that was left may be continued by another, from the next result on. Closing the source
+    closes its streams.
 
     Attributes:
         statistics: of the results so far.
@@ -45,29 +45,30 @@ class Stream:
         source: Source,
         runtime: Runtime,
         *,
+        sinks: Sequence[Sink] = (),
         on_event: Callable[[Event], object] = lambda event: None,
-        on_poses: Callable[[Sequence[TimedPose]], object] = lambda poses: None,
-        on_wait: Callable[[], object] = lambda: None,
         stop: threading.Event | None = None,
         duration_s: float | None = None,
         commands: Commands | None = None,
         statistics: Statistics | None = None,
+        patience_s: float = 0.0,
         clock_s: Callable[[], float] = time.monotonic,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare to iterate.
+        """Prepare to make results.
 
         Args:
             source: open.
             runtime: makes the results.
+            sinks: open; they get every result and event, and the poses, before anything else does. Their counters are
+                the stream's.
             on_event: called with each event, in its place between results.
-            on_poses: called with the poses that the runtime has taken, before the results that are made with them.
-            on_wait: called several times a second while no scan comes.
             stop: ends the stream after the scans in hand.
             duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
                 results are made, measured in the time of the recording.
             commands: polled between scans.
             statistics: filled on the way, so that they are available however the stream ends.
+            patience_s: longest time for which results of sensors at rest may wait, in [s]: contact ends that at once.
             clock_s: monotonic, in [s].
             clock_ns: clock of the scans, in [ns].
 
@@ -76,39 +77,50 @@ class Stream:
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)
-        self.statistics = Statistics() if statistics is None else statistics
         self._source = source
-        self._runtime = runtime
-        self._on_event = on_event
-        self._on_poses = on_poses
-        self._on_wait = on_wait
-        self._stop = threading.Event() if stop is None else stop
-        self._duration_s = duration_s
-        self._commands = commands
-        self._poses = PoseQueue() if commands is None else commands.poses
-        self._intake = PoseIntake(runtime, self._poses, recorded=source.patient)
-        self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
-        self._deadlines: dict[str, Deadline] = {}
-        self._now_ns = 0
+        self._newest = NewestResults()
+
+        def tell(event: Event) -> None:
+            self._newest.tell(event)
+            on_event(event)
+
+        self._rounds = Rounds(
+            source,
+            runtime,
+            sinks=sinks,
+            on_event=tell,
+            stop=stop,
+            duration_s=duration_s,
+            commands=commands,
+            statistics=statistics,
+            patience_s=patience_s,
+            clock_s=clock_s,
+            clock_ns=clock_ns,
+        )
+        self.statistics = self._rounds.statistics
+        self._running = self._rounds.run()
+        self._made: deque[Result] = deque()
+        self._between = True
+        self._error: Exception | None = None
+        self._turn = threading.RLock()
+        self._worker: ThreadPoolExecutor | None = None
         self._clock_s = clock_s
         self._clock_ns = clock_ns
-        path = None if source.kind == "replay" else source.sensor_file.path
-        self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
-        self._running = self._run()
+        source.before_close(self._close)
+
+    def __repr__(self) -> str:
+        statistics = self.statistics
+        return f"<Stream of {self._source.name}: {statistics.scans} scans, {statistics.patterns} patterns>"
+
+    @property
+    def ended(self) -> bool:
+        """True once there are no more results to make."""
+        return self._newest.ended
 
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        statistics = self.statistics
-        counters = self._source.counters()
-        counters["dropped"] = statistics.dropped
-        counters["overruns"] = statistics.overruns
-        counters["late"] = statistics.late
-        counters["missed"] = statistics.missed
-        counters["poses"] = statistics.poses
-        counters["poses_refused"] = statistics.poses_refused
-        counters["poses_dropped"] = statistics.poses_dropped
-        return counters
+        return self._rounds.counters
 
     def pose(
         self,
@@ -146,132 +158,157 @@ class Stream:
         fields = {name: float(value) if isinstance(value, Real) else value for name, value in numbers.items()}
         fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
         try:
-            self._poses.put(pose_of_fields(fields, now_ns))
+            self._rounds.poses.put(pose_of_fields(fields, now_ns))
         except PoseError as error:
             raise UsageError(f"a pose: {error}") from error
 
     def __iter__(self) -> Iterator[Result]:
-        """Return the results, from the next one on; raises as `__next__` does."""
-        return self._running
-
-    def __next__(self) -> Result:
-        """Return the next result as soon as it is made.
+        """Yield every result as soon as it is made, from the next one on.
 
         Raises:
             LinkLostError: after every scan before it got its result.
             ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
+            SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
         """
-        return next(self._running)
-
-    def _run(self) -> Iterator[Result]:
-        try:
-            yield from self._made()
-        finally:
-            if self._keeper is not None:
-                self._keeper.close()
-                if self._keeper.trouble is not None:
-                    detail = f"learned gains are not kept: {self._keeper.trouble}"
-                    self._tell(Event(self._clock_ns(), "note", None, detail))
-
-    def _made(self) -> Iterator[Result]:
-        for taken in self._taken():
-            if self._commands is not None:
-                obey(self._commands, self._runtime)
-                self.statistics.commands_refused = self._commands.refused
-            self._take_poses(taken)
-            scans: list[Scan] = []
-            for one in taken:
-                if isinstance(one, Scan):
-                    scans.append(one)
-                    continue
-                if isinstance(one, TimedPose):
-                    continue
-                yield from self._results(scans)
-                self._heed(one)
-                scans = []
-            yield from self._results(scans)
-            for event in self._silence.look():
-                self._tell(event)
-            if not taken:
-                self._on_wait()
-
-    def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
-        """Pass poses on to the runtime: those from outside, and those of the source."""
-        recorded = [one for one in taken if isinstance(one, TimedPose)]
-        if not (recorded or self._poses.begun or self._intake.used):
-            return
-        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
-        first_ns = min(times_ns, default=None)
-        if not self._source.patient:
-            self._now_ns = self._clock_ns()
-        elif first_ns is not None:
-            self._now_ns = first_ns
-        intake, statistics = self._intake, self.statistics
-        poses = intake.take(recorded, first_ns, self._now_ns)
-        statistics.poses, statistics.poses_refused = intake.used, intake.refused
-        statistics.poses_dropped = intake.dropped
-        if poses:
-            self._on_poses(poses)
-        for event in intake.look(self._now_ns):
-            self._tell(event)
-
-    def _taken(self) -> Iterator[list[Scan | Notice | TimedPose]]:
-        """Yield the scans, notices and poses of the source, until it ends, `stop` is set, or the time is over.
-
-        A patient source's time is that of its scans.
-        """
-        length_s = math.inf if self._duration_s is None else self._duration_s
-        begun_s = self._clock_s()
-        first_ns: int | None = None
-        while not self._stop.is_set() and (self._source.patient or self._clock_s() - begun_s < length_s):
-            taken = self._source.take(POLL_S)
-            self.statistics.overruns = self._source.overruns
-            if taken is None:
+        while True:
+            while self._made:  # left by a task that was cancelled
+                yield self._next_made()
+            if self._newest.ended:
                 return
-            for one in taken if self._source.patient else ():  # one scan at most
-                if isinstance(one, Scan):
-                    first_ns = one.time_ns if first_ns is None else first_ns
-                    if one.time_ns - first_ns >= length_s * 1e9:
-                        return
-            yield taken
+            result = self._step(POLL_S, on=True)
+            if result is not None:
+                self._newest.pass_on(result)
+                yield result
 
-    def _results(self, scans: Sequence[Scan]) -> Iterator[Result]:
-        if not scans:
-            return
-        newest = {scan.sensor: scan for scan in scans}
-        results = self._runtime.push_together([(scan, newest[scan.sensor] is scan) for scan in scans])
-        done_ns = self._clock_ns()
-        for name, pad in self._runtime.take_learned().items():
-            if self._keeper is not None:
-                self._keeper.keep(name, pad)
-        for result in results:
-            yield self._follow(result, done_ns)
+    async def __aiter__(self) -> AsyncIterator[Result]:
+        """Yield every result as `__iter__` does, beside other tasks; nothing is lost where one of them cancels it."""
+        while True:
+            while self._made:
+                yield self._next_made()
+            if self._newest.ended:
+                return
+            await self._step_beside()
 
-    def _follow(self, result: Result, done_ns: int) -> Result:
-        """Count a result that was ready at `done_ns`."""
-        scan, statistics = result.scan, self.statistics
-        deadline = self._deadlines.get(scan.sensor)
-        if deadline is None:
-            deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
-        if not scan.unread_ns:  # scans that waited unread came at no pace
-            deadline.follow(scan.time_ns)
-        back = self._silence.follow(scan, deadline.period_ns)
-        if result.pattern is not None and not self._source.patient:  # its scans have another clock
-            statistics.late += deadline.check(scan.time_ns, done_ns)
-            result = replace(result, latency_us=(done_ns - scan.time_ns) / 1e3)
-        statistics.add(result)
-        statistics.missed = self._silence.missed
-        if back is not None:
-            self._tell(back)
+    def latest(self, sensor: str | None = None) -> Latest:
+        """Return the newest result of a sensor, with its age and the state of its link; never waits for a scan.
+
+        It makes the results of the scans that have arrived since the last call. Results before the newest are skipped,
+        and counted; sinks get them all.
+
+        Args:
+            sensor: name of the sensor, such as "4" or "left/4"; None for the only one.
+
+        Raises:
+            UsageError: no sensor is named, and there are several; or the source is a recording that is not paced.
+            LinkLostError: and other errors, as `__iter__` does, now and at every later call.
+        """
+        self._round(0.0)
+        return self._taken_newest(sensor)
+
+    def latest_of_all(self) -> dict[str, Latest]:
+        """Return the newest result of every sensor that has sent a scan, by name; otherwise as `latest`."""
+        self._round(0.0)
+        self._made.clear()
+        now_ns = self._clock_ns()
+        return {name: self._newest.take(name, now_ns) for name in self._newest.sensors}
+
+    def read(self, sensor: str | None = None, *, timeout_s: float = 1.0) -> Latest:
+        """Return the newest result of a sensor, after waiting for one that no earlier call returned.
+
+        Args:
+            sensor: as in `latest`.
+            timeout_s: longest wait, in [s].
+
+        Raises:
+            NoResultError: none came in time, or no more will come.
+            UsageError: and other errors, as `latest` does.
+        """
+        end_s = self._end_s(timeout_s)
+        while not self._newest.has_new(sensor):
+            self._round(min(POLL_S, self._left_s(end_s, sensor)))
+        return self._taken_newest(sensor)
+
+    async def read_async(self, sensor: str | None = None, *, timeout_s: float = 1.0) -> Latest:
+        """Return what `read` does, beside other tasks; one of them may cancel it at any time."""
+        end_s = self._end_s(timeout_s)
+        while not self._newest.has_new(sensor):
+            await self._step_beside(min(POLL_S, self._left_s(end_s, sensor)))
+        return self._taken_newest(sensor)
+
+    def _end_s(self, timeout_s: float) -> float:
+        check_positive("timeout_s", timeout_s)
+        return self._clock_s() + timeout_s
+
+    def _left_s(self, end_s: float, sensor: str | None) -> float:
+        left_s = end_s - self._clock_s()
+        if left_s <= 0 or self._newest.ended:
+            name = "" if sensor is None else f" of sensor {sensor}"
+            raise NoResultError(f"no new result{name}: {self._newest.why_none(sensor)}")
+        return left_s
+
+    def _taken_newest(self, sensor: str | None) -> Latest:
+        latest = self._newest.take(sensor, self._clock_ns())
+        self._made.clear()
+        return latest
+
+    def _next_made(self) -> Result:
+        result = self._made.popleft()
+        self._newest.see(result)
         return result
 
-    def _heed(self, notice: Notice) -> None:
-        """Forget readings and taps from before an outage, and report the notice as an event."""
-        if notice.kind in ("lost", "silent", "back"):
-            self._runtime.lose_touch(notice.sensors)
-            self._silence.begin_anew(notice.time_ns, notice.sensors)
-        self._tell(Event.of(notice))
+    def _round(self, wait_s: float) -> None:
+        """Make the results of the scans that wait, after waiting at most `wait_s` for them."""
+        if self._source.patient:
+            raise UsageError(
+                f"{self._source.name} is a recording that is read as fast as its results are made, without a latest "
+                "one: iterate over the stream, or open it with paced=True"
+            )
+        for _ in range(1 if self._between else 2):  # results of the last round may be left
+            while (result := self._step(wait_s)) is not None:
+                self._newest.add(result)
 
-    def _tell(self, event: Event) -> None:
-        self.statistics.tell(event)
-        self._on_event(event)
+    def _step(self, wait_s: float, *, on: bool = False) -> Result | None:
+        """Make the next result, `on` into the next round; None at the end of a round, and where there are no more."""
+        with self._turn:
+            if self._error is not None:
+                raise self._error.with_traceback(None)  # else every call would lengthen it
+            self._rounds.wait_s = wait_s
+            try:
+                result = next(self._running)
+                if result is None and on:
+                    result = next(self._running)
+            except StopIteration:
+                self._newest.ended = True
+                result = None
+            except Exception as error:
+                self._error = error
+                raise
+            self._between = result is None
+            return result
+
+    def _keep_step(self) -> None:
+        """Make the next result, if scans wait, and keep it for the task that asked, or for the one after it."""
+        result = self._step(0.0)
+        if result is not None:
+            self._newest.add(result)
+            self._made.append(result)
+
+    async def _step_beside(self, wait_s: float = POLL_S) -> None:
+        """Make the next result in a thread, once scans wait; the result stays here if the task is cancelled."""
+        import asyncio
+
+        if self._between and not self._source.patient:
+            await self._source.heard(wait_s)
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
+        await asyncio.get_running_loop().run_in_executor(self._worker, self._keep_step)
+
+    def _close(self) -> None:
+        """End the stream; its sinks, which may be closed by now, get nothing more."""
+        if self._worker is not None:
+            self._worker.shutdown()
+        self._rounds.sinks = ()
+        with self._turn, suppress(ValueError):  # a callback that closes the source is still within the generator
+            self._made.clear()
+            self._running.close()
+            self._error = UsageError(f"source {self._source.name} is closed: results that were left are old")

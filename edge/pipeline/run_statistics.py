@@ -18,6 +18,7 @@ STAGES: Final = ("zeroing", "incomplete", "idle", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 LONGEST_US: Final = 2.0**26
 """Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
+NO_CONTACT: Final = "no contact: its readings never reached --contact-on-counts over the baseline"
 
 
 class Histogram:
@@ -191,7 +192,7 @@ class Statistics:
             why = {
                 "zeroing": f"not zeroed, {result.note or 'too few scans'}; or pass --baseline, of the free pad",
                 "incomplete": result.note or "a taxel was not received",
-                "idle": None if self.patterns else "nothing touched it",
+                "idle": None if self.patterns else NO_CONTACT,
                 "dropped": "newer scans overtook all that were in contact",
             }.get(result.state)
             if why is not None:

@@ -1,8 +1,9 @@
 """Source of scans from links, read in threads of its own so that nothing waits for inference."""
 
+import atexit
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from queue import Empty, SimpleQueue
 from typing import Final, Self
@@ -11,7 +12,8 @@ from edge.errors import UsageError
 from edge.pipeline.link_reader import LinkReader
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.links.base import Link, Notice, Pace, SourceKind, one_origin
+from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile
@@ -31,6 +33,7 @@ class Source:
     Attributes:
         name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all their names.
         patient: True if the link waits for its reader, and its scans have another clock than now.
+        states_poses: True if poses of some sensors come with the scans, as in a recording.
         sensor_file: properties of its sensors.
         rate_hz: requested rate of each sensor, in [Hz]; None without.
         overruns: scans discarded.
@@ -60,6 +63,7 @@ class Source:
         _one_kind(links)
         self.name = ", ".join(link.name for link in links)
         self.patient = len(links) == 1 and links[0].patient
+        self.states_poses = any(link.states_poses for link in links)
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
         self.rate_hz = rate_hz
         self._force = force
@@ -73,12 +77,30 @@ class Source:
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
+        self._sleepers: list[Callable[[], None]] = []
         self._capacity_scans = capacity_scans
         self._through = False
         self._open = ExitStack()
         self._reader: LinkReader | None = None
 
+    def __repr__(self) -> str:
+        state = "closed" if self._closed else "open" if self._opened else "not open"
+        return f"<Source {self.name}, {state}>"
+
     def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def open(self) -> Self:
+        """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
+
+        Raises:
+            UsageError: it was opened before.
+            SensorFileError: the sensor file is of an emulated sensor, and this is a device.
+            BridgeError: a link cannot be opened.
+        """
         if self._opened:
             raise UsageError(f"source {self.name} was opened before: make another, with open_source")
         with ExitStack() as opening:
@@ -86,16 +108,23 @@ class Source:
                 opening.enter_context(link)
             refuse_emulated(self.sensor_file, _one_kind(self._links), self._force)  # some know their kind only now
             if not self.patient:
-                self._reader = LinkReader(self._links, self._put, lambda: self._bell.put(None))
+                self._reader = LinkReader(self._links, self._put, self._end)
                 self.thread_ids = self._reader.thread_ids
                 opening.callback(self._reader.close)
             self._open = opening.pop_all()
         self._opened = True
+        atexit.register(self.close)
         return self
 
-    def __exit__(self, *exc_info: object) -> None:
+    def close(self) -> None:
+        """End its streams, all reading and all threads, and close the links; closing twice does nothing."""
         self._closed = True
+        atexit.unregister(self.close)
         self._open.close()
+
+    def before_close(self, callback: Callable[[], object]) -> None:
+        """Register a function that is called when an open source is about to close."""
+        self._open.callback(callback)
 
     @property
     def kind(self) -> SourceKind:
@@ -107,6 +136,15 @@ class Source:
         if not self._opened:
             raise self._not_open()
         return self._links[0].kind
+
+    def steer(self) -> Callable[[PadPose | None], None] | None:
+        """Return the function by which the emulated robot of the demo is asked where to tap next; None without."""
+        return next((asked for link in self._links if (asked := link.steer()) is not None), None)
+
+    def set_pace(self, pace: Pace) -> None:
+        """Allow scans to come late. A recording, whose scans wait for their reader, has no use for it."""
+        if self._reader is not None:
+            self._reader.set_pace(pace)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received, skipped and missed items so far, by name; sums over all links."""
@@ -156,8 +194,30 @@ class Source:
             self._reader.reading.result()
         return None
 
+    async def heard(self, timeout_s: float) -> None:
+        """Return once something waits, or no more will come, or after `timeout_s`; other tasks run meanwhile."""
+        import asyncio
+
+        loop, woken = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake() -> None:
+            loop.call_soon_threadsafe(woken.set)
+
+        with self._lock:
+            if self._through or not self._bell.empty():
+                return
+            self._sleepers.append(wake)
+        try:
+            async with asyncio.timeout(timeout_s):
+                await woken.wait()
+        except TimeoutError:
+            pass
+        finally:
+            with self._lock:
+                self._sleepers.remove(wake)
+
     def _not_open(self) -> UsageError:
-        return UsageError(f"source {self.name} is not open: use it in a with statement")
+        return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")
 
     def _take_next(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
         (link,) = self._links
@@ -170,12 +230,21 @@ class Source:
     def _put(self, notices: Sequence[Notice | TimedPose], scans: Sequence[Scan]) -> None:
         with self._lock:
             if not self._waiting:
-                self._bell.put(None)
+                self._ring()
             self._waiting += notices
             for scan in scans:
                 if len(self._waiting) >= self._capacity_scans:
                     self._make_room()
                 self._waiting.append(scan)
+
+    def _end(self) -> None:
+        with self._lock:
+            self._ring()
+
+    def _ring(self) -> None:
+        self._bell.put(None)
+        for wake in self._sleepers:
+            wake()
 
     def _make_room(self) -> None:
         """Discard the oldest scan; notices keep their place, since they part the scans before from those after."""

@@ -67,6 +67,12 @@ class Silence:
         """Restart the silence of sensors whose names begin so at `time_ns` [ns], when their link came back."""
         self._since_ns[sensors] = time_ns
 
+    def forget(self, sensors: str = "") -> None:
+        """Forget the scans of sensors whose names begin so: a recording goes on elsewhere, and none is missing."""
+        for kept in (self._last, self._gaps, self._paced_from):
+            for name in [name for name in kept if name.startswith(sensors)]:
+                del kept[name]
+
     def follow(self, scan: Scan, period_ns: int | None) -> Event | None:
         """Take the next scan of a sensor with its period in [ns], if available; return an event if it was silent."""
         before, self._last[scan.sensor] = self._last.get(scan.sensor), scan

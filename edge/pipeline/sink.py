@@ -13,10 +13,14 @@ class Sink(Protocol):
 
     Attributes:
         unwritten: records left out so far, because the reader is too slow.
+        uses_poses: True where its results depend on poses, as those of a map do.
+        patience_s: longest time for which results of a sensor at rest may wait for it, in [s].
         trouble: what is wrong with it, in plain words for the user; None while all is well.
     """
 
     unwritten: int = 0
+    uses_poses: bool = False
+    patience_s: float = 0.0
 
     @property
     def trouble(self) -> str | None:  # noqa: D102 - above

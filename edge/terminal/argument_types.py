@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
+from edge import __version__
+from edge.terminal.help_format import HelpFormatter
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 
 EXIT_USAGE: Final = 2
@@ -16,39 +18,37 @@ class Parser(argparse.ArgumentParser):
     """Argument parser that reports wrong usage in one line."""
 
     def __init__(self, **settings: Any) -> None:
-        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **settings)
+        super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, **settings)
+        self.add_argument("--version", action="version", version=f"edge-sr {__version__}", help="show the version")
 
     def error(self, message: str) -> NoReturn:
         """End with the message and a hint at the help."""
         self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help lists all options)\n")
 
 
-def add_source(parser: argparse.ArgumentParser) -> None:
-    """Add the options of every command that reads a sensor."""
-    parser.add_argument(
-        "--source",
-        metavar="SRC",
-        action="append",
-        default=[],
-        help="source of the scans (default: the adapter plugged in); for two fingers repeated, as NAME=SRC",
+def add_source(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
+    """Add the options of every command that reads a sensor; returns the function that adds more to their group."""
+    add = parser.add_argument_group("sensor").add_argument
+    source_help = (
+        "where scans come from (default: the adapter plugged in); for two fingers repeated, as NAME=SRC; "
+        "edge-sr --help lists all"
     )
-    parser.add_argument(
-        "--id-map",
-        metavar="MAP",
-        choices=ID_MAPS,
-        help=f"map from CAN ids to taxels: {', '.join(ID_MAPS)}; A and B are boards before 2021 "
-        f"(default {USPA44_MAP.name})",
+    add("--source", metavar="SRC", action="append", default=[], help=source_help)
+    sensor_help = (
+        "sensor file, which edge-sr doctor writes: how the pad is wired and mounted, and its readings when free; other "
+        "options override it"
     )
-    sensor_help = "sensor file of edge-sr doctor: id map, order, axes, gains, force, baseline; options override it"
-    parser.add_argument("--sensor", metavar="FILE", type=Path, help=sensor_help)
-    force_help = "allow a sensor file of an emulated sensor on a device"
-    parser.add_argument("--force", action="store_true", help=force_help)
-    parser.add_argument(
-        "--rate-hz",
-        metavar="R",
-        type=positive,
-        help="rate at which a recording is played; for a device, its expected rate",
+    add("--sensor", metavar="FILE", type=Path, help=sensor_help)
+    map_help = (
+        f"kind of pad: which CAN message is which taxel: {', '.join(ID_MAPS)}; A and B are boards before 2021 "
+        f"(default {USPA44_MAP.name})"
     )
+    add("--id-map", metavar="MAP", choices=ID_MAPS, help=map_help)
+    rate_help = "scans a second at which a recording is played; for a device, its expected rate"
+    add("--rate-hz", metavar="R", type=positive, help=rate_help)
+    force_help = "use a sensor file of an emulated sensor on a real one all the same"
+    add("--force", action="store_true", help=force_help)
+    return add
 
 
 def positive(text: str) -> float:

@@ -60,18 +60,19 @@ def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: 
     return "truecolor" if environment.get("COLORTERM") in ("truecolor", "24bit") else "256"
 
 
-def draw(panels: Sequence[Panel], columns: int, palette: Palette) -> str:
+def draw(panels: Sequence[Panel], columns: int, palette: Palette, widest: int = WIDEST) -> str:
     """Draw panels side by side, or below each other if the terminal is too narrow.
 
     Args:
         panels: from left to right.
         columns: width of the terminal; no line is wider.
         palette: colours or characters of the values.
+        widest: columns of a panel, at most.
     """
-    width = min(WIDEST, (columns - GAP * (len(panels) - 1)) // len(panels))
+    width = min(widest, (columns - GAP * (len(panels) - 1)) // len(panels))
     width -= width % SHARP
     if width < NARROWEST:
-        width = max(1, min(WIDEST, columns))
+        width = max(1, min(widest, columns))
         return "\n\n".join("\n".join(_lines(panel, width, palette)) for panel in panels)
     rows = zip(*(_lines(panel, width, palette) for panel in panels), strict=True)
     return "\n".join((" " * GAP).join(row).rstrip() for row in rows)
@@ -93,7 +94,7 @@ def _overlaps(old: int, new: int) -> NDArray[np.float64]:
 def _lines(panel: Panel, width: int, palette: Palette) -> list[str]:
     """Return title, map and scale, each `width` cells wide."""
     span = panel.high - panel.low
-    height = max(1, width // 2)
+    height = max(1, width * panel.values.shape[0] // (2 * panel.values.shape[1]))
     pixel_rows = height if palette == "plain" else 2 * height
     shares = (resample(panel.values, pixel_rows, width) - panel.low) / (span if span > 0 else 1)
     shares = np.clip(shares, 0, 1)

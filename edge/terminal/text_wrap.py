@@ -1,8 +1,9 @@
 """Text for a terminal of any width."""
 
+import os
 import shutil
 import textwrap
-from typing import Final
+from typing import Final, TextIO
 
 FEWEST_COLUMNS: Final = 30
 
@@ -10,6 +11,11 @@ FEWEST_COLUMNS: Final = 30
 def columns() -> int:
     """Return the width of the terminal, or the default of one, at least FEWEST_COLUMNS."""
     return max(shutil.get_terminal_size().columns, FEWEST_COLUMNS)
+
+
+def rewritable(stream: TextIO | None) -> bool:
+    """Return whether a line can be rewritten in place: on a terminal, unless it knows no escape sequences."""
+    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[str]:

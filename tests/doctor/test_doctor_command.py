@@ -258,6 +258,48 @@ def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"
 
 
+class Impatient(Person):
+    """Presses the first two corners, then types what they were given."""
+
+    def __init__(self, type_now) -> None:
+        super().__init__()
+        self._type_now = type_now
+
+    def hear(self, text: str) -> None:
+        if "bottom" in text and "corner" in text:
+            self._type_now()
+        else:
+            super().hear(text)
+
+
+def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(monkeypatch):
+    """At the keyboard of a real pseudo-terminal; the felt load is shown meanwhile."""
+    leader, follower = os.openpty()
+    with os.fdopen(follower) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        os.write(leader, b"\n")  # before anything is asked: no answer to it
+        person = Impatient(lambda: os.write(leader, b"\n"))
+        with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+            asked = ("--rate-hz", 400, "--no-grip", "--json")
+            done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+    os.close(leader)
+    settled = {one["name"]: (one["verdict"], one["measured"]) for one in json.loads(done.out)["findings"]}
+    assert settled["taxel order"] == ("not known", "2 of 4 corners measured")
+    assert done.err.count("Skipped. Let go.") == 2 and done.code == 1
+    assert re.search(r"\rfelt \[[# ]{10}\] (60|59) s left, Enter skips", done.err)
+
+
+def test_ctrl_c_at_a_request_keeps_the_baseline(monkeypatch, tmp_path):
+    file = tmp_path / "s.toml"
+    person = Impatient(lambda: signal.raise_signal(signal.SIGINT))
+    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+        asked = ("--rate-hz", 400, "--no-grip", "--out", file)
+        done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+    entry = load_sensor_file(file).sensors["4"]
+    assert done.code == 130 and f"kept in {file}" in done.out
+    assert entry.baseline is not None and "mounting" in entry.assumed
+
+
 def test_a_cable_pulled_out_is_3_after_what_was_found(monkeypatch, tmp_path):
     with Emulator([recording(healthy_counts(150), rate_hz=150.0)]) as emulator:
         done = doctor(monkeypatch, emulator.port, "--out", tmp_path / "s.toml", drift_s=30)
@@ -287,7 +329,8 @@ def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
         assert process.stderr is not None and "watching for 60 s" in process.stderr.readline()
         time.sleep(0.9)
         process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=60)
+        out, errors = process.communicate(timeout=60)
+    assert "not written, because the free pad was not measured to the end" in errors
     assert process.returncode == 130 and "rate:" in out and "\nstopped after " in out and not (tmp_path / "s").exists()
 
 

@@ -21,6 +21,7 @@ from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -67,6 +68,7 @@ class TestLoss:
                 "constants of the pad of sensor 4",
             ),
             (SensorEntry(Mounting(gains=GAINS), assumed=frozenset({"mounting"})), "gains of sensor 4"),
+            (SensorEntry(frame=PadFrame("tool0"), assumed=frozenset({"mounting"})), "place on the robot of sensor 4"),
         ],
     )
     def test_each_part_is_named_and_kept_where_the_file_is_given_as_well(self, tmp_path, held, lost):
@@ -79,6 +81,21 @@ class TestLoss:
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}
         assert keep._lost(held, load_sensor_file(path).sensors["4"]) == []
         assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
+
+    def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, monkeypatch, tmp_path):
+        path, free = tmp_path / "s.toml", healthy_counts(200)
+        baseline = Baseline.from_counts("4", free, 1.79e9)
+        save_sensor_file(
+            path, SensorFile(sensors={"4": SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))})
+        )
+        pressed = free.copy()
+        pressed[:, 2] += 800
+        for counts, stored in ((pressed, False), (free, True)):
+            with Emulator([recording(counts)], loop=True) as emulator:
+                done = doctor(monkeypatch, emulator.port, "--no-press", "--sensor", path, "--out", path)
+            assert ("this baseline is not stored" in " ".join(done.out.split())) is not stored
+            now = load_sensor_file(path).sensors["4"].baseline
+            assert (now.id != baseline.id) is stored and np.abs(now.counts - baseline.counts).max() < 10
 
     def test_the_adapters_number_is_a_part(self, tmp_path):
         path = tmp_path / "s.toml"

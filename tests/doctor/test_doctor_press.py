@@ -62,12 +62,34 @@ def test_there_are_eight_ways_and_they_are_all_there_are():
 def test_the_dialogue_is_what_a_person_is_told():
     asked, _ = answer_to(visit(UPRIGHT, False, (1, 1, 1)))
     assert asked[:5] == [
-        "Press the top left corner with a finger and hold it.",
+        "Press the top left corner with a finger, about as hard as a stiff doorbell, and hold it.",
         "Still pressing, push towards the middle of the pad.",
         "Good. Let go.",
-        "Press the top right corner with a finger and hold it.",
+        "Press the top right corner with a finger, about as hard as a stiff doorbell, and hold it.",
         "Still pressing, push towards the middle of the pad.",
     ]
+
+
+def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next():
+    guide = GuidedPress()
+    pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
+    answer_to([pressed] * 10, guide)
+    assert guide.felt_counts > guide.enough_counts
+    assert guide.skip() == "Skipped. Let go."
+    more, _ = answer_to([pressed] * 40, guide)
+    assert more[1:] == [], "the finger is still there"
+    rest = visit(UPRIGHT, False, (1, 1, 1))
+    rest = rest[np.flatnonzero(rest[:, 2].any(axis=(1, 2)))[90:][0] :]  # from the press of the second corner on
+    more, _ = answer_to([np.zeros((3, 4, 4))] * 25 + list(rest), guide)
+    assert "Press the top right corner" in more[1] and guide.done
+    assert [press.place for press in guide.answer.presses] == [3, 15, 12]
+    _, mounting = judged(guide)
+    assert mounting == Mounting()
+    ended = GuidedPress()
+    for _ in range(4):
+        ended.skip()
+        answer_to([np.zeros((3, 4, 4))] * 25, ended)
+    assert ended.done and ended.skip() is None and not ended.answer.presses
 
 
 def test_a_pad_that_is_held_over_eight_real_sensors_on_one_pseudo_terminal():

@@ -1,4 +1,5 @@
 import errno
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 from map_samples import letter, raster, result_of
 from matplotlib.image import imread
+from PIL import Image
 
 from edge.errors import SinkError
 from edge.mapping import map_files
@@ -13,8 +15,8 @@ from edge.mapping.live_map import STATES, Box, LiveMap
 from edge.mapping.map_files import png
 from edge.mapping.object_map import MapLayers, ObjectMap
 from edge.mapping.sink import SHOW_NS, MapSink
+from edge.perception.event import Event
 from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
 
 NONE = {"dropped": 0}
 
@@ -29,10 +31,8 @@ class Clock:
 def pressed(sink, places=((0.0, 0.0),), *, posed=True, first=0, **changes):
     """Press a letter at places, each for a scan."""
     for number, (x_mm, y_mm) in enumerate(places, first):
-        result = result_of(letter, PadPose(x_mm, y_mm), number=number, **changes)
-        if posed:
-            sink.pose([TimedPose(PadPose(x_mm, y_mm), result.scan.time_ns)])
-        sink.write(result, NONE)
+        pose = PadPose(x_mm, y_mm)
+        sink.write(result_of(letter, pose, number=number, posed=posed, **changes), NONE)
 
 
 def test_layers_come_back_from_the_npz_and_the_picture_shows_them(tmp_path):
@@ -59,6 +59,62 @@ def test_layers_come_back_from_the_npz_and_the_picture_shows_them(tmp_path):
     assert light.mean() > dark.mean() + 0.2
     files = f"{tmp_path / 'm.npz'} and {tmp_path / 'm.png'}"
     assert sink.summary() == f"map: 2 patterns fused, 1 not believed; {files} written"
+
+
+def test_files_of_an_emulated_sensor_say_so_also_in_a_replay(tmp_path):
+    for source, origin, emulated in (
+        ("emulated", None, True),
+        ("replay", "emulated", True),
+        ("replay", "device", False),
+    ):
+        npz, png_path = tmp_path / f"{source}-{origin}.npz", tmp_path / f"{source}-{origin}.png"
+        sink = MapSink(ObjectMap(), npz=npz, png=png_path, origin=origin)
+        pressed(sink, source=source)
+        sink.close()
+        with np.load(npz) as data, Image.open(png_path) as picture:
+            assert {str(data["origin"]), picture.info["origin"]} == {"emulated" if emulated else "device"}
+            assert picture.info["source"] == source
+            line = np.asarray(picture)[:-480]
+        assert sink.summary().startswith("map (EMULATED): 1 " if emulated else "map: 1 ")
+        assert (line.shape[0] > 20) == emulated and set(np.unique(line)) == ({0, 255} if emulated else set())
+
+
+def test_a_reset_ends_the_map_of_one_object_and_begins_that_of_the_next(tmp_path):
+    reset = (Event(0, "reset", None, ""),)
+    sink = MapSink(ObjectMap(40.0, 2.0, centre_mm=(5.0, 0.0)), npz=tmp_path / "m.npz")
+    pressed(sink, events=reset)
+    (tmp_path / "m-2.npz").write_text("a good one")
+    pressed(sink, ((10.0, 0.0), (-10.0, 0.0)), first=1)
+    sink.write(result_of(letter, PadPose(0.0, 0.0), number=3, events=reset, trusted=False), NONE)
+    assert np.load(tmp_path / "m.npz")["fused_patterns"] == 3, "the press that lasted belongs to the object before"
+    pressed(sink, ((-8.0, 0.0), (8.0, 0.0)), first=4)
+    sink.close()
+    with np.load(tmp_path / "m-3.npz") as data:
+        assert (int(data["fused_patterns"]), int(data["doubted_patterns"])) == (2, 1)
+        assert data["contact"].shape == (80, 80) and data["centre_mm"].tolist() == [5, 0]
+    assert (tmp_path / "m-2.npz").read_text() == "a good one"
+    files = f"{tmp_path / 'm.npz'} and {tmp_path / 'm-3.npz'}"
+    assert sink.summary() == f"map: 5 patterns fused, 1 not believed; {files} written" and sink.fused == 5
+
+
+def test_two_pads_at_one_place_are_not_fused_since_one_has_the_others_pose():
+    shared, apart, shown = MapSink(ObjectMap()), MapSink(ObjectMap()), []
+    apart.show, apart._pause_ns = shown.append, 0
+    for number in range(6):
+        for sensor, x_mm in (("4", 0.0), ("6", 20.0)):
+            pressing = number > 0  # both are free at first
+            for sink, place_mm in ((shared, number + x_mm / 20), (apart, number + x_mm)):
+                pose = PadPose(place_mm, 0.0)
+                result = result_of(letter, pose, number=number, sensor=sensor)
+                sink.write(result if pressing else replace(result, pattern=None, contact=False), NONE)
+    assert set(shown[-1].pads) == {"4", "6"}
+    pressed(apart, ((9.0, 0.0),), first=200)  # as after another link was lost
+    for sink in (shared, apart):
+        sink.close()
+    assert set(shown[-1].pads) == {"4"}, "no pad is drawn where it was long ago"
+    assert shared.fused == 0 and apart.fused == 11 and apart.trouble is None
+    assert "10 patterns of two pads at one place are left out" in (shared.trouble or "")
+    assert shared.summary() == "map: 0 patterns fused, 10 of two pads at one place; no file written"
 
 
 def test_a_png_holds_every_pixel():
@@ -93,23 +149,6 @@ def test_a_disk_that_is_full_leaves_no_half_of_a_file(tmp_path, monkeypatch):
     with pytest.raises(SinkError, match="No space left"):
         sink.close()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_sensor_has_poses_of_its_own_or_those_of_all_between_two_of_them():
-    sink = MapSink(ObjectMap())
-    for time_ns, x_mm in ((10**7, -1.0), (5 * 10**7, 3.0)):
-        sink.pose([TimedPose(PadPose(x_mm, 0.0), time_ns), TimedPose(PadPose(90.0, 0.0), time_ns, "7")])
-    shown = []
-    sink.show = shown.append
-    sink.write(result_of(letter, PadPose(0.0, 0.0), number=3), NONE)
-    ((sensor, pose),) = shown[-1].pads.items()
-    assert sensor == "4" and pose.x_mm == pytest.approx(-1 + (shown_time(3) - 10**7) / 1e7)
-    sink.close()
-    assert sink.whole.fused == 1
-
-
-def shown_time(number):
-    return result_of(letter, PadPose(0.0, 0.0), number=number).scan.time_ns
 
 
 def test_states_are_shown_a_few_times_a_second_and_at_the_end():

@@ -112,6 +112,12 @@ def test_a_press_too_light_to_check_is_left_out_where_the_model_checks():
             whole.add(result_of(dome, pose, trusted=one), pose)
         whole.finish()
         assert (whole.fused, whole.light) == fate
+    whole, window = ObjectMap(), np.zeros((1, 3, 4, 4), dtype=np.float32)
+    for x_mm, counts in ((0.0, 99.0), (9.0, 101.0)):
+        window[0, 2, 1, 1] = counts
+        whole.add(result_of(dome, HERE, trusted=None, window=window.copy()), PadPose(x_mm, 0.0))
+    whole.finish()
+    assert (whole.fused, whole.light) == (1, 1), "also before any other press was checked"
     whole = ObjectMap()
     whole.add(result_of(dome, HERE, 0.03, trusted=True), HERE)
     whole.finish()

@@ -55,11 +55,11 @@ def test_a_pattern_is_late_after_one_period_and_not_before():
 
 
 def test_the_loop_counts_late_patterns_and_tells_every_latency():
-    """The clock gives 4 ms after each scan, 11 ms after the last; each comes when the one before is written."""
+    """The clock gives 4 ms after each scan, more after the last ones; each comes when the one before is written."""
     contact = scans(range(10))
     written = [threading.Event() for _ in contact]
     sink, statistics = ListSink(on_write=lambda result: written[result.scan.number].set()), Statistics()
-    done_ms = dict.fromkeys(range(10), 4.0) | {9: 11.0}
+    done_ms = dict.fromkeys(range(10), 4.0) | {7: 11.0, 8: 50.0, 9: 290.0}
     link = FakeLink([part for scan, event in zip(contact, written, strict=True) for part in ([scan], event)])
     run(
         link,
@@ -69,8 +69,11 @@ def test_the_loop_counts_late_patterns_and_tells_every_latency():
         rate_hz=100,
     )
     assert [result.latency_us for result in sink.results] == [1000 * done_ms[n] for n in range(10)]
-    assert [counters["late"] for counters in sink.counters] == [0] * 9 + [1]
-    assert statistics.late == 1 and statistics.latency_us.count == 10 and statistics.dropped == 0
+    assert [counters["late"] for counters in sink.counters] == [0] * 7 + [1, 2, 3]
+    noted = "this pattern was ready 0.29 s after its newest reading arrived"
+    assert [result.note for result in sink.results] == [None] * 9 + [noted]
+    assert [note.kind for note in sink.results[9].notes] == ["late"]
+    assert statistics.late == 3 and statistics.latency_us.count == 10 and statistics.dropped == 0
 
 
 def test_scans_that_lay_unread_set_no_pace():

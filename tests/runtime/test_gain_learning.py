@@ -341,13 +341,17 @@ class TestKeeping:
         keeper.close()
         assert keeper.trouble is not None and "gone.toml: cannot be read" in keeper.trouble
 
-    def test_a_stream_reports_that_gains_cannot_be_kept(self, file):
+    @pytest.mark.parametrize("ends", [True, False])
+    def test_a_stream_reports_that_gains_cannot_be_kept(self, file, ends):
         events = []
-        with Source(FakeLink([]), sensor_file=load_sensor_file(file)) as source:
+        with Source(FakeLink([], endless=not ends), sensor_file=load_sensor_file(file)) as source:
             stream = Stream(source, make_runtime(FakeModel()), on_event=events.append)
             file.unlink()
-            stream._keeper.keep("4", LEARNED)
-            assert list(stream) == []
+            stream._rounds._keeper.keep("4", LEARNED)
+            if ends:
+                assert list(stream) == []
+            else:
+                assert stream.latest().result is None  # closing the source ends it
         assert [event.kind for event in events] == ["note"]
         assert "learned gains are not kept: " in events[0].text and "cannot be read" in events[0].text
 

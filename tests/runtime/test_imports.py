@@ -82,8 +82,8 @@ print(code, within[0], sorted(sys.modules), sep="\\n")
 
 
 def test_a_run_loads_what_it_uses_and_starts_two_threads(tmp_path):
-    """One reads; one sleeps until a signal asks for the end."""
-    write_recording(tmp_path / "rest.csv", make_counts(20))
+    """One reads, for as long as scans come; one sleeps until a signal asks for the end."""
+    write_recording(tmp_path / "rest.csv", make_counts(1000))
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(tmp_path / "rest.csv")],
         cwd=ROOT,
@@ -95,6 +95,6 @@ def test_a_run_loads_what_it_uses_and_starts_two_threads(tmp_path):
     )
     code, threads, modules = done.stdout.splitlines()
     assert code == "0", done.stderr
-    assert ast.literal_eval(threads) == ["MainThread", "ending", "scan-reader_0"]
+    assert ast.literal_eval(threads) == ["MainThread", "ending", "scan-reader"]
     assert not set(ast.literal_eval(modules)) & (UNUSED_IN_A_REPLAY | FORBIDDEN)
     assert "edge.sinks.status_line" in ast.literal_eval(modules)

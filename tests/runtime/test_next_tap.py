@@ -17,6 +17,7 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.next_tap import NextTapFinder, TapAdvice
 from edge.perception.result import NextTap
 from edge.perception.runtime import Runtime
+from edge.perception.tap_tracker import TapPeak, TapState
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import open_sink
 from firmware_bridge.pad_geometry import USPA44
@@ -99,8 +100,14 @@ def made(force_counts=100.0, **changes) -> Any:
     return SimpleNamespace(**values | {"force_counts": force_counts} | changes)
 
 
+PEAKS = (TapPeak(0, 0),)
+TOUCHING, FREE, FORGOTTEN = (
+    TapState(contact, 0, int(contact), EVEN, peaks) for contact, peaks in ((True, ()), (False, PEAKS), (False, ()))
+)
+
+
 def after(advice):
-    return advice.proposal(contact=False, remembered=True)
+    return advice.proposal(FREE)
 
 
 def proposed_after(advice) -> NextTap:
@@ -112,15 +119,15 @@ def proposed_after(advice) -> NextTap:
 def test_a_proposal_is_made_when_a_tap_ends_and_kept_until_the_next_one(finder):
     advice = TapAdvice(finder, taps=7)
     assert after(advice) is None
-    advice.see(made())
-    assert advice.proposal(contact=True, remembered=True) is None
+    advice.see(made(), 0)
+    assert advice.proposal(TOUCHING) is None
     proposed = after(advice)
     assert proposed is not None and after(advice) is proposed
-    assert advice.proposal(contact=True, remembered=True) is None
+    assert advice.proposal(TOUCHING) is None
     assert after(advice) is None, "a tap without a pattern proposes nothing"
-    advice.see(made())
+    advice.see(made(), 0)
     assert after(advice) is not None
-    assert advice.proposal(contact=False, remembered=False) is None
+    assert advice.proposal(FORGOTTEN) is None
     assert after(advice) is None, "forgotten taps are no reason to touch again"
 
 
@@ -130,16 +137,16 @@ def test_the_strongest_pattern_of_a_tap_is_the_one_that_counts(finder):
     left[:, :12] *= 8
     advice = TapAdvice(finder, taps=7)
     for force_counts, deviation in ((50.0, left), (200.0, right), (80.0, left)):
-        advice.see(made(force_counts, deviation=deviation))
+        advice.see(made(force_counts, deviation=deviation), 0)
     assert proposed_after(advice).dx_mm > 0
-    advice.proposal(contact=True, remembered=True)
-    advice.see(made(60.0, deviation=left))
+    advice.proposal(TOUCHING)
+    advice.see(made(60.0, deviation=left), 0)
     assert proposed_after(advice).dx_mm < 0, "a lighter tap counts no less, once it is the newest"
 
 
 def test_the_target_is_the_proposal_in_the_objects_plane(finder):
     advice = TapAdvice(finder, taps=7)
-    advice.see(made())
+    advice.see(made(), 0)
     proposed = proposed_after(advice)
     target = proposed.target
     assert target is not None
@@ -153,7 +160,7 @@ def test_the_target_is_the_proposal_in_the_objects_plane(finder):
 )
 def test_nothing_is_proposed_without_what_it_needs(finder, changes):
     advice = TapAdvice(finder, taps=7)
-    advice.see(made(**changes))
+    advice.see(made(**changes), 0)
     assert after(advice) is None
 
 
@@ -207,6 +214,20 @@ class TestRuntime:
         assert self.push().next_tap is not None
         later = [self.push() for _ in range(30)]
         assert later[-1].next_tap is None
+
+    def test_a_reset_within_a_tap_leaves_nothing_of_the_object_before(self, tmp_path):
+        self.make(tmp_path)
+        self.tap(PadPose(0, 0))
+        self.runtime.pose(PadPose(1, 0), (self.number + 1) * PERIOD_NS - 1000, holds=True)
+        self.push(self.PRESS)
+        self.runtime.reset()
+        self.runtime.pose(PadPose(3, 0), (self.number + 1) * PERIOD_NS - 1000, holds=True)
+        later = [self.push(press) for press in (0.8 * self.PRESS, 0.7 * self.PRESS)]
+        proposed, alone = self.push().next_tap, TapAdvice(self.runtime._finder, 7)
+        alone.see(later[0], 0)
+        expected = alone.proposal(FREE)
+        assert later[0].taps_used == 1 and proposed is not None and expected is not None
+        assert proposed.target == expected.target and proposed.error_lost == expected.error_lost
 
     def test_without_poses_and_by_other_models_nothing_is_proposed(self, tmp_path):
         self.make(tmp_path)

@@ -5,7 +5,7 @@ import pytest
 from edge_samples import FakeModel
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
-from edge.perception.pattern_check import LEAST_COUNTS, REPEATS, PatternCheck, Verdict, first_stranger
+from edge.perception.pattern_check import LEAST_COUNTS, REPEATS, PatternCheck, Verdict, strangers
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
@@ -195,16 +195,19 @@ class TestBelonging:
         window[:, 2].reshape(4, -1)[:, FOREIGN_TAXEL] = 3, 3, 0, 3
         window[2, 2, 3, 3] = 3
         shares = make_check().belonging(window, 4)
-        assert [share >= 0.5 for share in shares] == [False, True, False] and first_stranger(shares) == 2
+        assert [share >= 0.5 for share in shares] == [False, True, False]
+        assert strangers(shares, posed=True) == [2], "a tap with a pose of its own goes alone"
+        assert strangers(shares, posed=False) == [2, 3]
         assert all(0 <= share <= 1 for share in shares)
 
     def test_only_taps_that_are_there_are_asked_for(self):
         window = np.ones((4, 3, 4, 4), dtype=np.float32)
         assert len(make_check().belonging(window, 3)) == 2 and make_check().belonging(window, 1) == []
-        assert first_stranger([]) is None and first_stranger([0.1, 0.49]) is None
-        assert first_stranger([0.5]) == 1
+        for posed in (False, True):
+            assert strangers([], posed=posed) == strangers([0.1, 0.49], posed=posed) == []
+            assert strangers([0.5], posed=posed) == [1]
 
     def test_a_tap_that_is_not_finite_does_not_belong(self):
         window = np.ones((4, 3, 4, 4), dtype=np.float32)
         window[1, 0, 0, 0] = np.nan
-        assert first_stranger(make_check().belonging(window, 4)) == 1
+        assert strangers(make_check().belonging(window, 4), posed=True)[0] == 1

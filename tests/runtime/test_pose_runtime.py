@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, PERIOD_NS, FakeModel, inferred, make_contract, make_scan
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 from runtime_samples import PRESS, make_runtime
 from trust_samples import make_posed_trust, make_trust
@@ -178,7 +178,7 @@ def test_two_sensors_with_different_numbers_of_taps_in_one_run(session):
         pads[0].tap(pose)
     pads[1].number = pads[0].number
     pads[0].place(PadPose(1, 2, 3))
-    results = runtime.push_together([(pad.scan(PRESS + 100 * index), True) for index, pad in enumerate(pads)])
+    results = inferred(runtime, [pad.scan(PRESS + 100 * index) for index, pad in enumerate(pads)])
     assert [result.taps_used for result in results] == [4, 1]
     assert [result.pose.x_mm for result in results] == [1, 7], "its own poses come before those of all"
     for result in results:
@@ -275,6 +275,39 @@ def test_the_check_of_earlier_taps_takes_their_poses_and_a_dropped_tap_is_forgot
     result = pad.tap(PadPose(4, 0))
     assert result.poses[:, 0].tolist() == [0, -4, -2], "the first tap is forgotten, the others are not"
     assert pad.events == ["tap_without_pose", "tap_dropped"]
+
+
+def test_a_tap_that_does_not_belong_goes_alone_where_taps_have_poses():
+    model = PosedModel(make_checked_contract(make_posed_trust(2.5)))
+    pad = Pad(make_runtime(model, options=EVERY))
+    for x_mm, more in ((1, 0), (4, 100), (2, 200)):
+        pad.tap(PadPose(x_mm, 0), PRESS + more)
+    pad.place(PadPose(0, 0))
+    light = pad.push(0.7 * PRESS)
+    again = pad.push(0.7 * PRESS)
+    assert light.poses[:, 0].tolist() == [0, 2, 1] and (light.taps_used, light.taps_dropped) == (3, 1)
+    assert again.reused_from == light.scan.number and again.taps_dropped == 1
+    for result in (light, again):
+        np.testing.assert_allclose(model.windows[-1], model.contract.scale_window(result.window), rtol=1e-5)
+    assert [window[2].max() for window in light.window] == [0.7 * PRESS, PRESS + 200, PRESS]
+    assert "tap_dropped" not in pad.events, "a light press may only have begun"
+    pad.push(PRESS)
+    settled = pad.push(1.1 * PRESS)
+    assert settled.poses[:, 0].tolist() == [0, 2, 1] and settled.taps_dropped == 0
+    assert pad.events == ["tap_dropped"]
+
+
+def test_taps_of_the_schedule_go_with_the_stranger_that_came_after_them():
+    # Without poses every tap lies at 0 mm, so that a limit below that drops them all.
+    runtime = make_runtime(
+        PosedModel(make_checked_contract(make_posed_trust(-1.0))), options=RuntimeOptions(every_tap=True, taps=3)
+    )
+    pad = Pad(runtime)
+    for _ in range(5):
+        pad.tap()
+    result = pad.push(PRESS)
+    assert (result.taps_used, result.taps_dropped, len(result.window)) == (1, 1, 1)
+    assert pad.push(PRESS).tap_mismatch is None and not runtime._sensors["4"].taps._peaks
 
 
 def test_checks_without_poses_do_not_fit_a_model_that_takes_them():

@@ -14,7 +14,7 @@ from edge.pipeline.pump import pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
 from firmware_bridge.errors import LinkLostError
-from firmware_bridge.links.base import Notice
+from firmware_bridge.links.base import Notice, Pace
 from firmware_bridge.zeroing.baseline import Baseline
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
@@ -61,6 +61,35 @@ def test_reading_goes_on_beside_inference():
     run(link, ListSink(), model=FakeModel(on_run=lambda: seen.append(read_again.wait(10))))
     assert all(seen)
     assert link.thread is not threading.current_thread()
+
+
+def test_scans_that_come_between_the_calls_of_a_round_overtake_those_that_wait():
+    """Six sensors press; a call has time for two of them, and the next scans come during the second call."""
+    names = [f"{number}" for number in range(6)]
+    batches = [[make_scan(n, sensor=name, press_counts=3000 + 500 * n) for name in names] for n in range(3)]
+    gates = [threading.Event(), threading.Event()]
+    link = FakeLink([batches[0], gates[0], batches[1], gates[1], batches[2]])
+    clock_us, calls = itertools.count(0, 3000), []
+
+    class Slow(FakeModel):
+        def run_together(self, windows, pads=None):
+            calls.append(len(windows))
+            if len(calls) <= 2:
+                gates[len(calls) - 1].set()
+                while link.reads < 2 * len(calls) + 2:  # the batch is handed over before the next read
+                    time.sleep(0.001)
+            return super().run_together(windows, pads)
+
+    runtime = Runtime(
+        Slow(), source="device", baselines=dict.fromkeys(names, BASELINE), clock_ns=lambda: 1000 * next(clock_us)
+    )
+    sink = ListSink()
+    statistics = run(link, sink, runtime=runtime, rate_hz=250)  # a call may take 1 ms
+    made = [(one.scan.number, one.scan.sensor) for one in sink.results if one.pattern is not None]
+    assert calls[:4] == [6, 2, 2, 2] and max(calls[4:]) <= 2
+    assert made == [(0, name) for name in names] + [(1, "0"), (1, "1")] + [(2, name) for name in "234501"]
+    assert statistics.dropped == 4
+    assert all(numbers(sink, name) == [0, 1, 2] for name in names)
 
 
 def slow_run(batch_while_busy, **settings):
@@ -279,3 +308,41 @@ def test_a_notice_keeps_its_place_where_scans_are_thrown_away_that_nobody_took(a
     numbers = ["lost" if isinstance(heard, Notice) else heard.number for heard in taken]
     assert numbers == {1: ["lost", 6, 7, 8], 5: ["lost", 5, 6, 7, 8], 9: [5, 6, 7, "lost", 8]}[at]
     assert reader.overruns + len(taken) - 1 == 9
+
+
+class Patient(ListSink):
+    patience_s = 0.2
+
+
+@pytest.mark.parametrize("impatient", [False, True])
+def test_scans_may_wait_only_at_rest_and_only_where_every_sink_can_wait(impatient):
+    """Close to contact they may not: changes too small to be seen could add up to one."""
+    begun, rested, paces = threading.Event(), threading.Event(), []
+    rest = [make_scan(n, noise=3) for n in range(120)]
+    link = FakeLink([rest[:1], begun, rest[1:], rested, [make_scan(120, noise=3, press_counts=1200)]])
+    link.set_pace = paces.append
+    gates = {0: begun, 119: rested}
+    sink = Patient(lambda result: gates.pop(result.scan.number, begun).set())
+    run(link, sink, ListSink() if impatient else Patient())
+    assert paces == ([Pace()] if impatient else [Pace(still_s=0.2), Pace(still_s=0.2, restless=frozenset("4"))])
+
+
+@pytest.mark.parametrize(("sensors", "every_ms"), [(3, 0.0), (4, 2.5)])
+def test_many_sensors_are_read_together_four_times_a_period(sensors, every_ms):
+    paces, written = [], threading.Semaphore(1)
+    batches = [[make_scan(n, sensor=f"{name}", noise=3) for name in range(sensors)] for n in range(20)]
+    link = FakeLink(batches)
+    link.set_pace = paces.append
+    read = link.read
+
+    def read_one(timeout_s):
+        written.acquire(timeout=10)
+        return read(timeout_s)
+
+    link.read = read_one
+    sink = ListSink(lambda result: written.release() if result.scan.sensor == "0" else None)
+    run(link, sink, runtime=Runtime(FakeModel(), source="device"))
+    assert [pace._replace(together_s=round(1e3 * pace.together_s, 2)) for pace in paces] == [
+        Pace(),
+        *[Pace(every_ms)] * (every_ms > 0),
+    ]

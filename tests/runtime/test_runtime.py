@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -267,13 +268,44 @@ def test_any_scans_give_one_result_each_and_a_pattern_only_in_contact(scans):
         assert np.isfinite(window).all()
 
 
-def test_two_scans_of_one_sensor_in_one_call_get_patterns_of_their_own():
-    model = FakeModel()
-    runtime = Runtime(model, source="device", baselines={"4": BASELINE})
-    first, second = runtime.push_together(
-        [(make_scan(0, press_counts=3000), True), (make_scan(1, press_counts=6000), True)]
+def test_the_newest_scan_wins_and_keeps_the_place_of_the_one_that_it_overtakes():
+    """Sensor 4 sends three scans while 6 sends one, and both wait: 4 is the first all the same, by its newest scan."""
+    runtime = Runtime(FakeModel(), source="device", baselines=dict.fromkeys("468", BASELINE))
+    sent = [make_scan(number, sensor="4", press_counts=3000 * (number + 1)) for number in range(3)]
+    assert runtime.take(sent[0]) == [] and runtime.take(make_scan(0, sensor="6", press_counts=3000)) == []
+    overtaken = [result for scan in sent[1:] for result in runtime.take(scan)]
+    assert [(result.scan.number, result.state, result.pattern) for result in overtaken] == [
+        (0, "dropped", None),
+        (1, "dropped", None),
+    ]
+    (idle,) = runtime.take(make_scan(0, sensor="8"))
+    assert idle.state == "idle" and runtime.waiting == 2
+    newest, other = runtime.infer()
+    assert (newest.scan, other.scan.sensor, runtime.waiting) == (sent[2], "6", 0)
+    assert newest.pattern.max() == pytest.approx(3 * other.pattern.max())
+    dropped, free = runtime.take(sent[0]) or runtime.take(make_scan(9, sensor="4"))
+    assert (dropped.state, free.state, runtime.infer()) == ("dropped", "idle", [])
+
+
+def test_sensors_that_do_not_fit_into_one_call_wait_for_the_next_and_none_starves():
+    clock_us = itertools.count(0, 3000)  # two looks at it a call: each takes 3 ms
+    names = [str(number) for number in range(6)]
+    runtime = Runtime(
+        FakeModel(),
+        source="device",
+        baselines=dict.fromkeys(names, BASELINE),
+        clock_ns=lambda: 1000 * next(clock_us),
+        options=RuntimeOptions(every_scan=True),
     )
-    assert second.pattern.max() == pytest.approx(2 * first.pattern.max())
+
+    def infer(number, longest_us):
+        for name in names:
+            runtime.take(make_scan(number, sensor=name, press_counts=3000))
+        return [result.scan.sensor for result in runtime.infer(longest_us)]
+
+    assert infer(0, None) == names
+    assert [infer(number, 2000) for number in range(1, 5)] == 2 * [names[:3], names[3:]]
+    assert len(runtime.infer(0.001)) == 1, "one at least, or nothing would ever go on"
 
 
 class TestLoseTouch:

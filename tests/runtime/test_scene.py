@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, inferred, make_contract, make_scan
 
 from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
 from edge.perception.contact_options import RuntimeOptions
@@ -179,10 +179,9 @@ def test_two_sensors_are_inferred_in_one_call_in_the_order_they_came():
         )
         for name, press in (("4", 3000), ("6", 5000))
     }
-    scans = [(make_scan(0, press_counts=2000), False)]
-    scans += [(make_scan(1, sensor=name, press_counts=press), True) for name, press in (("4", 3000), ("6", 5000))]
-    dropped, *results = runtime.push_together(scans)
-    assert calls == [2] and dropped.state == "dropped" and dropped.pattern is None
+    pressed = [make_scan(1, sensor=name, press_counts=press) for name, press in (("4", 3000), ("6", 5000))]
+    results = inferred(runtime, pressed)
+    assert calls == [2] and [result.scan for result in results] == pressed
     for result in results:
         np.testing.assert_array_equal(result.pattern, alone[result.scan.sensor].pattern)
         np.testing.assert_array_equal(result.deviation, alone[result.scan.sensor].deviation)

@@ -106,7 +106,7 @@ def noted(number, state, note=None, sensor="4"):
         ([noted(0, "zeroing")], "not zeroed, too few scans; or pass --baseline, of the free pad"),
         ([noted(0, "zeroing"), noted(1, "zeroing", "it moved")], "not zeroed, it moved; or pass --baseline, of the"),
         ([noted(0, "incomplete", "taxel 3 is dead"), noted(1, "zeroing")], "taxel 3 is dead"),
-        ([noted(0, "zeroing", "it moved"), noted(1, "idle")], "nothing touched it"),
+        ([noted(0, "zeroing", "it moved"), noted(1, "idle")], "no contact: its readings never reached"),
         ([noted(0, "idle"), noted(1, "dropped"), noted(2, "idle")], "newer scans overtook all"),
     ],
 )

@@ -19,9 +19,12 @@ from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.cdr_messages import force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
+from edge.sinks.ros2.map_messages import image_map
+from edge.sinks.ros2.ros_types import WRENCH_STAMPED
 from edge.view.frames import Frames, Run, hello
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.viewer_state import Viewer
+from firmware_bridge.pad_geometry import USPA44
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS
@@ -140,10 +143,11 @@ class TestSinks:
         sink.close()
         told = messages_of(tmp_path / "out.mcap")
         [(_, traction)] = told["/s4/traction"]
-        assert ros_messages.IMAGE.decode(traction)["encoding"] == "32FC3"
-        np.testing.assert_array_equal(ros_messages.image_map(traction), results[1].traction)
+        assert results[1].traction is not None
+        pascal = image_map(traction).reshape(3, 8, 8)
+        np.testing.assert_allclose(pascal, results[1].traction * 1e3, rtol=1e-6)
         [(_, data)] = told["/s4/wrench"]
-        wrench = ros_messages.WRENCH_STAMPED.decode(data)["wrench"]
+        wrench = WRENCH_STAMPED.decode(data)["wrench"]
         assert list(wrench["force"].values()) == pytest.approx([0, 0, FORCE_N])
         arm_m = 2.35e-3
         assert list(wrench["torque"].values()) == pytest.approx([-arm_m * FORCE_N, arm_m * FORCE_N, 0])
@@ -153,11 +157,11 @@ class TestSinks:
     def test_ros_takes_the_wrench_before_the_calibrated_force_and_the_diagnostics_name_its_origin(self):
         both = make_wrench_result(counts_per_newton=1000.0)
         assert both.wrench is not None and both.force_n == 20 and both.wrench_origin == "calibrated"
-        told = force_and_torque(both)
+        told = force_and_torque(both, USPA44)
         assert told is not None and told[0] == both.wrench.force_n and not math.isnan(told[1][2])
         assert diagnose(both, {}, {}, 0.0, None).values["wrench_origin"] == "calibrated"
         nominal = diagnose(make_wrench_result(), {}, {}, 0.0, None).values
-        assert nominal["wrench_origin"] == "nominal" and "force" not in nominal
+        assert nominal["wrench_origin"] == "nominal" and "wrench" not in nominal
 
     def test_the_live_page(self):
         heard = RunSnapshot(lambda: 10**12)

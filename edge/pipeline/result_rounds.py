@@ -1,0 +1,308 @@
+"""Maker of the results of a source, round by round: of all scans that wait, then again."""
+
+import math
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from operator import attrgetter
+from typing import Final
+
+from edge.perception.event import Event
+from edge.perception.result import Result, replace
+from edge.perception.runtime import Runtime
+from edge.perception.scan_notes import OLD_NS, waited_note
+from edge.pipeline.commands import Commands, obey
+from edge.pipeline.deadline import Deadline
+from edge.pipeline.gain_keeper import GainKeeper
+from edge.pipeline.pose_intake import PoseIntake
+from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.silence import Silence
+from edge.pipeline.sink import Sink
+from firmware_bridge.errors import BridgeError
+from firmware_bridge.links.base import Notice, Pace
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.silence import POLL_S
+
+_UNWRITTEN: Final = attrgetter("unwritten")
+CALLS_A_PERIOD: Final = 4
+"""Calls of inference for which there is time in a period: a scan waits for one that has begun."""
+TOGETHER_SENSORS: Final = 4
+"""Fewest sensors whose scans are read together."""
+READS_A_PERIOD: Final = 4
+"""Reads of many sensors in a period."""
+LONGEST_TOGETHER_S: Final = 0.05
+"""Period from which scans come too seldom to be read together, in [s]."""
+SAME_SHARE: Final = 0.1
+"""Share by which a measured period may change before links are asked for another pace."""
+RESTLESS_NS: Final = 1_000_000_000
+"""Time after a contact, in [ns], during which every scan is still handed on at once."""
+
+
+class Rounds:
+    """Maker of results from scans, commands and poses, for a stream; its settings are those of the stream.
+
+    Sinks and `on_event` get events in their place between results, and sinks get a result before anything else does.
+
+    Attributes:
+        statistics: of the results so far.
+        poses: queue of the poses from outside.
+        wait_s: longest wait for scans at the beginning of the next round, in [s].
+        sinks: get results, events and poses.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        runtime: Runtime,
+        *,
+        sinks: Sequence[Sink],
+        on_event: Callable[[Event], object],
+        stop: threading.Event | None,
+        duration_s: float | None,
+        commands: Commands | None,
+        statistics: Statistics | None,
+        patience_s: float,
+        clock_s: Callable[[], float],
+        clock_ns: Callable[[], int],
+    ) -> None:
+        self.statistics = Statistics() if statistics is None else statistics
+        self.poses = PoseQueue() if commands is None else commands.poses
+        self.wait_s = POLL_S
+        self.sinks = tuple(sinks)
+        self._source = source
+        self._runtime = runtime
+        self._on_event = on_event
+        self._stop = threading.Event() if stop is None else stop
+        self._duration_s = duration_s
+        self._commands = commands
+        unused_by = None if any(sink.uses_poses for sink in self.sinks) else runtime.unposed
+        self._intake = PoseIntake(runtime, self.poses, recorded=source.patient, unused_by=unused_by)
+        self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
+        self._deadlines: dict[str, Deadline] = {}
+        self._now_ns = 0
+        self._waited_s = -math.inf
+        self._clock_s = clock_s
+        self._clock_ns = clock_ns
+        self._received: dict[str, int] | None = None
+        self._pace: Pace | None = None
+        self._patience_s = patience_s
+        self._restless_ns: dict[str, int] = {}
+        path = None if source.kind == "replay" else source.sensor_file.path
+        self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
+        statistics = self.statistics
+        if self._received is None:
+            self._received = self._source.counters()
+        counters = self._received.copy()
+        counters["dropped"] = statistics.dropped
+        counters["overruns"] = statistics.overruns
+        counters["late"] = statistics.late
+        counters["missed"] = statistics.missed
+        counters["poses"] = statistics.poses
+        counters["poses_refused"] = statistics.poses_refused
+        counters["poses_dropped"] = statistics.poses_dropped
+        counters["unwritten"] = statistics.unwritten
+        return counters
+
+    def run(self) -> Generator[Result | None]:
+        """Yield the results of a round, None at its end, and so on; what `Stream.__iter__` raises ends it."""
+        try:
+            yield from self._rounds()
+        finally:
+            if self._keeper is not None:
+                self._keeper.close()
+                if self._keeper.trouble is not None:
+                    detail = f"learned gains are not kept: {self._keeper.trouble}"
+                    self._tell(Event(self._clock_ns(), "note", None, detail))
+
+    def _rounds(self) -> Iterator[Result | None]:
+        """Yield the results of all scans that wait, and then None, again and again.
+
+        Scans that come while patterns are made join the round, but do not prolong it.
+        """
+        left = 0
+        try:
+            for taken in self._taken():
+                if self._commands is not None:
+                    obey(self._commands, self._runtime)
+                    self.statistics.commands_refused = self._commands.refused
+                for one in taken:
+                    if isinstance(one, TimedPose):
+                        self.poses.begun = True
+                if self.poses.begun:
+                    self._take_poses(taken)
+                for one in taken:
+                    if isinstance(one, Scan):
+                        for result in self._runtime.take(one):
+                            yield self._follow(result)
+                    elif isinstance(one, Notice):
+                        yield from self._patterns()
+                        self._heed(one)
+                left = min(left or self._runtime.waiting, self._runtime.waiting)
+                for result in self._infer():
+                    left -= 1
+                    yield result
+                if left > 0 and not self._source.patient:
+                    continue
+                left = 0
+                yield from self._patterns() if self._source.patient else ()
+                for event in self._silence.look():
+                    self._tell(event)
+                self._set_pace()
+                if not taken:
+                    self._rest()
+                yield None
+        except BridgeError:  # the source is lost: what was taken before gets its results
+            yield from self._patterns()
+            raise
+        yield from self._patterns()
+
+    def _rest(self) -> None:
+        """Let the sinks do what is due, ten times a second while no scan comes."""
+        now_s = self._clock_s()
+        if self.wait_s or now_s - self._waited_s >= POLL_S:
+            self._waited_s = now_s
+            for sink in self.sinks:
+                sink.wait()
+
+    def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
+        """Pass poses on to the runtime: those from outside, and those of the source."""
+        recorded = [one for one in taken if isinstance(one, TimedPose)]
+        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
+        first_ns = min(times_ns, default=None)
+        if not self._source.patient:
+            self._now_ns = self._clock_ns()
+        elif first_ns is not None:
+            self._now_ns = first_ns
+        intake, statistics = self._intake, self.statistics
+        poses = intake.take(recorded, first_ns, self._now_ns)
+        statistics.poses, statistics.poses_refused = intake.used, intake.refused
+        statistics.poses_dropped = intake.dropped
+        for sink in self.sinks if poses else ():
+            sink.pose(poses)
+        for event in intake.look(self._now_ns):
+            self._tell(event)
+
+    def _taken(self) -> Iterator[list[Scan | Notice | TimedPose]]:
+        """Yield the scans, notices and poses of the source, until it ends, `stop` is set, or the time is over.
+
+        A patient source's time is that of its scans.
+        """
+        length_s = math.inf if self._duration_s is None else self._duration_s
+        begun_s = self._clock_s()
+        first_ns: int | None = None
+        while not self._stop.is_set() and (self._source.patient or self._clock_s() - begun_s < length_s):
+            taken = self._source.take(0.0 if self._runtime.waiting else self.wait_s)
+            self.statistics.overruns = self._source.overruns
+            self._received = None
+            if taken is None:
+                return
+            for one in taken if self._source.patient else ():  # one scan at most
+                if isinstance(one, Scan):
+                    first_ns = one.time_ns if first_ns is None else first_ns
+                    if one.time_ns - first_ns >= length_s * 1e9:
+                        return
+            yield taken
+
+    def _patterns(self) -> Iterator[Result]:
+        """Yield the results of all sensors that wait for their patterns."""
+        while self._runtime.waiting:
+            yield from self._infer()
+
+    def _infer(self) -> Iterator[Result]:
+        """Yield the results of the sensors that have waited longest, as many as one call has time for."""
+        results = self._runtime.infer(self._longest_call_us()) if self._runtime.waiting else []
+        done_ns = self._clock_ns() if results else 0
+        for name, pad in self._runtime.take_learned().items():
+            if self._keeper is not None:
+                self._keeper.keep(name, pad)
+        for result in results:
+            yield self._follow(result, done_ns)
+
+    def _longest_call_us(self) -> float | None:
+        """Return the time that one inference may take, in [us]: scans that come meanwhile wait for its end."""
+        if self._runtime.waiting < 2:  # the rule, for which it need not be known
+            return None
+        period_s = self._shortest_period_s()
+        return None if period_s == math.inf else 1e6 * period_s / CALLS_A_PERIOD
+
+    def _shortest_period_s(self) -> float:
+        periods_ns = [deadline.period_ns for deadline in self._deadlines.values() if deadline.period_ns is not None]
+        return min(periods_ns, default=math.inf) / 1e9
+
+    def _watch_rest(self, result: Result) -> None:
+        """Keep which sensors have been near contact of late."""
+        sensor, time_ns = result.scan.sensor, result.scan.time_ns
+        if not self._runtime.rests(result):
+            self._restless_ns[sensor] = time_ns
+        elif time_ns - self._restless_ns.get(sensor, time_ns) > RESTLESS_NS:
+            del self._restless_ns[sensor]
+
+    def _set_pace(self) -> None:
+        """Let the source read late where that costs nothing: many sensors together, and those at rest now and then."""
+        together_s = 0.0
+        if len(self._deadlines) >= TOGETHER_SENSORS:
+            period_s = self._shortest_period_s()
+            together_s = period_s / READS_A_PERIOD if period_s < LONGEST_TOGETHER_S else 0.0
+            before_s = 0.0 if self._pace is None else self._pace.together_s
+            if abs(together_s - before_s) < SAME_SHARE * together_s:
+                together_s = before_s
+        pace = Pace(together_s, self._patience_s if self._deadlines else 0.0, frozenset(self._restless_ns))
+        if pace != self._pace:
+            self._pace = pace
+            self._source.set_pace(pace)
+
+    def _follow(self, result: Result, done_ns: int = 0) -> Result:
+        """Count a result; its pattern, if it has one, was ready at `done_ns`, 0 for now."""
+        scan, statistics = result.scan, self.statistics
+        deadline = self._deadlines.get(scan.sensor)
+        if deadline is None:
+            deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
+        if not scan.unread_ns:  # scans that waited unread came at no pace
+            deadline.follow(scan.time_ns)
+        back = self._silence.follow(scan, deadline.period_ns)
+        if result.pattern is not None and not self._source.patient:  # its scans have another clock
+            done_ns = done_ns or self._clock_ns()
+            statistics.late += deadline.check(scan.time_ns, done_ns)
+            waited_ns = done_ns - scan.time_ns
+            notes = result.notes if waited_ns <= OLD_NS else (*result.notes, waited_note(waited_ns))
+            result = replace(result, latency_us=waited_ns / 1e3, notes=notes)
+        if self._patience_s:
+            self._watch_rest(result)
+        statistics.add(result)
+        statistics.missed = self._silence.missed
+        if back is not None:
+            self._tell(back)
+        if self.sinks:
+            counters = self._count()
+            for sink in self.sinks:
+                sink.write(result, counters)
+        return result
+
+    def _heed(self, notice: Notice) -> None:
+        """Forget readings and taps from before an outage, and report the notice as an event."""
+        if notice.kind in ("lost", "silent", "back"):
+            self._runtime.lose_touch(notice.sensors)
+            self._silence.begin_anew(notice.time_ns, notice.sensors)
+        if notice.text:
+            self._tell(Event.of(notice))
+        else:
+            self._silence.forget(notice.sensors)
+
+    def _tell(self, event: Event) -> None:
+        self.statistics.tell(event)
+        if self.sinks:
+            counters = self._count()
+            for sink in self.sinks:
+                sink.tell(event, counters)
+        self._on_event(event)
+
+    def _count(self) -> dict[str, int]:
+        """Return the counters, with the records that the sinks left out."""
+        self.statistics.unwritten = sum(map(_UNWRITTEN, self.sinks))
+        return self.counters
