@@ -13,7 +13,7 @@ from struct import unpack_from
 import numpy as np
 
 USAGE = "usage: python shm_read.py NAME SENSOR [--pretend]; --pretend acts also on a sensor that is none"
-DEVICE = 1
+SOURCES = ("unknown", "device", "replay", "emulated")
 UNTRUSTED = 0
 
 
@@ -28,24 +28,38 @@ def attach(name: str) -> memoryview:
 
 def latest(memory: memoryview, sensor: str, oldest_s: float = 0.05, pretend: bool = False) -> bytes | None:
     """Return the newest whole result of a sensor, or None unless it is recent and from a device (or `pretend`)."""
+    half = newest(memory).get(sensor)
+    return None if half is None or refusal(half, oldest_s, pretend) else half
+
+
+def refusal(half: bytes, oldest_s: float = 0.05, pretend: bool = False) -> str | None:
+    """Return why nothing may be done by a result; None if it is recent and from a device (or `pretend`)."""
+    age_s = (time.monotonic_ns() - unpack_from("<q", half, 16)[0]) / 1e9
+    if not 0 <= age_s < oldest_s:
+        return f"the newest reading is {age_s:.2f} s old, expected under {oldest_s:g}"
+    (source,) = unpack_from("<i", half, 48)
+    if SOURCES[source] == "device" or pretend:
+        return None
+    return f"its source is {SOURCES[source]}, not a device: --pretend acts on it all the same"
+
+
+def newest(memory: memoryview) -> dict[str, bytes]:
+    """Return the newest whole result of each sensor, whatever its age and source."""
+    found = {}
     header_bytes, slots, slot_bytes, half_bytes, first_half_at = unpack_from("<5I", memory, 12)
     sequences = memory.cast("Q")  # unlike struct, this reads eight bytes in one piece
     for slot_at in range(header_bytes, header_bytes + slots * slot_bytes, slot_bytes):
         for _ in range(100):  # again if it was overwritten during the copy
-            newest = sequences[slot_at // 8]
-            if newest == 0:
-                return None
-            half_at = slot_at + first_half_at + (newest & 1) * half_bytes
+            wanted = sequences[slot_at // 8]
+            if wanted == 0:  # no later slot is in use either
+                return found
+            half_at = slot_at + first_half_at + (wanted & 1) * half_bytes
             half = bytes(memory[half_at : half_at + half_bytes])
-            checksum, _, sequence, time_ns = unpack_from("<IIQq", half)
-            if sequence == newest and checksum == zlib.crc32(memoryview(half)[8:]):
+            checksum, _, sequence = unpack_from("<IIQ", half)
+            if sequence == wanted and checksum == zlib.crc32(memoryview(half)[8:]):
+                found[half[184:440].rstrip(b"\0").decode()] = half
                 break
-        else:
-            return None
-        if half[184:440].rstrip(b"\0").decode() == sensor:
-            young = 0 <= time.monotonic_ns() - time_ns < oldest_s * 1e9
-            return half if young and (pretend or unpack_from("<i", half, 48) == (DEVICE,)) else None
-    return None
+    return found
 
 
 def described(memory: memoryview, half: bytes) -> str:
@@ -61,8 +75,13 @@ def main(name: str, sensor: str, pretend: bool) -> None:
     """Print ten lines a second while the memory exists, attaching each time, because a writer may restart."""
     while True:
         memory = attach(name)
-        half = latest(memory, sensor, pretend=pretend)
-        print("nothing to act on" if half is None else described(memory, half), flush=True)
+        results = newest(memory)
+        half = results.get(sensor)
+        if half is None:
+            why = f"no sensor {sensor}, but {', '.join(results)}" if results else "no scan came yet"
+        else:
+            why = refusal(half, pretend=pretend)
+        print(f"nothing to act on: {why}" if half is None or why else described(memory, half), flush=True)
         time.sleep(0.1)
 
 

@@ -16,7 +16,6 @@ import math
 import os
 import signal
 import sys
-import threading
 import time
 from typing import Protocol
 
@@ -24,6 +23,8 @@ from edge.api import BridgeError, EdgeError, Event, Result, Source, Stream, open
 
 SETTLING_NS = 500_000_000
 """Time after the first reading by which every present sensor must have sent one, in [ns]."""
+TICK_S = 0.005
+"""Pause between two looks at the newest readings, half a period of a sensor, in [s]."""
 
 
 class Gripper(Protocol):
@@ -88,26 +89,21 @@ class Grip:
         self._received_ns: dict[str, int] = {}
         self._free: set[str] = set()
         self._closing = False
-        self._ended = threading.Event()
+        self._ended = False
 
     def run(self, source: Source, model: str, duration_s: float) -> None:
         """Grip; the gripper is stopped whenever this returns or raises."""
         runtime = open_runtime(model, source)
         if self._name is None:
             self._missing = runtime.expected
-        stream = Stream(
-            source,
-            runtime,
-            on_event=self._on_event,
-            on_wait=self._mind_silence,
-            stop=self._ended,
-            duration_s=duration_s,
-        )
+        stream = Stream(source, runtime, on_event=self._on_event, duration_s=duration_s)
         try:
-            for result in stream:
-                self.follow(result)
-                if self._ended.is_set():
-                    return
+            while not (self._ended or stream.ended):
+                time.sleep(TICK_S)
+                for latest in stream.latest_of_all().values():
+                    if latest.new and latest.result is not None and not self._ended:
+                        self.follow(latest.result)
+                self._mind_silence()
             self._end("no more readings: the time is over, or the source")
         finally:
             self._gripper.stop()
@@ -177,10 +173,10 @@ class Grip:
     def _end(self, why: str) -> None:
         if not self._closing:  # not closing yet; it waits until all sensors are ready
             self.why = f"it never began: {why}"
-        elif not self._ended.is_set():
+        elif not self._ended:
             self._gripper.stop()
             self.why = why
-            self._ended.set()
+            self._ended = True
 
 
 def end(number: int, frame: object) -> None:

@@ -2,25 +2,69 @@
 
     pip install '.[export]'
     python train_and_deploy.py bolt.stl --out bolt                    # the real thing, see below
-    python train_and_deploy.py bolt.stl --out bolt --sequences 32 --steps 20    # whether all of it works
+    python train_and_deploy.py bolt.stl --out bolt --minutes 4        # a first model, to see whether all of it works
 
 The file is an STL, OBJ or PLY in millimetres. Its taps are simulated: presses into the pad at random places and
 turns; training adds the noise, drift and dead taxels of real sensors. The defaults, 9000 presses and 16000 steps, are
-those of the bundled networks and take about an hour on two cores. The same command resumes an interrupted run.
+those of the first bundled networks and take about an hour on two cores; before it begins it prints how long they take
+here, by a few presses and steps that it tries. The same command resumes an interrupted run; after --minutes name the
+presses and steps that it printed, as --sequences and --steps.
 
 A network that was trained on one object alone draws that object for every contact, and looks right. Unless nothing
 else can be touched, add --figures 9000: random figures as well, as for the bundled networks.
 """
 
 import argparse
+import contextlib
+import io
 import os
 import sys
+import tempfile
+import time
 from pathlib import Path
 
-from edge.api import BridgeError, EdgeError, Stream, load_model, open_runtime, open_source
+import torch
+
+from edge.api import BridgeError, EdgeError, NoDeviceError, Stream, load_model, open_runtime, open_source
 from export.to_onnx import main as export
 from train.fit import main as fit
 from train.generate import main as generate
+from train.networks.registry import build
+
+NETWORK = "compact-stsr"
+BATCH = 64
+TRIED = 8
+"""Presses, and steps, that are tried for an estimate."""
+REST_STEPS = 150
+"""Steps that take as long as all else: importing, the validation set, the export and its checks."""
+LEAST_SHARE = 0.005
+"""Smallest share of presses and steps, whatever minutes are given."""
+
+
+def tried(mesh: Path) -> tuple[float, float]:
+    """Return how long a press takes with all processors, and a step of training, in [s]."""
+    seconds: list[float] = []
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        for name in ("first", "second"):  # the first one also loads what is loaded once
+            start_s = time.monotonic()
+            taps(Path(folder) / f"{name}.npz", ["--mesh", str(mesh)], TRIED, 1)
+            seconds.append(time.monotonic() - start_s)
+    press_s = min(seconds) / TRIED / len(os.sched_getaffinity(0))
+    net, window, seconds = build(NETWORK, 10), torch.randn(BATCH, 3, 4, 4), []
+    for _ in range(TRIED):
+        start_s = time.monotonic()
+        outputs: tuple[torch.Tensor, ...] = net(window)
+        loss = torch.stack([output.mean() for output in outputs]).sum()
+        torch.autograd.grad(loss, list(net.parameters()), allow_unused=True)
+        seconds.append(time.monotonic() - start_s)
+    return press_s, sorted(seconds)[TRIED // 2]
+
+
+def fitted(minutes: float, presses: int, steps: int, press_s: float, step_s: float) -> tuple[int, int]:
+    """Return fewer presses and steps, in their proportion, that take so many minutes together."""
+    share = (60 * minutes - REST_STEPS * step_s) / (presses * press_s + steps * step_s)
+    share = min(max(share, LEAST_SHARE), 1.0)
+    return max(round(share * presses), 1), max(round(share * steps), 1)
 
 
 def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, seed: int) -> Path:
@@ -32,7 +76,7 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
         kinds = ["--glyphs", str(figures // 2), "--polygons", str(figures - figures // 2)]
         data.append(taps(out / "figures.npz", kinds, figures, seed + 1))
     # python -m train.fit ...
-    network = ["--network", "compact-stsr", "--name", name, "--steps", str(steps), "--seed", str(seed)]
+    network = ["--network", NETWORK, "--name", name, "--steps", str(steps), "--seed", str(seed)]
     fit([str(checkpoints), "--data", *data, *network])
     # python -m export.to_onnx ...; compares ONNX with torch. Its error is on the frozen test set, letters and shapes,
     # so it shows the network's error on objects that it was not trained for.
@@ -51,11 +95,19 @@ def taps(out: Path, surfaces: list[str], count: int, seed: int) -> str:
 
 
 def deploy(model: Path, source_text: str | None, duration_s: float) -> None:
-    """Run the model, as `edge-sr --model FILE` does."""
+    """Run the model, as `edge-sr --model FILE` does; without a source and an adapter, only say how."""
+    then = f"from now on: edge-sr --model {model}"
+    try:
+        source = open_source(*filter(None, [source_text]))
+    except NoDeviceError as error:
+        if source_text is not None:
+            raise
+        print(f"not tried on a sensor: {error}\n{then}")
+        return
     session = load_model(model)
     print(f"{session.name}: error on the frozen test set {session.contract.test_error}")
     patterns = 0
-    with open_source(*filter(None, [source_text])) as source:
+    with source:
         for result in Stream(source, open_runtime(session, source), duration_s=duration_s):
             if result.pattern is not None:
                 patterns += 1
@@ -63,7 +115,7 @@ def deploy(model: Path, source_text: str | None, duration_s: float) -> None:
                     f"{result.source} sensor {result.scan.sensor}: pattern {result.pattern.shape} in "
                     f"{result.pattern_unit}, deepest {result.pattern.max():.2f}, {result.area_mm2:.0f} mm2 touch"
                 )
-    print(f"{patterns} patterns; from now on: edge-sr --model {model}")
+    print(f"{patterns} patterns; {then}")
 
 
 def main() -> None:
@@ -74,19 +126,32 @@ def main() -> None:
     parser.add_argument("--sequences", type=int, default=9000, help="simulated presses (9000)")
     parser.add_argument("--figures", type=int, default=0, help="number of random figures to press in addition (0)")
     parser.add_argument("--steps", type=int, default=16_000, help="training steps (16000)")
+    parser.add_argument("--minutes", type=float, help="take fewer presses and steps, for about so many minutes")
     parser.add_argument("--seed", type=int, default=1, help="seed of everything random (1)")
-    parser.add_argument("--source", help="source to try it on, as for edge-sr (default: the adapter plugged in)")
+    parser.add_argument(
+        "--source", help="source to try it on, as for edge-sr (default: the adapter plugged in, if any)"
+    )
     parser.add_argument("--duration-s", type=float, default=10, help="seconds to try it (10)")
     options = parser.parse_args()
-    model = train(
-        options.mesh,
-        options.out,
-        sequences=options.sequences,
-        figures=options.figures,
-        steps=options.steps,
-        seed=options.seed,
-    )
     try:
+        if options.source is not None:
+            open_source(options.source)  # a form that does not exist is refused now, not after the training
+        press_s, step_s = tried(options.mesh)
+        sequences, figures, steps = options.sequences, options.figures, options.steps
+        if options.minutes is not None:
+            presses, steps = fitted(options.minutes, sequences + figures, steps, press_s, step_s)
+            figures = round(presses * figures / (sequences + figures))
+            sequences = max(presses - figures, 1)
+        simulating, training, rest = (sequences + figures) * press_s, steps * step_s, REST_STEPS * step_s
+        print(
+            f"about {(simulating + training + rest) / 60:.1f} minutes on this machine: {simulating / 60:.1f} to "
+            f"simulate {sequences + figures} presses, {training / 60:.1f} for {steps} steps of training, "
+            f"{rest / 60:.1f} for the rest",
+            flush=True,
+        )
+        start_s = time.monotonic()
+        model = train(options.mesh, options.out, sequences=sequences, figures=figures, steps=steps, seed=options.seed)
+        print(f"trained in {(time.monotonic() - start_s) / 60:.1f} minutes")
         deploy(model, options.source, options.duration_s)
     except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -54,13 +54,14 @@ PARSED = {
     r"torchrun .*": "trains",
     r"python -m edge\.bench\.soak .*": "takes minutes; test_soak runs it",
     r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench, test_zenoh_programs run them",
+    r"python tests/system/hand_soak\.py.*": "takes minutes; test_soak runs it",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
     r"python tests/system/fault_emulator\.py .*--loop.*": "plays until ended; test_fault_bench runs it",
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
-    r"edge-sr (record |replay |--source replay:)FILE( --view)?": "a name is to be filled in; press.mcap is run",
+    r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
 }
 LEFT_OUT = {
     r"git clone .*": "needs the network",
@@ -68,14 +69,20 @@ LEFT_OUT = {
     r"(echo .*\| )?sudo .*": "needs root, and the machine that the adapter is plugged into",
     r"(cmake|export) .*|pip install [\w-]+": "makes, or fetches, what is of others",
     r"ros2 .*": "needs ROS",
+    r"lerobot-record .*|tactile-sr-to-lerobot .*": "needs LeRobot; test_lerobot runs it where that is installed",
+    r"pip install \. \./examples/lerobot_camera_tactile_sr": "fetches LeRobot; test_lerobot imports the package",
+    r"python examples/viewers/rerun_view\.py .*": "needs Rerun; test_mcap_viewers runs it where that is installed",
     r"your-robot-program \| .*": "is the reader's own; test_poses_stdin pipes poses of a program",
     r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm_reading runs it",
     r"python examples/zenoh_listen\.py .*": "goes on until it is ended; test_zenoh runs it",
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
+    r"edge-sr --source demo:loop --sink ros2:.*": "goes on until it is ended; test_six_ways runs it",
+    r"python examples/lerobot_camera_tactile_sr/observe\.py .*": "needs LeRobot; test_six_ways runs it",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
     r"tensorboard .*": "serves until it is ended, and is not ours",
     r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_demo takes one",
     r"mkdocs build .*": "test_site builds the site",
+    r"python tests/system/hot_path\.py": "is run with main; .ci/run and test_hot_path run it",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }
 
@@ -206,7 +213,7 @@ def end_with_enough(monkeypatch) -> None:
 @pytest.mark.parametrize("command", TYPED)
 def test_edge_sr_does_what_is_typed(command, world, monkeypatch, capfd):
     words = shortened(world(command))
-    if "replay" not in command and "demo" not in command:  # which end by themselves
+    if "--view" in words or ("replay" not in command and "demo" not in command):  # the others end by themselves
         end_with_enough(monkeypatch)
     code = cli.main(words[1:])
     out, err = capfd.readouterr()
@@ -311,7 +318,7 @@ def test_options_that_are_spoken_of_exist():
     [
         pytest.param(one.text, id=f"{one.page}-{at}")
         for at, one in enumerate(written_samples.blocks())
-        if one.language == "python"
+        if one.language == "python" and one.page != "recipes.md"  # which test_recipes runs
     ],
 )
 def test_python_of_the_pages_runs(snippet, world):

@@ -41,6 +41,7 @@ FRONT = {
     *(
         "edge.terminal.argument_types",
         "edge.cli.run_options",
+        "edge.cli.silence_hint",
         "edge.doctor.options",
         "edge.bench.options",
     ),  # what may be asked
@@ -53,8 +54,9 @@ FRONT = {
     *(
         "edge.sinks.event_printer",
         "edge.cli.devices_command",
-        "edge.cli.demo_score",
-        "edge.cli.demo_scenes",
+        "edge.cli",
+        "edge.cli.demo_sinks",
+        "firmware_bridge.in_place",
         "edge.terminal.heatmap",
     ),  # what a person reads
     *(
@@ -150,7 +152,9 @@ def test_records_of_the_command_line_are_those_of_the_api(files, options, settin
 def test_a_source_is_used_open_and_once():
     source = open_source("demo")
     for use in (lambda: open_runtime(FakeModel(), source), lambda: next(iter(stream(source)))):
-        with pytest.raises(UsageError, match=r"^source demo is not open: use it in a with statement$"):
+        with pytest.raises(
+            UsageError, match=r"^source demo is not open: use it in a with statement, or call open\(\)$"
+        ):
             use()
     source = Source(FakeLink([[make_scan(n)] for n in range(9)]))
     with source:

@@ -134,7 +134,7 @@ class TestBaseline:
     def test_a_moving_pad_is_3_and_nothing_is_written(self, files, tmp_path):
         moving = write_recording(tmp_path / "moving.npz", range(0, 2000, 10))
         done = run("baseline", "--source", f"replay:{moving}", "--rate-hz", "1000", "--out", tmp_path / "zero.json")
-        assert_refused(done, 3, "sensor 4: taxel (1, 1) z", "keep the pad still and free")
+        assert_refused(done, 3, "sensor 4: nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by")
         assert not (tmp_path / "zero.json").exists()
 
     def test_of_a_recording_a_few_free_scans_are_enough(self, files, tmp_path):
@@ -145,8 +145,21 @@ class TestBaseline:
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert load_baselines(tmp_path / "zero.json")["4"].scans == 40
+        done = run("baseline", "--source", f"replay:{begins_in_contact}", "--out", tmp_path / "free.json")
+        assert "sensor 4: zeroed from its scans 5" in done.stderr
+        assert done.stderr.count("where the pad is still and pressed least\n") == 1
+        free, zero = (load_baselines(tmp_path / f"{name}.json")["4"] for name in ("free", "zero"))
+        assert np.abs(free.counts - zero.counts).max() < 5
+
+    def test_a_recording_that_hardly_changes_may_be_of_a_held_pad(self, tmp_path):
+        """Nothing in it shows that the pad is free, so that is not stated."""
+        for begins in ([400] * 60, []):
+            held = write_recording(tmp_path / "held.npz", [*begins, *[0] * 110])
+            done = run("replay", held)
+            assert "either nothing touches the pad, or it holds something all the time" in done.stderr
+            assert "sensor 4 has no pattern: no contact: its readings never reached" in done.stderr
 
     def test_a_recording_too_short_is_3(self, files, tmp_path):
         source = f"replay:{files}/taps.npz"
-        done = run("baseline", "--source", source, "--rate-hz", "1000", "--out", tmp_path / "zero.json")
+        done = run("baseline", "--source", source, "--rate-hz", "1000", "--skip", "1", "--out", tmp_path / "zero.json")
         assert_refused(done, 3, "ended before 100 complete scans")

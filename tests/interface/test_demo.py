@@ -1,26 +1,34 @@
 import dataclasses
+import re
+from dataclasses import replace
 
+import cli_samples
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_contract, make_scan
+from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
+from pose_samples import make_posed_contract, write_posed_model
+from trust_samples import make_forward, make_posed_trust
 
 from edge.api import load_model
 from edge.cli import main as cli
 from edge.cli import run_command as run
-from edge.cli.demo_scenes import DemoScenes
+from edge.cli.demo_scenes import SLIDE, DemoScenes
 from edge.cli.demo_score import DemoScore, score_picture, score_table
 from edge.errors import UsageError
-from edge.evaluation.metrics import psnr_db, rmse_percent, ssim
-from edge.inference.bundled import DEMO_MODEL, demo_recording
+from edge.evaluation.metrics import psnr_db, rmse_percent
+from edge.inference.bundled import POSED_MODEL, demo_recording
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 
 PRESSES = [0, 0, 2000, 3000, 3500, 0, 2100, 4000, 0]
 TAPS = [-1, -1, 0, 0, -1, -1, 1, 1, -1]
+OPTION = [2500, 4500]
+"""Presses of a tap that may be played in place of the second one."""
 
 
 @pytest.fixture
@@ -34,15 +42,21 @@ def recording(tmp_path):
         tap=np.array(TAPS),
         indentation_mm=np.arange(len(TAPS)) / 8,
         unit_patterns=unit_patterns,
-        angles_deg=np.array([10.0, 15.0]),
+        tap_pose=np.array([[0, 0, 0, 0.2, 1], [0, 0, -5, 0.2, 1]]),
+        scene=np.full(len(TAPS), -1),
+        option_counts=np.stack([make_scan(9, press_counts=press).counts for press in OPTION])[None],
+        option_indentation_mm=np.array([[0.1, 0.2]]),
+        option_unit_patterns=np.full((1, 40, 40), 0.5, dtype=np.float16),
+        option_pose=np.array([[2.35, 0, 0, 0.2, 1]]),
         surface=np.array("S"),
     )
     return path
 
 
 def play(recording, *, lost=(), overtaken=()):
-    score = DemoScore(recording, make_contract())
-    runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
+    model = FakeModel()
+    score = DemoScore(recording, model)
+    runtime = Runtime(model, source="emulated", baselines={"4": BASELINE})
     series = ScanSeries("4", USPA44)
     with np.load(recording) as data:
         for index, counts in enumerate(data["counts"]):
@@ -56,14 +70,13 @@ def test_each_tap_is_scored_at_its_peak_against_that_frames_truth(recording):
     score = play(recording)
     assert (score.surface, score.taps) == ("S", 2)
     first, second = score.scores()
-    assert (first.tap, first.angle_deg, second.tap, second.angle_deg) == (0, 10.0, 1, 15.0)
+    assert (first.tap, first.pose, second.tap, second.pose) == (0, (0, 0, 0), 1, (0, 0, -5))
     assert (first.result.taps_used, second.result.taps_used) == (1, 2)
     for got, frame, unit in ((first, 3, np.kron(np.eye(4), np.ones((10, 10)))), (second, 7, np.ones((40, 40)))):
         assert got.result.force_counts == pytest.approx(PRESSES[frame], abs=40)
         truth = unit * frame / 8
         np.testing.assert_allclose(got.truth, truth)
         assert got.psnr_db == pytest.approx(float(psnr_db(got.result.pattern, truth, 2.0)))
-        assert got.ssim == pytest.approx(float(ssim(got.result.pattern, truth, 2.0)))
         assert got.rmse_percent == pytest.approx(float(rmse_percent(got.result.pattern, truth, 2.0)))
 
 
@@ -78,15 +91,33 @@ def test_without_a_pattern_at_the_peak_the_next_strongest_counts(recording):
     np.testing.assert_allclose(first.truth.max(), 2 / 8)
 
 
+def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(recording):
+    model, score = FakeModel(), None
+    score, runtime = DemoScore(recording, model), Runtime(model, source="emulated", baselines={"4": BASELINE})
+    with np.load(recording) as data:
+        shown = [*data["counts"][:6], *data["option_counts"][0], data["counts"][8]]
+    series = ScanSeries("4", USPA44)
+    for index, counts in enumerate(shown):
+        score.write(runtime.push(series.close(counts.copy(), index * 10_000_000)), {})
+    first, second = score.scores()
+    assert score.complete and second.pose == (2.35, 0, 0)
+    np.testing.assert_allclose(second.truth, 0.1, rtol=1e-3)
+    alone = model.run(
+        np.stack([*model.contract.scale_window(second.result.window[:1]), np.zeros((3, 4, 4))], dtype="f4")
+    )
+    assert second.alone_percent == pytest.approx(float(rmse_percent(alone, second.truth, 2.0)))
+    assert second.alone_percent != second.rmse_percent and first.alone_percent == first.rmse_percent
+
+
 def test_a_tap_without_any_pattern_has_no_score(recording):
-    assert [score.tap for score in play(recording, lost=(2, 3, 4)).scores()] == [1]
+    assert [score.pose for score in play(recording, lost=(2, 3, 4)).scores()] == [(0, 0, -5)]
     assert play(recording, lost=range(9)).scores() == []
 
 
 def test_when_the_last_tap_is_over_it_says_so_once_and_a_second_pass_changes_nothing(recording):
     told = []
     score = DemoScore(
-        recording, make_contract(), lambda score: told.append([one.result.scan.number for one in score.scores()])
+        recording, FakeModel(), lambda score: told.append([one.result.scan.number for one in score.scores()])
     )
     runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
     series = ScanSeries("4", USPA44)
@@ -100,7 +131,7 @@ def test_when_the_last_tap_is_over_it_says_so_once_and_a_second_pass_changes_not
 
 def told_of_scenes(results, path):
     events = []
-    scenes = DemoScenes(path, events.append)
+    scenes = DemoScenes(path, events.append, lambda: pytest.fail("it goes on to no other object"))
     for result in results:
         scenes.write(result, {})
     scenes.close()
@@ -131,42 +162,57 @@ def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
 
 def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
     runtime = Runtime(
-        load_model(DEMO_MODEL), source="emulated", options=RuntimeOptions(every_scan=True, every_tap=True)
+        load_model(POSED_MODEL), source="emulated", options=RuntimeOptions(every_scan=True, every_tap=True)
     )
     series = ScanSeries("4", USPA44)
     with np.load(demo_recording()) as demo:
-        counts, tap, scene = (demo[name] for name in ("counts", "tap", "scene"))
-    results = [runtime.push(series.close(one.astype(np.int32), n * 10_000_000)) for n, one in enumerate(counts)]
+        before = np.argmax(demo["scene"] == SLIDE)
+        counts, tap, scene = (demo[name][:before] for name in ("counts", "tap", "scene"))
+    poses = load_recording(demo_recording()).poses
+    assert poses is not None
+    stated, results = [poses.at(row, 0) for row in range(len(poses))], []
+    for n, one in enumerate(counts):
+        while stated[0].time_ns <= n * 10_000_000:
+            pose = stated.pop(0)
+            assert runtime.pose(pose.pose, pose.time_ns, holds=pose.holds)
+        results.append(runtime.push(series.close(one.astype(np.int32), n * 10_000_000)))
     dropped = [scene[n] for n, one in enumerate(results) for event in one.events if event.kind == "tap_dropped"]
-    assert dropped == [0, 0, 1]
+    assert dropped == [0] * 4 + [0, 1], "the four of the first surface, the foreign one, and the one before the magnet"
     made = np.array([one.pattern is not None for one in results])
     trusted = np.array([one.trusted is True for one in results])
     doubted = np.array([one.trusted is False for one in results])
     assert trusted[made & (tap >= 0)].mean() > 0.95 and trusted[made & (scene == 0)].mean() > 0.95
     assert doubted[made & (scene == 1)].mean() > 0.9
-    assert max(one.taps_used for one, part in zip(results, scene, strict=True) if part >= 0) == 1
+    used = [one.taps_used for one, part in zip(results, scene, strict=True) if part >= 0]
+    assert sum(taps > 1 for taps in used) <= 3, "too light a contact to be told apart for 20 ms"
 
 
 def test_rest_and_foreign_scans_are_not_scored(recording):
-    score = DemoScore(recording, make_contract())
+    score = DemoScore(recording, FakeModel())
     runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
     score.write(runtime.push(make_scan(0, press_counts=9999)), {})
     assert score.scores() == []
 
 
-def test_the_table_has_a_line_a_tap_and_fits_40_columns(recording):
+def test_the_table_has_a_line_a_tap_and_says_what_the_taps_are_worth(recording):
     scores = [
-        dataclasses.replace(s, psnr_db=-12.301, rmse_percent=123.456, ssim=0.98765, angle_deg=30)
+        dataclasses.replace(s, psnr_db=-12.301, rmse_percent=99.99, alone_percent=88.88, pose=(-7.05, 2.35, -15))
         for s in play(recording).scores()
     ]
     scores[0] = dataclasses.replace(scores[0], result=dataclasses.replace(scores[0].result, run_time_us=321.4))
-    lines = score_table(scores).splitlines()
-    assert len(lines) == 2 + 2 and max(map(len, lines)) <= 40
-    assert lines[2].split() == ["1", "30", "1", "-12.30", "0.988", "123.46", "-", "321"]
+    *lines, verdict = score_table(scores).splitlines()
+    assert len(lines) == 2 + 2 and max(map(len, lines)) <= 50
+    assert lines[2].split() == ["1", "-7.0", "2.4", "-15", "1", "-12.30", "99.99", "88.88", "-", "321"]
+    assert "did not fall: 99.99 % of full scale, 88.88 % with it alone" in verdict and "rose" not in verdict
     scores[0] = dataclasses.replace(scores[0], result=dataclasses.replace(scores[0].result, interval_mm=0.1234))
-    lines = score_table(scores).splitlines()
-    assert max(map(len, lines)) <= 40 and lines[2].split()[-2:] == ["123", "321"]
-    assert lines[0].index("+-") + 1 == lines[1].index("um") + 1 == lines[2].index("123", 30) + 2
+    scores[1] = dataclasses.replace(scores[1], rmse_percent=88, alone_percent=99)
+    *lines, verdict = score_table(scores).splitlines()
+    assert max(map(len, lines)) <= 50 and lines[2].split()[-2:] == ["123", "321"]
+    assert lines[0].index("+-") + 1 == lines[1].rindex("um") + 1 == lines[2].index("123", 40) + 2
+    assert "error fell: 88.00" in verdict
+    scores[1] = dataclasses.replace(scores[1], rmse_percent=99.995)
+    assert "rose at tap 2" in score_table(scores)
+    assert score_table(scores[:1]).splitlines()[-1].startswith("Each pattern is of one tap")
 
 
 def test_the_picture_shows_taxels_result_and_truth_on_their_scales(recording):
@@ -185,15 +231,26 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
     with np.load(demo_recording()) as demo:
         tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
+    poses = load_recording(demo_recording()).poses
+    assert poses is not None
     series, sink = ScanSeries("4", USPA44), ListSink()
     link = FakeLink([[series.close(one, n * 10_000_000)] for n, one in enumerate([*counts, *counts])], kind="emulated")
-    link.patient = True
+    link.patient = link.states_poses = True
+    length_ns = len(counts) * 10_000_000
+    waiting = [poses.at(row, again * length_ns) for again in (0, 1) for row in range(len(poses))]
+
+    def stated():
+        now_ns = link.reads * 10_000_000
+        return [waiting.pop(0) for one in tuple(waiting) if one.time_ns < now_ns]
+
+    link.poses = stated
     monkeypatch.setattr(cli, "_open_source", lambda options, give_up_s: Source(link))
     monkeypatch.setattr(run, "open_sink", lambda text, **facts: sink)
     assert cli.main(["--source", "demo:loop", "--sink", "status"]) == 0
     out, err = capfd.readouterr()
     assert out.count("4 of 4 taps scored") == 1 and err.count("continues until Ctrl-C") == 1
-    assert err.count("demo: now another surface is tapped") == err.count("demo: now a magnet comes near") == 2
+    assert out.count("map of a letter of 50 mm") == 1
+    assert all(err.count(f"demo: now {scene}") == 2 for scene in ("another surface", "a magnet", "the pad slides"))
     used: dict[tuple[int, int], set[int]] = {}
     for result in sink.results:
         if result.pattern is not None:
@@ -202,11 +259,47 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     assert max(used[0, 3]) > 1 and used[1, 0] == {1}
 
 
+def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_path):
+    """The whole program with a model that takes poses: each proposal of its records is where the next tap is made."""
+    path = tmp_path / "posed.onnx"
+    trust = replace(make_posed_trust(100.0), forward=make_forward(1e6)).to_json()  # all is believed
+    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
+    write_posed_model(
+        path, make_posed_contract(interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True)
+    )
+    done = cli_samples.run("demo", "--model", str(path), "--rate-hz", "300", "--sink", "jsonl:-")
+    assert done.returncode == 0, done.stderr
+    assert "taps 'S' 4 times, where it is proposed" in done.stderr and "4 of 4 taps scored" in done.stderr
+    results = [one for one in cli_samples.records(done.stdout) if one["state"] != "event"]
+    assert {one["source"] for one in results} == {"emulated"}
+    places, proposed, contact = [], [], False
+    for one in results:
+        if one["contact"] and not contact:
+            places.append((one["pose"]["x_mm"], one["pose"]["y_mm"]))
+        if contact and one["contact"] is False and one["next_tap"] is not None:
+            proposed.append((one["next_tap"]["target"]["x_mm"], one["next_tap"]["target"]["y_mm"]))
+        contact = one["contact"]
+    assert places[0] == (0, 0) and len(set(places[:4])) == 4
+    np.testing.assert_allclose(places[1:4], proposed[:3], atol=0.01)
+    row = r"^ +\d +(-?[\d.]+) +(-?[\d.]+) +0 +(\d) "
+    table = [tuple(map(float, one)) for one in re.findall(row, done.stderr, re.MULTILINE)]
+    np.testing.assert_allclose(table, [(x, y, n) for n, (x, y) in enumerate(places[:4], 1)], atol=0.051)
+    assert len({one["pose"]["x_mm"] for one in results[-250:]}) > 100 and "map of a letter of 50 mm" in done.stderr
+
+
 @pytest.mark.parametrize(
-    ("arguments", "terminal", "source"),
-    [(["--view"], True, "demo:loop"), (["--view"], False, "demo"), ([], True, "demo")],
+    ("arguments", "source"),
+    [
+        (["demo", "--view"], "demo:loop"),
+        (["--source", "demo", "--view", "0"], "demo:loop"),
+        (["demo", "--view", "--sink", "status"], "demo:loop"),
+        (["demo", "--view", "--sink", "jsonl:-"], "demo"),
+        (["demo"], "demo"),
+    ],
 )
-def test_only_who_looks_at_the_page_from_a_terminal_gets_a_demo_without_end(monkeypatch, arguments, terminal, source):
+def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(monkeypatch, arguments, source):
+    """In a container, as a service or before `tee` as well: a page needs no terminal."""
+
     class AskedError(UsageError):
         pass
 
@@ -214,11 +307,11 @@ def test_only_who_looks_at_the_page_from_a_terminal_gets_a_demo_without_end(monk
         raise AskedError(*options.source)
 
     monkeypatch.setattr(cli, "_open_source", ask)
-    monkeypatch.setattr(cli.sys.stdout, "isatty", lambda: terminal)
     monkeypatch.setattr(cli, "_exit_code", lambda error: str(error))
-    assert cli.main(["demo", *arguments]) == source
+    assert cli.main(arguments) == source
 
 
 def test_the_demo_takes_no_other_source(capsys):
-    assert cli.main(["demo", "--source", "gs_usb"]) == 2
-    assert "leave out --source gs_usb" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["demo", "--source", "gs_usb"])
+    assert "unrecognized arguments: --source gs_usb" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -307,5 +308,52 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     )
     assert code == 0, errors
     assert (empty / "ball" / "ball.onnx").is_file() and {path.name for path in empty.iterdir()} == {"ball"}
+    expected = r"about [\d.]+ minutes on this machine: [\d.]+ to simulate 6 presses, [\d.]+ for 2 steps .*"
+    assert re.fullmatch(expected, out[0])
+    assert any(re.fullmatch(r"trained in \d+\.\d minutes", line) for line in out)
     assert any(line.startswith("emulated sensor 4: pattern (40, 40) in mm, ") for line in out)
     assert out[-1].endswith(" patterns; from now on: edge-sr --model ball/ball.onnx")
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """The example on a machine without an adapter, whose training takes no time; it counts its trainings."""
+    spec = importlib.util.spec_from_file_location("train_and_deploy", ROOT / "examples" / "train_and_deploy.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.trainings = []
+    monkeypatch.setattr(module, "train", lambda mesh, out, **_: module.trainings.append(mesh) or out / "ball.onnx")
+    monkeypatch.setattr(module, "tried", lambda mesh: (0.02, 0.2))
+    monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", list)
+    return module
+
+
+def test_the_time_is_printed_before_the_training_and_can_be_chosen(trained, monkeypatch, capsys):
+    words = ["train_and_deploy.py", "ball.stl", "--out", "ball"]
+    monkeypatch.setattr(sys, "argv", words)
+    trained.main()
+    line = "about 56.8 minutes on this machine: 3.0 to simulate 9000 presses, 53.3 for 16000 steps of training, 0.5 for"
+    assert capsys.readouterr().out.startswith(line)
+    monkeypatch.setattr(sys, "argv", [*words, "--minutes", "4", "--figures", "9000"])
+    trained.main()
+    line = "about 4.0 minutes on this machine: 0.4 to simulate 1062 presses, 3.1 for 944 steps of training, 0.5 for"
+    assert capsys.readouterr().out.startswith(line)
+    monkeypatch.setattr(sys, "argv", [*words, "--minutes", "0.5"])  # less than the rest takes
+    trained.main()
+    line = "about 0.8 minutes on this machine: 0.0 to simulate 45 presses, 0.3 for 80 steps of training, 0.5 for"
+    assert capsys.readouterr().out.startswith(line)
+    assert len(trained.trainings) == 3
+
+
+def test_without_a_sensor_the_trained_model_is_the_end_of_it(trained, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball"])
+    trained.main()
+    out = capsys.readouterr().out.splitlines()
+    assert out[2].startswith("not tried on a sensor: ") and out[-1] == "from now on: edge-sr --model ball/ball.onnx"
+
+
+def test_a_source_that_does_not_exist_is_refused_before_the_training(trained, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", "--source", "slcna:x"])
+    with pytest.raises(SystemExit, match=r"train_and_deploy: source is 'slcna:x', expected one of"):
+        trained.main()
+    assert trained.trainings == []

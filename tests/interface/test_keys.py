@@ -125,6 +125,7 @@ def terminal(tmp_path):
 
 
 def test_keys_zero_and_the_terminal_is_given_back_where_it_stops_and_ends(terminal):
+    assert b"keys: r forgets earlier taps, z zeroes" in terminal.shown
     terminal.type("z")
     terminal.until(lambda: any("zeroing refused: sensor 4 is in contact" in event for event in terminal.events()))
     terminal.until(lambda: '"idle"' in terminal.records.read_text())

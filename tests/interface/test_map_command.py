@@ -50,6 +50,7 @@ def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, long, tmp_path):
     assert place == [5, -3] and fused > 3
     assert f"map: {fused} patterns fused" in err and f"; {out} and {picture} written" in err
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "takes none" not in err, "a map uses the poses, whatever the model takes"
 
 
 def test_a_run_without_poses_says_so_and_writes_nothing(files, tmp_path):
@@ -68,6 +69,7 @@ def test_what_cannot_become_a_map_is_refused_before_anything_is_opened(files, tm
     assert_refused(run("map", *source, "--out", tmp_path / "m.mcap"), 2, "ends in .npz")
     assert_refused(run("map", *source, "--out", tmp_path / "m.npz", "--png", tmp_path / "m.jpg"), 2, "ends in .png")
     assert_refused(run("map", *source, "--out", tmp_path / "m.npz", "--size-mm", "9000"), 2, "pixels along a side")
+    assert_refused(run("map", *source, "--out", tmp_path / "m.npz", "--centre-mm", "0", "nan"), 2, "finite numbers")
     assert_refused(run("map", *source, "--out", tmp_path / "m.npz"), 2, "absent.npz")
 
 
@@ -89,9 +91,11 @@ def test_a_map_is_made_by_hand_and_from_a_stream(files):
     with open_recording(files / "taps.npz") as source:
         runtime = open_runtime(files / "tiny.onnx", source, baselines=files / "zero.json")
         by_hand, sink = ObjectMap(), MapSink(ObjectMap())
-        for result in Stream(source, runtime, on_poses=sink.pose):
+        for result in Stream(source, runtime, sinks=[sink]):
             by_hand.add(result, PadPose(1.0, 2.0))
-            sink.write(result, {})
+            if result.scan.number == 9:  # after the first of four taps
+                runtime.pose(PadPose(3.0, 0.0), result.scan.time_ns + 1, "4", holds=True)
     by_hand.finish()
+    sink.close()
     assert by_hand.fused == 4 and np.isfinite(by_hand.layers().contact).any()
-    assert sink.whole.fused == 0 and sink.without_pose == sum([5] * 4)
+    assert sink.without_pose == 5 and sink.whole.fused == 3, "a pose that the runtime was given itself counts"

@@ -9,6 +9,7 @@ import time
 import pytest
 from cli_samples import base_options, files, records, start, wait_for, write_recording
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
+from pose_samples import make_posed_contract
 
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET, CommandLines, Commands
@@ -16,8 +17,11 @@ from edge.pipeline.pose_fields import FURTHEST_AHEAD_NS, PoseError, pose_of_fiel
 from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
 from edge.pipeline.pose_queue import WAITING_POSES, PoseQueue
 from edge.pipeline.pump import pump
+from edge.pipeline.result_rounds import Rounds
+from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
+from firmware_bridge.links.base import Link
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.silence import POSES_SILENT_NS
@@ -98,6 +102,12 @@ class TestLines:
 
 
 class TestQueue:
+    def test_a_message_that_names_no_sensor_is_for_that_of_its_key(self):
+        queue = PoseQueue()
+        for sensor in ("null", '"6"'):
+            queue.put_json(f'{{"x_mm": 1, "y_mm": 0, "sensor": {sensor}}}'.encode(), 0, "4")
+        assert [one.sensor for one in queue.take()] == ["4", "6"]
+
     def test_it_is_bounded_and_the_oldest_are_dropped(self):
         queue = PoseQueue()
         for number in range(WAITING_POSES + 10):
@@ -126,7 +136,7 @@ class TestQueue:
 
 
 def make_runtime():
-    return Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
+    return Runtime(FakeModel(make_posed_contract()), source="device", baselines={"4": BASELINE})
 
 
 def pose(time_ns, x_mm=0.0, sensor=None, holds=False):
@@ -188,6 +198,17 @@ class TestIntake:
         intake.take([], None, 1)
         assert intake.look(10**15) == []
 
+    def test_poses_of_now_do_not_mix_with_those_of_a_recording_that_is_played_at_its_speed(self):
+        queue = PoseQueue()
+        intake = PoseIntake(make_runtime(), queue)
+        queue.put(pose(3))
+        assert [one.time_ns for one in intake.take([], 4, 4)] == [3], "a recording may have none"
+        queue.put(pose(7))
+        assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
+        queue.put(pose(8, sensor="4"))
+        assert intake.take([], 9, 9) == []
+        assert intake.refused == 2 and "has poses of its own" in intake.look(9)[0].text
+
     def test_poses_of_now_are_refused_for_scans_of_another_time(self):
         queue = PoseQueue()
         intake = PoseIntake(make_runtime(), queue, recorded=True)
@@ -221,6 +242,15 @@ def test_poses_come_to_the_sinks_before_the_scans_that_they_serve():
     assert "poses: 1 received, 1 used, 0 refused, 0 dropped" in statistics.summary(source="fake")
 
 
+def test_a_run_without_poses_asks_for_none(monkeypatch):
+    asked = []
+    monkeypatch.setattr(Rounds, "_take_poses", lambda self, taken: asked.append(taken))
+    monkeypatch.setattr(Link, "poses", lambda self: asked.append(self) or [])
+    with Source(FakeLink([[make_scan(0)], [make_scan(1)]])) as source:
+        results = list(Stream(source, make_runtime(), commands=Commands()))
+    assert len(results) == 2 and asked == []
+
+
 def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
     """A robot at 1000 poses/s that dies: every scan gets its record all the same, and one event reports it."""
     recording = write_recording(files / "long.npz", ([0] * 5 + [3000] * 5) * 30)
@@ -245,9 +275,9 @@ def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
         assert process.wait() == 0
     lines = records("".join(out))
     events = [line["event"] for line in lines if line["state"] == "event"]
-    assert events.count("poses_silent") == 1 and events.count("poses_trouble") == 1
+    assert events.count("poses_silent") == 1 and events.count("poses_trouble") == 2
     scans = [line for line in lines if line["state"] != "event"]
     assert [line["scan"] for line in scans] == list(range(300))
     assert f"poses: {sent + 50} received, {sent} used, 50 refused, 0 dropped" in err
-    assert err.count("x_mm is 'left'") == 1
+    assert err.count("x_mm is 'left'") == err.count("takes none, so that each pattern is of one tap: give --model") == 1
     assert scans[-1]["counters"]["poses"] == sent

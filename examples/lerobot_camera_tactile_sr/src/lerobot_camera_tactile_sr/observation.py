@@ -1,0 +1,55 @@
+"""Images and state of LeRobot, made of a result. No I/O."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.api import Contract, Result
+
+AXES = ("x", "y", "z")
+WRENCH = ("force_x_n", "force_y_n", "force_z_n", "torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm")
+BELIEVED = "believed"
+
+
+def believed(result: Result) -> bool:
+    """Return whether the image of a result shows what touches the pad, or that nothing does."""
+    return result.contact is False or (result.pattern is not None and result.trusted is not False)
+
+
+def image_of(result: Result, contract: Contract, full_scale_mm: float, zoom: int = 1) -> NDArray[np.uint8]:
+    """Return an image (H, W, 3): pattern, deviation, and 255 where the image is to be believed.
+
+    Args:
+        result: a result; without a pattern the first two are 0.
+        contract: of its model.
+        full_scale_mm: deformation and deviation that are 255, whatever the result.
+        zoom: side of a pixel of the pattern in the image.
+    """
+    image = np.zeros((*contract.pattern_shape, 3), dtype=np.uint8)
+    for channel, values in enumerate((result.pattern, result.deviation)):
+        if values is not None:
+            image[..., channel] = np.clip(np.rint(values * (255 / full_scale_mm)), 0, 255)
+    image[..., 2] = 255 if believed(result) else 0
+    return image.repeat(zoom, axis=0).repeat(zoom, axis=1)
+
+
+def state_names(contract: Contract) -> list[str]:
+    """Return the names of the numbers that `state_of` gives for a model."""
+    taxels = [f"taxel_{axis}_{taxel}" for axis in AXES for taxel in range(contract.rows * contract.cols)]
+    return [*taxels, *(WRENCH if contract.traction_shape is not None else ()), BELIEVED]
+
+
+def state_of(result: Result, contract: Contract) -> dict[str, float]:
+    """Return taxels in counts over the baseline, the wrench in N and N mm, and whether all of it is to be believed.
+
+    A number that is not available is 0, since datasets cannot hold NaN, and then `believed` is 0: before zeroing, and
+    of a taxel that is dead. Without contact the wrench is 0.
+    """
+    shape = (3, contract.rows, contract.cols)
+    taxels = np.full(shape, np.nan) if result.zeroed is None else result.zeroed.astype(np.float64)
+    numbers = taxels.ravel().tolist()
+    if contract.traction_shape is not None:
+        wrench = result.wrench
+        numbers += [0.0] * 6 if wrench is None else [*wrench.force_n, *wrench.torque_n_mm]
+    known = believed(result) and bool(np.isfinite(numbers).all())
+    finite = np.nan_to_num(numbers, nan=0.0).tolist()
+    return dict(zip(state_names(contract), [*finite, float(known)], strict=True))

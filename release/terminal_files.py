@@ -1,0 +1,98 @@
+"""Completion for bash and zsh, and the man page, generated from the options of every command."""
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any, Final
+
+import shtab
+from argparse_manpage.manpage import Manpage
+
+from edge import __version__
+from edge.bench.options import bench_parser
+from edge.cli.run_options import (
+    baseline_parser,
+    demo_parser,
+    devices_parser,
+    map_parser,
+    models_parser,
+    record_parser,
+    replay_parser,
+    run_parser,
+)
+from edge.doctor.options import doctor_parser
+from edge.inference.bundled import bundled_models
+
+PARSERS: Final = {
+    "demo": demo_parser,
+    "record": record_parser,
+    "replay": replay_parser,
+    "map": map_parser,
+    "models": models_parser,
+    "baseline": baseline_parser,
+    "bench": bench_parser,
+    "devices": devices_parser,
+    "doctor": doctor_parser,
+}
+SHELLS: Final = {
+    "bash": "bash-completion/completions/edge-sr",
+    "zsh": "zsh/site-functions/_edge-sr",
+}
+MAN_PAGE: Final = "man/man1/edge-sr.1"
+PAGE: Final = {
+    "version": __version__,
+    "manual_title": "Tactile super-resolution",
+    "description": "tactile super-resolution at the sensor's rate",
+}
+MAN_COLUMNS: Final = "72"
+"""Width of texts that a man page keeps as they are: 80 columns less the margin."""
+
+
+def write_terminal_files(folder: Path) -> dict[Path, str]:
+    """Write completions and man page below a folder; returns each file's path and its place in an environment.
+
+    Args:
+        folder: an empty folder.
+    """
+    texts = {place: shtab.complete(command_tree(), shell) for shell, place in SHELLS.items()}
+    os.environ["COLUMNS"] = MAN_COLUMNS
+    texts[MAN_PAGE] = str(Manpage(command_tree(), dict(PAGE)))
+    written = {}
+    for place, text in texts.items():
+        path = folder / place
+        path.parent.mkdir(parents=True)
+        path.write_text(text, encoding="utf-8")
+        written[path] = f"share/{place}"
+    return written
+
+
+def command_tree() -> argparse.ArgumentParser:
+    """Return one parser with the commands as subparsers: the form that both generators read."""
+    tree = run_parser()
+    commands: Any = tree.add_subparsers(title="commands", metavar="COMMAND")
+    for name, make in PARSERS.items():
+        one = make()
+        commands.add_parser(
+            name,
+            parents=[one],
+            add_help=False,
+            conflict_handler="resolve",
+            usage=one.usage,
+            help=" ".join((one.description or "").split()),
+            description=one.description,
+            epilog=one.epilog,
+        )
+    for parser in (tree, *commands.choices.values()):
+        for action in parser._actions:
+            _complete(action)
+    return tree
+
+
+def _complete(action: Any) -> None:
+    """Let an argument complete to files, folders or the bundled models."""
+    if action.metavar in ("FILE", "OLD.json"):
+        action.complete = shtab.FILE
+    elif action.metavar == "DIR":
+        action.complete = shtab.DIRECTORY
+    elif "--model" in action.option_strings:
+        action.choices = [path.stem for path in bundled_models()]

@@ -1,0 +1,161 @@
+"""Arrays to patterns in one call, results of two fingers in pairs, and objects that print in a line."""
+
+import weakref
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from cli_samples import write_recording
+from edge_samples import BASELINE, REST, FakeModel, make_scan
+
+import edge
+from edge.api import (
+    Stream,
+    UsageError,
+    infer,
+    load_model,
+    open_recording,
+    open_runtime,
+    paired,
+)
+
+PRESSES = [0] * 5 + [3000] * 5 + [0] * 5
+COUNTS = np.stack([make_scan(number, press_counts=press, noise=3).counts for number, press in enumerate(PRESSES)])
+
+
+def test_an_array_has_the_results_of_a_recording_of_it(tmp_path):
+    results = infer(FakeModel(), COUNTS, BASELINE)
+    with open_recording(write_recording(tmp_path / "taps.npz", PRESSES)) as source:
+        recorded = list(Stream(source, open_runtime(FakeModel(), source, baselines={"4": BASELINE})))
+    assert [result.state for result in results] == [result.state for result in recorded]
+    assert [result.scan.time_ns for result in results] == [10_000_000 * number for number in range(len(PRESSES))]
+    for result, other in zip(results, recorded, strict=True):
+        np.testing.assert_array_equal(result.zeroed, other.zeroed)
+        assert (result.pattern is None) == (other.pattern is None)
+        if result.pattern is not None:
+            np.testing.assert_array_equal(result.pattern, other.pattern)
+    assert results[7].pattern.shape == (40, 40)
+
+
+def test_one_scan_and_counts_of_the_free_pad_are_enough():
+    (result,) = infer(FakeModel(), COUNTS[7], np.stack([REST - 1, REST, REST + 1]).astype(np.uint16))
+    assert result.pattern is not None and result.force_counts == pytest.approx(3000, abs=60)
+    (free,) = infer(FakeModel(), COUNTS[0], REST)
+    assert free.state == "idle" and free.pattern is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"counts": COUNTS.astype(float)}, "counts are of type float64, expected whole numbers: raw counts, nothing"),
+        ({"counts": COUNTS[:, :2]}, r"counts have shape \(15, 2, 4, 4\), expected \(3, rows, cols\) or \(n, 3, rows"),
+        ({"counts": COUNTS[:0]}, r"counts have shape \(0, 3, 4, 4\), expected"),
+        ({"counts": COUNTS - 70_000}, "counts are -.*, expected -1 to 65535"),
+        ({"counts": np.zeros((3, 9, 9), dtype=int)}, "counts have 81 taxels, expected at most 64"),
+        ({"baseline": np.full((3, 4, 4), -1)}, "baseline are -1 to -1, expected 0 to 65535"),
+        ({"baseline": REST[:, :2]}, r"baseline of sensor array has shape \(3, 2, 4\), expected \(3, 4, 4\)"),
+        ({"rate_hz": 0}, "rate_hz is 0, expected a positive number"),
+    ],
+)
+def test_an_array_of_something_else_is_refused(wrong, words):
+    with pytest.raises(UsageError, match=words):
+        infer(FakeModel(), **({"counts": COUNTS, "baseline": REST} | wrong))
+
+
+class Timed:
+    """Result as far as pairing looks at it."""
+
+    def __init__(self, sensor, time_ms):
+        self.scan = SimpleNamespace(sensor=sensor, on_bus_ns=int(time_ms * 1e6))
+
+
+def results_at(**times_ms):
+    """Results, by the time of their scans, of sensors at times."""
+    made = [Timed(name, time_ms) for name, times in times_ms.items() for time_ms in times]
+    return sorted(made, key=lambda result: result.scan.on_bus_ns)
+
+
+def pairs_ms(results, *sensors, **settings):
+    return [
+        tuple(result.scan.on_bus_ns / 1e6 for result in pair) for pair in paired(iter(results), sensors, **settings)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "expected"),
+    [
+        ([0, 10, 20], [3, 13, 23], [(0, 3), (10, 13), (20, 23)]),
+        ([0, 10, 20], [8, 18, 28], [(10, 8), (20, 18)]),  # the nearer neighbour, though it came first
+        ([0, 10, 20, 30], [21], [(20, 21)]),
+        ([0, 10, 20, 30, 40], [1, 41], [(0, 1), (40, 41)]),
+        ([0, 10], [40, 50], []),
+        ([0], [], []),
+    ],
+)
+def test_results_are_paired_with_the_nearest(left, right, expected):
+    assert pairs_ms(results_at(left=left, right=right, other=[2]), "left", "right") == expected
+    swapped = [(b, a) for a, b in expected]
+    assert pairs_ms(results_at(left=left, right=right), "right", "left") == swapped
+
+
+@pytest.mark.parametrize("left", [[0, 10, 20], [0, 50]])
+def test_a_pair_comes_as_soon_as_nothing_can_better_it(left):
+    results = results_at(left=left, right=[3, 13, 23])
+    taken = []
+
+    def follow():
+        for result in results:
+            taken.append(result)
+            yield result
+
+    first = next(paired(follow(), ("left", "right")))
+    assert [result.scan.on_bus_ns for result in first] == [0, 3_000_000] and len(taken) == 3
+
+
+def test_results_that_come_late_in_one_lump_are_paired_all_the_same():
+    left, right = range(0, 2000, 10), range(3, 2000, 10)
+    results = [*results_at(left=left), *results_at(right=right)]
+    assert pairs_ms(results, "left", "right") == list(zip(left, right, strict=True))
+
+
+def test_three_fingers_and_the_longest_time_apart():
+    results = results_at(a=[0, 10, 20], b=[2, 12, 22], c=[9, 19, 29])
+    assert pairs_ms(results, "a", "b", "c") == [(10, 12, 9), (20, 22, 19)]
+    assert pairs_ms(results, "a", "b", "c", apart_s=0.001) == []
+
+
+def test_a_silent_finger_lets_nothing_pile_up():
+    alive, most = weakref.WeakSet(), 0
+
+    def alone():
+        nonlocal most
+        for time_ms in range(0, 30_000, 10):
+            (result,) = results_at(left=[time_ms])
+            alive.add(result)
+            most = max(most, len(alive))
+            yield result
+
+    assert list(paired(alone(), ("left", "right"))) == []
+    assert 0 < most < 1100
+
+
+@pytest.mark.parametrize("sensors", ["left", ["left"], ["left", "left"]])
+def test_a_pair_is_of_two_sensors(sensors):
+    with pytest.raises(UsageError, match="expected two or more different names"):
+        paired([], sensors)
+
+
+def test_what_is_printed_is_a_line(tmp_path):
+    results = infer(FakeModel(), COUNTS, BASELINE)
+    model = load_model("stsr-small-int8")
+    with open_recording(write_recording(tmp_path / "taps.npz", PRESSES)) as source:
+        runtime = open_runtime(model, source, baselines={"4": BASELINE})
+        stream = Stream(source, runtime)
+        next(iter(stream))
+        said = [repr(one) for one in (source, runtime, stream, model, model.contract, BASELINE, results[7].scan)]
+    assert all("\n" not in text and len(text) < 1500 for text in said)
+    assert repr(results[7]).startswith("<Result of scan 7 of sensor 4, replay: contact, 30")
+    assert "pattern (40, 40) to " in repr(results[7]) and repr(results[0]).endswith(" counts>")
+    assert repr(replace(results[7], trusted=False, untrusted_reason="stuck")).endswith(", not trusted (stuck)>")
+    assert edge.__version__.count(".") == 2

@@ -1,0 +1,337 @@
+"""The newest result of a stream: never an old one as if it were new, nothing that piles up, nothing that waits."""
+
+import asyncio
+import itertools
+import math
+import threading
+
+import pytest
+from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
+
+from edge.api import (
+    Baseline,
+    Event,
+    LinkLostError,
+    NoResultError,
+    Stream,
+    UsageError,
+    open_runtime,
+    open_source,
+)
+from edge.pipeline.latest import NewestResults
+from edge.pipeline.scan_reader import Source
+from firmware_bridge.links.base import Notice
+
+BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
+
+
+class StagedLink(FakeLink):
+    """Link whose batches come when the test lets them: one stage each, with notices in front of its scans."""
+
+    def __init__(self, *stages, notices=None, **settings):
+        self.gates = [threading.Event() for _ in stages]
+        self.arrived = [threading.Event() for _ in stages]
+        batches = itertools.chain.from_iterable(zip(self.gates, stages, strict=True))
+        super().__init__(batches, **settings)
+        self._told = dict(notices or {})
+        self._stage = -1
+
+    def read(self, timeout_s):
+        if self._stage >= 0:
+            self.arrived[self._stage].set()
+            self._stage = -1
+        stage = self.reads // 2 if self.reads % 2 else -1
+        scans = super().read(timeout_s)
+        self._stage = stage if stage < len(self.gates) else -1
+        return scans
+
+    def notices(self):
+        return self._told.pop(self._stage, []) if self._stage >= 0 else []
+
+    def let(self, stage):
+        self.gates[stage].set()
+        assert self.arrived[stage].wait(10)
+
+
+def scans(*numbers, sensor="4", press=3000):
+    return [make_scan(number, sensor=sensor, press_counts=press) for number in numbers]
+
+
+def stream_of(source, **settings):
+    return Stream(source, open_runtime(settings.pop("model", FakeModel()), source, baselines=BASELINES), **settings)
+
+
+def test_it_is_the_newest_and_what_it_passed_over_is_counted_and_kept(monkeypatch):
+    link, sink = StagedLink(scans(*range(7)), scans(7), endless=True), ListSink()
+    waits_s = set()
+    with Source(link) as source:
+        take = source.take
+        monkeypatch.setattr(source, "take", lambda timeout_s: waits_s.add(timeout_s) or take(timeout_s))
+        stream = stream_of(source, sinks=[sink], clock_ns=lambda: make_scan(6).time_ns + 5_000_000)
+        before = stream.latest()  # nothing has come, and it does not wait for that
+        assert (before.result, before.age_s, before.link, before.new) == (None, math.inf, "up", False)
+        link.let(0)
+        first = stream.latest()
+        assert first.result.scan.number == 6 and first.result.pattern is not None
+        assert (first.age_s, first.link, first.new, first.skipped) == (0.005, "up", True, 6)
+        again = stream.latest()
+        assert again.result is first.result and (again.new, again.skipped) == (False, 0)
+        link.let(1)
+        assert (stream.latest().skipped, stream.latest().new) == (0, False)
+    assert [result.scan.number for result in sink.results] == [*range(8)] and waits_s == {0.0}
+
+
+def test_an_old_result_is_never_new_and_its_age_grows():
+    ticks = itertools.count(10**9, 10**9)
+    link = StagedLink(scans(0), endless=True)
+    with Source(link) as source:
+        stream = stream_of(source, clock_ns=ticks.__next__)
+        link.let(0)
+        ages_s = [stream.latest().age_s for _ in range(3)]
+        assert stream.latest().new is False
+    assert ages_s[0] >= 0.98 and [round(b - a, 9) for a, b in itertools.pairwise(ages_s)] == [1, 1]
+
+
+def test_it_says_that_the_link_is_lost_and_that_it_is_back():
+    told = {1: [Notice(0, "lost", "gone")], 2: [Notice(0, "back", "there")], 3: [Notice(0, "silent", "quiet")]}
+    link = StagedLink(scans(0), [], scans(1), [], endless=True, notices=told)
+    states = []
+    with Source(link) as source:
+        stream = stream_of(source)
+        for stage in range(4):
+            link.let(stage)
+            latest = stream.latest()
+            states.append((latest.link, latest.new, latest.result.scan.number))
+    assert states == [("up", True, 0), ("lost", False, 0), ("up", True, 1), ("silent", False, 1)]
+
+
+def test_a_link_or_a_sensor_that_is_down_is_so_for_its_own_sensors_alone():
+    newest = NewestResults()
+    states = []
+    for kind, sensor, sensors in (
+        ("lost", None, "left/"),
+        ("silent", "right/4", ""),
+        ("back", None, "left/"),
+        ("trouble", None, "left/"),
+        ("back", "right/4", ""),
+        ("silent", None, ""),
+    ):
+        newest.tell(Event(0, kind, sensor, "", sensors))
+        states.append([newest.take(name, 0).link for name in ("left/4", "right/4", "right/41")])
+    assert states == [
+        ["lost", "up", "up"],
+        ["lost", "silent", "up"],
+        ["up", "silent", "up"],
+        ["up", "silent", "up"],
+        ["up", "up", "up"],
+        ["silent", "silent", "silent"],
+    ]
+
+
+def test_a_link_that_is_lost_for_good_is_an_error_at_every_call():
+    with Source(FakeLink([scans(0)], error=LinkLostError("gone for good"))) as source:
+        stream = stream_of(source)
+        assert stream.read().result.scan.number == 0
+        for call in (stream.read, stream.latest, stream.latest, lambda: next(iter(stream))):
+            with pytest.raises(LinkLostError, match="gone for good"):
+                while True:  # the reader's thread may not be there yet
+                    call()
+
+
+def test_at_the_end_it_says_so():
+    with Source(FakeLink([scans(0)])) as source:
+        stream = stream_of(source, clock_s=lambda: 0.0)
+        assert stream.read().new
+        with pytest.raises(NoResultError, match=r"^no new result: link ended, sensors so far: 4$"):
+            stream.read()
+        latest = stream.latest()
+        assert (latest.link, latest.new, latest.result.scan.number) == ("ended", False, 0)
+        assert list(stream) == []
+
+
+def test_of_two_fingers_each_has_its_own():
+    link = StagedLink(scans(0) + scans(0, sensor="6"), scans(1, 2, sensor="6"), endless=True)
+    with Source(link) as source:
+        stream = stream_of(source)
+        link.let(0)
+        assert stream.latest("4").new and stream.latest("6").new
+        with pytest.raises(UsageError, match="there are sensors 4, 6: name one of them"):
+            stream.latest()
+        link.let(1)
+        both = stream.latest_of_all()
+        assert list(both) == ["4", "6"] and not stream.latest("6").new
+        other, mine = both["4"], both["6"]
+        assert (other.new, other.result.scan.number) == (False, 0)
+        assert (mine.new, mine.skipped, mine.result.scan.number) == (True, 1, 2)
+        assert stream.latest("left/4").age_s == math.inf
+        with pytest.raises(NoResultError, match="no new result of sensor 8: link up, sensors so far: 4, 6"):
+            stream.read("8", timeout_s=0.01)
+
+
+def test_read_waits_for_a_result_that_is_new():
+    link = StagedLink(scans(0), scans(1), endless=True)
+    with Source(link) as source:
+        stream = stream_of(source)
+        with pytest.raises(TimeoutError, match="no new result: link up, sensors so far: none"):
+            stream.read(timeout_s=0.01)
+        link.let(0)
+        assert stream.read().result.scan.number == 0
+        threading.Timer(0.05, link.gates[1].set).start()
+        latest = stream.read(timeout_s=10)
+        assert (latest.result.scan.number, latest.new) == (1, True)
+        with pytest.raises(UsageError, match="timeout_s is 0, expected a positive number"):
+            stream.read(timeout_s=0)
+
+
+def test_a_loop_and_the_newest_share_one_stream():
+    link = StagedLink(scans(0, 1, 2, 3), scans(4), scans(5, 6), endless=True)
+    with Source(link) as source:
+        stream, seen = stream_of(source), []
+        link.let(0)
+        for result in stream:
+            seen.append(result.scan.number)
+            if len(seen) == 2:
+                break
+        link.let(1)
+        latest = stream.latest()  # of those that the loop was in, and of those that came since
+        assert (latest.result.scan.number, latest.skipped) == (4, 2)
+        link.let(2)
+        for result in stream:
+            seen.append(result.scan.number)
+            if len(seen) == 4:
+                break
+        assert stream.latest().new is False
+    assert seen == [0, 1, 5, 6]
+
+
+def test_a_source_is_opened_and_closed_without_a_with_statement():
+    source = Source(FakeLink([scans(0)], endless=True))
+    assert repr(source) == "<Source fake, not open>"
+    assert source.open() is source and repr(source) == "<Source fake, open>"
+    stream = stream_of(source)
+    assert stream.read().new
+    source.close()
+    source.close()
+    assert repr(source) == "<Source fake, closed>"
+    for call in (stream.latest, lambda: list(stream)):
+        with pytest.raises(UsageError, match="source fake is closed"):
+            call()
+    with pytest.raises(UsageError, match="fake was opened before"):
+        source.open()
+
+
+def test_a_recording_at_the_speed_of_its_reader_has_no_latest(tmp_path):
+    class Patient(FakeLink):
+        patient = True
+
+    with Source(Patient([scans(0)])) as source, pytest.raises(UsageError, match=r"without a latest.*paced=True"):
+        stream_of(source).latest()
+
+
+class SlowModel(FakeModel):
+    """Model that runs until the event loop lets it: with a loop that it blocked, it would not end."""
+
+    def __init__(self):
+        self.begun, self.let = threading.Event(), threading.Event()
+        super().__init__(on_run=self.wait)
+
+    def wait(self):
+        self.begun.set()
+        assert self.let.wait(10), "the event loop is blocked"
+
+
+async def until(event):
+    while not event.is_set():
+        await asyncio.sleep(0.001)
+
+
+def test_asyncio_goes_on_while_a_model_runs():
+    async def main():
+        with Source(FakeLink([scans(0), scans(1)])) as source:
+            model = SlowModel()
+
+            async def let():
+                await until(model.begun)
+                model.let.set()
+
+            letting = asyncio.create_task(let())
+            numbers = [result.scan.number async for result in stream_of(source, model=model)]
+            await letting
+            return numbers
+
+    assert asyncio.run(main()) == [0, 1]
+
+
+@pytest.mark.parametrize("way", ["iterate", "read"])
+@pytest.mark.parametrize("when", ["waiting", "running"])
+def test_a_task_that_is_cancelled_loses_no_result(way, when):
+    async def main():
+        link = StagedLink(scans(0), scans(1, press=4000), endless=True)
+        with Source(link) as source:
+            model = SlowModel()
+            stream = stream_of(source, model=model)
+
+            async def follow():
+                if way == "read":
+                    return (await stream.read_async(timeout_s=10)).result.scan.number
+                return (await anext(aiter(stream))).scan.number
+
+            task = asyncio.create_task(follow())
+            if when == "running":
+                link.let(0)
+                await until(model.begun)
+            else:
+                await asyncio.sleep(0.01)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            model.let.set()
+            link.gates[0].set()
+            numbers = [await follow()]
+            link.gates[1].set()
+            return [*numbers, await follow()]
+
+    assert asyncio.run(main()) == [0, 1]
+
+
+def test_a_task_wakes_as_soon_as_scans_wait():
+    async def main():
+        link = StagedLink(scans(0), endless=True)
+        with Source(link) as source:
+            waiting = asyncio.create_task(source.heard(1000))
+            await asyncio.sleep(0)
+            link.gates[0].set()
+            await asyncio.wait_for(waiting, 10)
+            await asyncio.wait_for(source.heard(1000), 10)  # they still wait
+            assert [scan.number for scan in source.take(0)] == [0]
+
+    asyncio.run(main())
+
+
+def test_asyncio_is_told_of_errors_and_of_time():
+    async def main():
+        with Source(FakeLink([scans(0)], error=LinkLostError("gone"))) as source:
+            stream = stream_of(source)
+            assert (await stream.read_async()).new
+            with pytest.raises(LinkLostError):
+                async for _ in stream:
+                    pass
+        assert not [thread for thread in threading.enumerate() if thread.name.startswith("result-stream")]
+        with Source(FakeLink([], endless=True)) as source, pytest.raises(NoResultError, match="link up"):
+            await stream_of(source).read_async(timeout_s=0.01)
+        return threading.active_count()
+
+    assert asyncio.run(main()) == threading.active_count()
+
+
+def test_the_demo_is_followed_beside_other_tasks():
+    async def main():
+        source = open_source("demo", rate_hz=1000).open()
+        try:
+            stream = Stream(source, open_runtime(FakeModel(), source))
+            return [(await stream.read_async()).result.scan.number for _ in range(5)]
+        finally:
+            source.close()
+
+    numbers = asyncio.run(main())
+    assert numbers == sorted(set(numbers))
