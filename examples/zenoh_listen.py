@@ -28,7 +28,8 @@ def unpack(message: bytes) -> tuple[dict, dict[str, np.ndarray]]:
 def tell(line: str) -> None:
     """Print at once, from any thread, since zenoh has its own."""
     try:
-        print(line, flush=True)
+        sys.stdout.write(f"{line}\n")  # in one piece: print would let another thread's line between it and its end
+        sys.stdout.flush()
     except BrokenPipeError:  # the reader has closed
         os._exit(0)
 

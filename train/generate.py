@@ -27,6 +27,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Final, cast
 
@@ -36,7 +37,7 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.dataset import Sequences, join, load_sequences
 from train.data.generation_config import FORCE_N, Generation, one_thread, random_figures, solve_chunk
-from train.data.workers import start_workers
+from train.data.workers import quiet_workers
 from train.errors import DatasetError, TrainError
 from train.surfaces.named_surfaces import PLATES, SURFACES, surface_mesh
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
@@ -141,9 +142,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         config = _config(options)
         total = config.sequences * config.taps
-        if options.jobs and config.chunks > 1:
-            start_workers(options.jobs)
-        made = generate(config, options.out, options.jobs)
+        with quiet_workers(options.jobs) if options.jobs and config.chunks > 1 else nullcontext():
+            made = generate(config, options.out, options.jobs)
     except TrainError as error:
         sys.stderr.write(f"train.generate: {error}\n")
         return 1

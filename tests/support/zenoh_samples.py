@@ -19,7 +19,9 @@ from edge.perception.runtime import Runtime
 zenoh = pytest.importorskip("zenoh")
 
 CONTRACT = make_pad_contract(interval_factor=1.6)
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}", "PYTHONUNBUFFERED": ""}
+ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
+# Buffered output, whatever the machine sets: the rest of an unbuffered write that SIGSTOP interrupts is left out.
+ENVIRONMENT["PYTHONUNBUFFERED"] = ""
 # Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
 CONSUME = """
 import json, sys, time, zenoh
@@ -64,7 +66,9 @@ def listening(endpoint, *connect):
 
 class Consumer:
     def __init__(self, endpoint):
-        self.process = subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE)
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", CONSUME, endpoint], env=ENVIRONMENT, stdout=subprocess.PIPE
+        )
         self.lines = queue.SimpleQueue()
         self.reader = threading.Thread(target=self.read)  # at once: a full pipe would hold up the consumer
         self.reader.start()

@@ -137,15 +137,35 @@ def test_a_users_mesh_that_has_changed_is_another_world(tmp_path):
     assert set(made.family.tolist()) == {f"mesh:{path}"}
 
 
-def test_workers_ignore_an_interruption():
+def test_workers_ignore_an_interruption_those_that_replace_others_too():
     """Else each of them prints a traceback, unless it is killed before."""
-    script = (
-        "import joblib, signal; from train.data.workers import start_workers; start_workers(2); "
-        "asked = (joblib.delayed(signal.getsignal)(signal.SIGINT) for _ in range(8)); "
-        "print(set(joblib.Parallel(n_jobs=2)(asked)) == {signal.SIG_IGN}, signal.getsignal(signal.SIGINT))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("True <built-in function default_int_handler>"), done.stdout
+    script = """
+import os, signal, time, joblib
+from joblib.externals.loky import process_executor
+from train.data.workers import quiet_workers
+
+def ignored(number):
+    time.sleep(0.02)
+    return os.getpid(), signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+
+def ask(count, setting=-1):
+    done = joblib.Parallel(n_jobs=2, batch_size=1)(joblib.delayed(ignored)(number) for number in range(count))
+    return {pid for pid, _ in done}, all(quiet for _, quiet in done)
+
+def grow(number):
+    from joblib.externals.loky import process_executor
+    process_executor._MAX_MEMORY_LEAK_SIZE = -(10**12)  # as if the process had grown
+    process_executor._MEMORY_LEAK_CHECK_DELAY = 0
+
+with quiet_workers(2):
+    first, quiet = ask(8)
+    joblib.Parallel(n_jobs=2, batch_size=1)(joblib.delayed(grow)(number) for number in range(8))
+    later, quiet_later = ask(40)
+    print(quiet, quiet_later, bool(later - first), signal.getsignal(signal.SIGINT) == signal.default_int_handler)
+"""
+    command = [sys.executable, "-W", "ignore", "-c", script]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "True True True True\n", done.stdout
 
 
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):

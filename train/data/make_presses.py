@@ -13,6 +13,7 @@ import shutil
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, cast
@@ -21,7 +22,7 @@ import joblib
 
 from edge.terminal.progress_bar import Progress
 from train.data.presses import PressSet, join_presses, load_presses
-from train.data.workers import start_workers
+from train.data.workers import quiet_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
@@ -88,9 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started_s = time.monotonic()
     try:
         world = _world(options)
-        if world.chunks > 1:
-            start_workers(options.jobs)
-        made = make_presses(world, options.out, options.jobs, compressed=options.compress)
+        with quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
+            made = make_presses(world, options.out, options.jobs, compressed=options.compress)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")
         return 1
