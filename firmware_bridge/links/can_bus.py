@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -84,6 +85,7 @@ class CanBusLink(Link):
         self._errors = BusErrors()
         self._unread = Unread()
         self._device_clock = DeviceClock(TICK_NS, None)
+        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = dict.fromkeys(("frames", "error_frames", "fd_frames"), 0)
         self._bus: Any = None
 
@@ -135,7 +137,9 @@ class CanBusLink(Link):
                 scans = []
             else:
                 self._unread.found(begun_ns, now_ns)
-                scans = self._unread.mark(self._take(message, now_ns), now_ns, self._device_clock.begun_ns)
+                with self._counting:
+                    fed = self._take(message, now_ns)
+                scans = self._unread.mark(fed, now_ns, self._device_clock.begun_ns)
             self.trouble = self._errors.trouble(now_ns)
             left_s = (end_ns - now_ns) / 1e9
             if scans or left_s <= 0:
@@ -143,8 +147,9 @@ class CanBusLink(Link):
 
     def counters(self) -> dict[str, int]:
         """Return the counts of frames by kind, bus and assembler; clock_restarts: steps back of the stamps' clock."""
-        counts = self._counts | {"clock_restarts": self._device_clock.restarts}
-        return counts | self._errors.counters() | self._scans.counters()
+        with self._counting:
+            counts = self._counts | {"clock_restarts": self._device_clock.restarts}
+            return counts | self._errors.counters() | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""

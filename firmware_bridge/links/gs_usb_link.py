@@ -3,6 +3,7 @@
 import array
 import errno
 import math
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -77,6 +78,7 @@ class GsUsbLink(Link):
         self._backend = backend
         self._clock_ns = clock_ns
         self._scans = GsUsbScans(model)
+        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
         self._transfers = 0
         self._unread = Unread()
@@ -125,9 +127,13 @@ class GsUsbLink(Link):
                 self._unread.found(begun_ns, now_ns)
             else:
                 self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
-            scans = self._unread.mark(self._scans.feed(data, now_ns), now_ns, self._scans.clock_begun_ns)
-            if data and len(data) < len(self._packet):
-                self._scans.end_transfer()
+            with self._counting:
+                self._transfers += bool(data)
+                self._received_bytes += len(data)
+                fed = self._scans.feed(data, now_ns)
+                if data and len(data) < len(self._packet):
+                    self._scans.end_transfer()
+            scans = self._unread.mark(fed, now_ns, self._scans.clock_begun_ns)
             self.trouble = self._scans.trouble(now_ns)
             left_ns = end_ns - now_ns
             if scans or left_ns <= 0:
@@ -135,7 +141,8 @@ class GsUsbLink(Link):
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received bytes and transfers, and the counters of decoder, bus and assembler."""
-        return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
+        with self._counting:
+            return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
@@ -151,8 +158,6 @@ class GsUsbLink(Link):
             if error.errno == errno.EINTR:
                 return b""
             raise LinkLostError(f"{self.name}: link lost, the cable or the adapter is gone: {error}") from error
-        self._transfers += 1
-        self._received_bytes += count
         return self._packet[:count].tobytes()
 
     def _claim(self, device: usb.core.Device) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -103,6 +104,7 @@ class SlcanSerialLink(Link):
         self._silent_openings = 0
         self._frames_at_opening = 0
         self._late_stamps_from = (0, 0)
+        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
         self._dropped_bytes = 0
         self._unread = Unread()
@@ -160,8 +162,10 @@ class SlcanSerialLink(Link):
             return []
         scans: list[Scan] = []
         for data, time_ns, self._unread.empty_ns in pieces:
-            self._received_bytes += len(data)
-            scans += self._unread.mark(self._scans.feed(data, time_ns), time_ns, self._scans.clock_begun_ns)
+            with self._counting:
+                self._received_bytes += len(data)
+                fed = self._scans.feed(data, time_ns)
+            scans += self._unread.mark(fed, time_ns, self._scans.clock_begun_ns)
         self._paced.follow(pieces[-1].data, scans)
         if self._questions.due(len(scans), self._scans.decoder.refusals, pieces[-1].time_ns):
             _ask(self._serial, STATUS_FLAGS)
@@ -204,8 +208,9 @@ class SlcanSerialLink(Link):
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received bytes and of bytes dropped on opening or closing, and the stages' counters."""
-        sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
-        return sizes | self._scans.counters()
+        with self._counting:
+            sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
+            return sizes | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""

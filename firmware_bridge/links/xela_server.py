@@ -1,6 +1,7 @@
 """Link to the vendor's server, over WebSocket."""
 
 import socket
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -80,6 +81,7 @@ class XelaServerLink(Link):
         self.url = self._address.url
         self._scans = ServerScans(geometry)
         self._clock_ns = clock_ns
+        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
         self._open = ExitStack()
         self._connection: ClientConnection | None = None
@@ -127,7 +129,8 @@ class XelaServerLink(Link):
 
     def counters(self) -> dict[str, int]:
         """Return the count of received bytes, and the counters of decoder and scans."""
-        return {"received_bytes": self._received_bytes} | self._scans.counters()
+        with self._counting:
+            return {"received_bytes": self._received_bytes} | self._scans.counters()
 
     def _take(self, timeout_s: float) -> list[Scan]:
         scans: list[Scan] = []
@@ -140,8 +143,9 @@ class XelaServerLink(Link):
                     message = connection.recv(timeout_s, decode=False)
                     timeout_s = 0
                     self._received_ns, self._pong = self._clock_ns(), None
-                    self._received_bytes += len(message)
-                    scans += self._scans.feed(message, self._received_ns)
+                    with self._counting:
+                        self._received_bytes += len(message)
+                        scans += self._scans.feed(message, self._received_ns)
             except TimeoutError:
                 self._watch(connection)  # raises at times, if the connection has just closed
         except ConnectionClosed as error:
