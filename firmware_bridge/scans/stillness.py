@@ -2,31 +2,24 @@
 
 It only decides when a scan is handed on, never what it holds: what is not certainly still is handed on at once. Each
 frame is compared with the one of its id that was learnt last, since frames of several sensors mix on a bus, and a read
-may end within a scan. All taxels are compared at once, because after a pause of 10 ms the cost of code is that of
-fetching it, and this is little.
+may end within a scan. All readings are compared at once, as parts of one integer, because after a pause of 10 ms the
+cost of code is that of fetching it, and this is little.
 """
 
 from binascii import unhexlify
-from typing import Any, Final
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Final
 
 from firmware_bridge.can.slcan import PACKED_BYTES, STAMPED_BYTES
 
 STILL_COUNTS: Final = 16
 """Change of one reading up to which it may be noise, in counts: over four standard deviations of a difference."""
-_IDS: Final = 1 << 16
-"""Number of values of an id with its length digit."""
-_UNKNOWN: Final = -(1 << 20)
-"""Reading that none is near."""
-_FORMS: Final = {
-    2 * size + 2: np.dtype(
-        {"names": ["id", "xyz"], "formats": [">u2", (">u2", 3)], "offsets": [0, 3], "itemsize": size}
-    )
-    for size in (PACKED_BYTES, STAMPED_BYTES)
-}
-"""Places of the values in a packed frame, by the length of its line."""
+_FRAME_BYTES: Final = {2 * size + 2: size for size in (PACKED_BYTES, STAMPED_BYTES)}
+"""Bytes of a packed frame, by the length of its line."""
+_XYZ: Final = 3
+"""Place of the readings in a packed frame."""
+_GROUPS: Final = ((0, 2), (1,))
+"""Axes that are compared together: between two readings of a group lie 16 bits or more, into which differences may
+overflow without reaching the next one."""
 
 
 class Stillness:
@@ -34,23 +27,19 @@ class Stillness:
 
     def __init__(self) -> None:
         """Start without readings."""
-        self._rows = np.zeros(_IDS, dtype=np.int16)
-        self._lowest = np.full((1, 3), _UNKNOWN, dtype=np.int32)
+        self._learnt: dict[bytes, bytes] = {}
         self._begun = b""
+        self._ids = b""
+        self._groups: list[tuple[int, int, int]] = []
 
     def learn(self, data: bytes, line_bytes: int) -> None:
         """Take the readings of the whole lines in `data`, if all are usual ones, as those to compare with."""
         end = data.rfind(b"\r") + 1
-        self._begun = data[end:]
+        self._begun, self._ids = data[end:], b""
         frames = _frames(data[end % line_bytes : end], line_bytes)
-        if frames is None:
-            return
-        ids = frames["id"]
-        new = np.unique(ids[self._rows[ids] == 0])
-        if new.size:
-            self._rows[new] = np.arange(len(self._lowest), len(self._lowest) + new.size)
-            self._lowest = np.concatenate([self._lowest, np.zeros((new.size, 3), dtype=np.int32)])
-        self._lowest[self._rows[ids]] = frames["xyz"].astype(np.int32) - STILL_COUNTS
+        size = _FRAME_BYTES[line_bytes]
+        for at in range(0, len(frames), size):
+            self._learnt[frames[at : at + 2]] = frames[at : at + size]
 
     def holds(self, data: bytes, line_bytes: int) -> bool:
         """Return True if every reading is as it was, within noise, up to the last whole line, of which there is one.
@@ -62,19 +51,38 @@ class Stillness:
         text = self._begun + data
         end = text.rfind(b"\r") + 1
         self._begun = text[end:]
-        frames = _frames(text[:end], line_bytes) if end else None
-        if frames is None:
+        frames = _frames(text[:end], line_bytes)
+        size = _FRAME_BYTES[line_bytes]
+        ids = frames[::size] + frames[1::size]
+        if ids != self._ids and not self._choose(ids, size):
             return False
-        above = frames["xyz"] - self._lowest[self._rows[frames["id"]]]
-        return bool(above.view(np.uint32).max() < 2 * STILL_COUNTS)  # one below the lowest is far above
+        readings = int.from_bytes(frames)
+        return bool(ids) and all(
+            not ((readings & mask) + raised_by) & beyond for mask, raised_by, beyond in self._groups
+        )
+
+    def _choose(self, ids: bytes, size: int) -> bool:
+        """Prepare the comparison with frames in this order; False if one of them is unknown or of another length."""
+        count = len(ids) // 2
+        learnt = [self._learnt.get(bytes(pair), b"") for pair in zip(ids[:count], ids[count:], strict=True)]
+        if any(len(frame) != size for frame in learnt):
+            return False
+        before, self._ids, self._groups = int.from_bytes(b"".join(learnt)), ids, []
+        for axes in _GROUPS:
+            lowest_bits = sum(1 << 8 * (size - _XYZ - 2 * axis - 2) for axis in axes)
+            lowest_bits *= sum(1 << 8 * size * frame for frame in range(count))
+            mask = 0xFFFF * lowest_bits
+            raised_by = STILL_COUNTS * lowest_bits - (before & mask)
+            self._groups.append((mask, raised_by, ~((2 * STILL_COUNTS - 1) * lowest_bits)))
+        return True
 
 
-def _frames(text: bytes, line_bytes: int) -> NDArray[Any] | None:
-    """Return ids and readings of usual lines; None if these are not such lines alone."""
+def _frames(text: bytes, line_bytes: int) -> bytes:
+    """Return the usual lines in `text`, packed; nothing if it holds any other."""
     digits = text.translate(None, b"t\r")
-    if len(digits) * line_bytes != len(text) * (line_bytes - 2):
-        return None
+    if len(text) % line_bytes or len(digits) * line_bytes != len(text) * (line_bytes - 2):
+        return b""
     try:
-        return np.frombuffer(unhexlify(digits), _FORMS[line_bytes])
+        return unhexlify(digits)
     except ValueError:
-        return None
+        return b""

@@ -60,7 +60,17 @@ def test_what_is_not_readings_of_a_known_sensor_is_not_still():
     assert stillness.holds(text + text, 26)
     other = lines(rest, stamped=True, rng=rng, ids=[can_id + 1 for can_id, _ in ORDER])
     short = lines(rest, stamped=False, rng=rng)
-    for data in (b"", b"t", text[1:], text.replace(b"8", b"x"), text + b"F00\r", short, other, text + other):
+    for data in (
+        b"",
+        b"t",
+        text[1:],
+        text.replace(b"8", b"x"),
+        text + b"F00\r",
+        text + b"123812345678\r",
+        short,
+        other,
+        text + other,
+    ):
         stillness.learn(text, 26)
         assert not stillness.holds(data, 26), data
     moved = lines(rest + 100, stamped=True, rng=rng)
