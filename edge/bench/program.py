@@ -310,8 +310,10 @@ def _held_to(cores: Collection[int]) -> Iterator[ExitStack]:
 
 def environment() -> dict[str, str]:
     """Return the environment for processes of the program's own parts."""
-    # The child imports the same packages as this process, however they were located.
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])}
+    # The child imports the same packages as this process, however they were located; their bytecode is kept, as that
+    # of an installed program is, or each start would compile them.
+    paths = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
+    return os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
 
 
 def _rest_counts() -> NDArray[np.int64]:
