@@ -47,5 +47,6 @@ SHOWN_AT_REST_S: Final = 0.25
 """Longest time for which a scan without contact may wait until a person sees it, in [s]: well below every silence."""
 GIVEN_UP_S: Final = 10.0
 """Time without a scan after which zeroing and the doctor give up, in [s]: a sensor just plugged in has come by then."""
-POLL_S: Final = 0.1
-"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces."""
+POLL_S: Final = 0.25
+"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces. As
+long as scans at rest may wait, so that these waits seldom end before them: each end wakes two threads."""

@@ -68,7 +68,7 @@ class Commands:
 
     @property
     def full(self) -> bool:
-        """True if no more should be put before the loop takes what waits, at least ten times a second."""
+        """True if no more should be put before the loop takes what waits, at least four times a second."""
         return self._waiting.qsize() >= WAITING
 
     def put(self, command: Command) -> None:

@@ -10,7 +10,7 @@ from edge.pipeline.pose_fields import PoseError, pose_of_fields
 from firmware_bridge.poses.timed_pose import TimedPose
 
 WAITING_POSES: Final = 1024
-"""Poses that may wait, a second at 1000 poses/s: ten times as long as the loop ever waits for a scan."""
+"""Poses that may wait, a second at 1000 poses/s: four times as long as the loop ever waits for a scan."""
 LONGEST_BYTES: Final = 4096
 """Bytes of one message: ten times those of a pose."""
 

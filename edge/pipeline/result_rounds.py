@@ -163,7 +163,7 @@ class Rounds:
         yield from self._patterns()
 
     def _rest(self) -> None:
-        """Let the sinks do what is due, ten times a second while no scan comes."""
+        """Let the sinks do what is due, four times a second while no scan comes."""
         now_s = self._clock_s()
         if self.wait_s or now_s - self._waited_s >= POLL_S:
             self._waited_s = now_s

@@ -57,9 +57,10 @@ class Stillness:
         if ids != self._ids and not self._choose(ids, size):
             return False
         readings = int.from_bytes(frames)
-        return bool(ids) and all(
-            not ((readings & mask) + raised_by) & beyond for mask, raised_by, beyond in self._groups
-        )
+        for mask, raised_by, beyond in self._groups:
+            if ((readings & mask) + raised_by) & beyond:
+                return False
+        return bool(ids)
 
     def _choose(self, ids: bytes, size: int) -> bool:
         """Prepare the comparison with frames in this order; False if one of them is unknown or of another length."""

@@ -230,7 +230,7 @@ def test_a_reset_command_resets_the_runtime():
     resets = []
     runtime = Runtime(FakeModel(), source="device", baselines=BASELINES)
     runtime.reset = lambda: resets.append(1)
-    statistics = run(FakeLink([], endless=True), runtime=runtime, commands=Script({1, 2}), duration_s=0.5)
+    statistics = run(FakeLink([], endless=True), runtime=runtime, commands=Script({1, 2}), duration_s=1.5)
     assert resets == [1, 1]
     assert statistics.commands_refused == 3
 
