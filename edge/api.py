@@ -273,6 +273,7 @@ def open_sink(
     *,
     stop: threading.Event | None = None,
     commands: Commands | None = None,
+    fields: str | None = None,
 ) -> Sink:
     """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
@@ -282,11 +283,14 @@ def open_sink(
         source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
         stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
         commands: those of the stream, for "ros2:TOPIC?commands", which takes zeroing and reset from the robot.
+        fields: those of JSON records, such as "force_n,pattern"; None for all.
 
     Raises:
-        UsageError: the form does not exist (the message lists the forms), or the source is not open.
+        UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open.
         SinkError: it cannot be opened.
     """
+    from edge.sinks.json_encoding import chosen_fields
+
     return forms.open_sink(
         text,
         contract,
@@ -299,6 +303,7 @@ def open_sink(
         origin=source.origin,
         stop=stop,
         commands=commands,
+        fields=None if fields is None else chosen_fields(fields),
     )
 
 

@@ -105,7 +105,14 @@ def run(
         ):
             hint = partial(silence_hint, options.source, source.counters)
             messages = MessageSink(hint=None if source.patient else hint)
-            opener = partial(open_sink, contract=model.contract, source=source, stop=stop, commands=commands)
+            opener = partial(
+                open_sink,
+                contract=model.contract,
+                source=source,
+                stop=stop,
+                commands=commands,
+                fields=options.fields,
+            )
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say, player)
                 print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)

@@ -19,6 +19,7 @@ from edge.cli.run_help import (
     RUN_ABOUT,
     RUN_HELP,
 )
+from edge.errors import UsageError
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
@@ -31,6 +32,7 @@ from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 VIEW_PORT: Final = 8077
 SINK_HELP: Final = "output for results, such as jsonl:-; repeat it for several; edge-sr --help lists all"
 
+_FIELDS_HELP: Final = "fields of JSON records, such as force_n,pattern; others are not made (default: all)"
 _MODEL_HELP: Final = (
     "bundled model, of those that edge-sr models lists, or model file (default "
     f"{DEFAULT_MODEL}; where poses of the pad come, as in the demo, {POSED_MODEL})"
@@ -144,9 +146,9 @@ def replay_parser() -> argparse.ArgumentParser:
     add("--rate-hz", metavar="R", type=positive, help=rate_help)
     add("--duration-s", metavar="T", type=positive, help="stop after T seconds of the recording")
     parser.add_argument_group("model").add_argument("--model", metavar="M", help=_MODEL_HELP)
-    parser.add_argument_group("outputs").add_argument(
-        "--sink", metavar="S", action="append", default=[], help=SINK_HELP
-    )
+    outputs = parser.add_argument_group("outputs").add_argument
+    outputs("--sink", metavar="S", action="append", default=[], help=SINK_HELP)
+    outputs("--fields", metavar="F", help=_FIELDS_HELP)
     _add_view(parser)
     _add_results(parser)
     parser.set_defaults(
@@ -159,12 +161,18 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
     """Parse the options of a run, and check all that can be checked before anything is opened.
 
     Raises:
-        UsageError: a sink does not exist or occurs twice, or thresholds are out of range.
+        UsageError: a sink or a field does not exist, a sink occurs twice, or thresholds are out of range.
     """
     options = parser.parse_args(arguments)
     for text in options.sink:
         check_sink(text)
     check_apart(options.sink)
+    if options.fields is not None:
+        from edge.sinks.json_encoding import chosen_fields
+
+        chosen_fields(options.fields)
+        if not any(text.startswith("jsonl:") for text in options.sink):
+            raise UsageError("--fields requires a sink of JSON records, such as --sink jsonl:-")
     for text in options.poses:
         check_poses(text)
     runtime_options(options)
@@ -218,6 +226,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("outputs").add_argument
     add("--sink", metavar="S", action="append", default=[], help=SINK_HELP)
+    add("--fields", metavar="F", help=_FIELDS_HELP)
     add("--duration-s", metavar="T", type=positive, help="stop after T seconds")
 
 

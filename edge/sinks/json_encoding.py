@@ -1,27 +1,69 @@
 """Record of a result, or of an event: one dictionary for every sink that writes them."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Final
 
+from edge.errors import UsageError
 from edge.perception.event import Event
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
 
-_FIELDS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
-_NAMES: Final = tuple(field.name for field in _FIELDS)
-_COLUMNS: Final = Columns(field.in_record() for field in _FIELDS)
-_LEFT_OUT: Final = tuple(field.name for field in _FIELDS if field.left_out)
+ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "pattern_unit")
+"""Fields of every record: which scan it is of, and whether a robot may act on it."""
+_MAPS: Final = tuple(field.name for field in FIELDS if Out.MAP in field.out)
+_NAMES: Final = tuple(field.name for field in FIELDS if Out.RECORD in field.out)
 
 
-def record(result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
-    """Return a result without its maps; absent is None, masks have bit i for taxel i. Counts may be an array."""
-    fields: dict[str, Any] = dict(zip(_NAMES, _COLUMNS.of(result), strict=True))
-    for name in _LEFT_OUT:
-        if fields[name] is None:
-            del fields[name]
-    fields["counters"] = dict(counters)
-    return fields
+class RecordForm:
+    """Choice of the fields of a record; what is not chosen is not made."""
+
+    def __init__(self, names: Collection[str] | None = None, *, maps: bool = False) -> None:
+        """Choose fields.
+
+        Args:
+            names: of `chosen_fields`, to which those of ALWAYS are added; None for all.
+            maps: append maps: those named, or all.
+        """
+        wanted = {*_NAMES, *_MAPS} if names is None else {*ALWAYS, *names}
+        heads = [field for field in FIELDS if field.name in wanted and Out.RECORD in field.out]
+        appended = [field for field in FIELDS if maps and field.name in wanted and Out.MAP in field.out]
+        self._names = tuple(field.name for field in heads)
+        self._maps = tuple(field.name for field in appended)
+        self._left_out = tuple(field.name for field in heads if field.left_out)
+        self._columns = Columns(field.in_record() for field in (*heads, *appended))
+
+    def of(self, result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
+        """Return a result; absent is None, masks have bit i for taxel i. Counts and maps may be arrays."""
+        values = self._columns.of(result)
+        fields: dict[str, Any] = dict(zip(self._names, values, strict=False))
+        for name in self._left_out:
+            if fields[name] is None:
+                del fields[name]
+        fields["counters"] = dict(counters)
+        fields.update(zip(self._maps, values[len(self._names) :], strict=True))
+        return fields
+
+
+def chosen_fields(text: str) -> frozenset[str]:
+    """Return the names in `text`, which are separated by commas.
+
+    Raises:
+        UsageError: a record has no such field; the message states the nearest one, or all.
+    """
+    from difflib import get_close_matches
+
+    names = frozenset(name.strip() for name in text.split(","))
+    fields = (*_NAMES, *_MAPS)
+    for name in sorted(names - {*fields}):
+        near = get_close_matches(name, fields, n=1)
+        meant = f"did you mean {near[0]}?" if near else f"expected {', '.join(fields)}"
+        raise UsageError(f"no field {name!r}: {meant}")
+    return names
+
+
+record: Final = RecordForm().of
+"""Function from a result and counters to a record without maps."""
 
 
 def event_record(event: Event, counters: Mapping[str, int], source: str | None) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import os
 import stat
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from io import BufferedWriter
 from pathlib import Path
 from typing import Final
@@ -14,16 +14,13 @@ import orjson
 
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
-from edge.perception.field import Columns
 from edge.perception.result import Result
-from edge.perception.result_fields import MAPS
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import event_record, record
+from edge.sinks.json_encoding import RecordForm, event_record
 from edge.sinks.pipe_capacity import has_room, widen
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
-_MAP_NAMES: Final = tuple(field.name for field in MAPS)
-_MAPS: Final = Columns(field.in_record() for field in MAPS)
+_ALL: Final = RecordForm(maps=True)
 _ROOM_S: Final = 0.002
 """Pause between two checks for room in a slow reader's pipe, in [s]; a pipe holds more than comes in meanwhile."""
 
@@ -36,7 +33,13 @@ class JsonLinesSink(Sink):
     """
 
     def __init__(
-        self, target: str, *, lossless: bool = True, source: str | None = None, stop: threading.Event | None = None
+        self,
+        target: str,
+        *,
+        lossless: bool = True,
+        source: str | None = None,
+        stop: threading.Event | None = None,
+        fields: Collection[str] | None = None,
     ) -> None:
         """Open the target; a file that exists is replaced.
 
@@ -45,6 +48,7 @@ class JsonLinesSink(Sink):
             lossless: wait for a slow reader, rather than leave records out.
             source: kind of the source, written with every event.
             stop: set when the run is to end, which ends all patience.
+            fields: those of the records, as `chosen_fields` returns them; None for all.
 
         Raises:
             SinkError: the target cannot be opened.
@@ -52,6 +56,7 @@ class JsonLinesSink(Sink):
         self._target = "stdout" if target == "-" else target
         self._stop = threading.Event() if stop is None else stop
         self._lossless = lossless
+        self._form = _ALL if fields is None else RecordForm(fields, maps=True)
         self._source = source
         self.unwritten = 0
         try:
@@ -65,7 +70,7 @@ class JsonLinesSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record; its counter `unwritten` counts what was left out for this reader only."""
-        self._write(record_line(result, {**counters, "unwritten": self.unwritten}))
+        self._write(record_line(result, {**counters, "unwritten": self.unwritten}, self._form))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
@@ -93,11 +98,9 @@ class JsonLinesSink(Sink):
             return
 
 
-def record_line(result: Result, counters: Mapping[str, int]) -> bytes:
+def record_line(result: Result, counters: Mapping[str, int], form: RecordForm = _ALL) -> bytes:
     """Return a result as one line of JSON, its maps last."""
-    line = record(result, counters)
-    line.update(zip(_MAP_NAMES, _MAPS.of(result), strict=True))
-    return orjson.dumps(line, option=_OPTIONS)
+    return orjson.dumps(form.of(result, counters), option=_OPTIONS)
 
 
 def event_line(event: Event, counters: Mapping[str, int], source: str | None) -> bytes:

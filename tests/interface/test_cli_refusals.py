@@ -57,6 +57,9 @@ class TestRefusals:
         [
             (["--contact-on-counts", "10"], ["on 10", "off 750"]),
             (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "npz:FILE"]),
+            (["--sink", "jsonl:-", "--fields", "force_n,patern"], ["no field 'patern'", "did you mean pattern?"]),
+            (["--sink", "jsonl:-", "--fields", "x"], ["no field 'x'", "expected time_ns, sensor, "]),
+            (["--fields", "force_n"], ["--fields requires a sink of JSON records"]),
             (["--sink", "mcap:/dev/full"], ["'mcap:/dev/full'", "a file whose name ends in .mcap"]),
             (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["'jsonl:-' is there 2 times", "leave one"]),
             (["--sink", "ros2:4fingers"], ["'4fingers'", "no digit first"]),

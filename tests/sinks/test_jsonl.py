@@ -16,6 +16,7 @@ from sink_samples import RUN, make_results, make_sure_results
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
+from edge.sinks.json_encoding import ALWAYS, chosen_fields
 from edge.sinks.jsonl import JsonLinesSink, record_line
 from edge.sinks.pipe_capacity import has_room
 from firmware_bridge.scans.scan import ABSENT, VendorReading
@@ -35,6 +36,24 @@ class TestJsonLines:
         sink.close()
         counters = RUN | {"unwritten": 0}
         assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, counters) for result in results)
+
+    @pytest.mark.parametrize(
+        ("chosen", "more"),
+        [
+            ("force_counts", {"force_counts"}),
+            ("deviation, pattern", {"deviation", "pattern"}),
+            ("trusted,temperature_k", set()),  # a field that is left out where it is unknown
+        ],
+    )
+    def test_a_record_holds_the_fields_that_are_named_and_what_a_robot_must_see(self, chosen, more, tmp_path):
+        whole, path = make_sure_results()[6], tmp_path / "out.jsonl"
+        sink = JsonLinesSink(str(path), fields=chosen_fields(chosen))
+        sink.write(whole, RUN)
+        sink.close()
+        record, expected = json.loads(path.read_bytes()), json.loads(record_line(whole, RUN | {"unwritten": 0}))
+        assert whole.pattern is not None and {"source", "state", "trusted", "pattern_unit"} < record.keys()
+        assert record.keys() == {*ALWAYS, "counters", *more}
+        assert record == {name: expected[name] for name in record}
 
     def test_a_record_says_all_of_a_contact(self):
         ticks = iter([0, 123_456])

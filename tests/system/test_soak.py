@@ -1,4 +1,4 @@
-"""Whole program for a minute, or EDGE_SOAK_MINUTES, and a hand as long; `make test` runs them next to the other tests.
+"""Whole program for a minute, or EDGE_SOAK_MINUTES; `make test` runs it next to the other tests.
 
 Therefore nothing is asserted that these can do to it: no time, and of latency only that its quiet quarter has not
 grown beyond what they may take.
@@ -18,6 +18,8 @@ from edge.bench.program import Line
 from edge.bench.soak import Window, evaluated
 
 MINUTES = float(os.environ.get("EDGE_SOAK_MINUTES", "1"))
+
+HAND_MINUTES = 0.1
 
 STILL = [Window(5.0 * (n + 1), 78.0 + 0.1 * (n % 2), 1000.0 + 100 * (n % 3), 3, 9, 0) for n in range(12)]
 
@@ -42,11 +44,9 @@ def test_memory_stays_flat_and_latency_does_not_drift():
     assert windows[-1]["overruns"] == 0
 
 
-@pytest.mark.soak
-@pytest.mark.timeout(60 * MINUTES + 240)
 def test_accounts_of_a_hand_among_faults_are_consistent():
     """Sixteen sensors on four buses; each scan is in a record or in a counter, each frame in a scan or in a counter."""
-    found, accounts, counters = hand_soak.soak(MINUTES, 16, seed=1)
+    found, accounts, counters = hand_soak.soak(HAND_MINUTES, 16, seed=1)
     assert accounts.broken == []
     assert len(accounts.records) == 16 and sum(accounts.records.values()) > 1000
     assert counters["frames"] > 16 * 1000 and max(window.resident_mb for window in found.windows) < hand_soak.MOST_MB
