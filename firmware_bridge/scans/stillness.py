@@ -7,6 +7,7 @@ cost of code is that of fetching it, and this is little.
 """
 
 from binascii import unhexlify
+from functools import lru_cache
 from typing import Final
 
 from firmware_bridge.can.slcan import PACKED_BYTES, STAMPED_BYTES
@@ -68,14 +69,21 @@ class Stillness:
         learnt = [self._learnt.get(bytes(pair), b"") for pair in zip(ids[:count], ids[count:], strict=True)]
         if any(len(frame) != size for frame in learnt):
             return False
-        before, self._ids, self._groups = int.from_bytes(b"".join(learnt)), ids, []
-        for axes in _GROUPS:
-            lowest_bits = sum(1 << 8 * (size - _XYZ - 2 * axis - 2) for axis in axes)
-            lowest_bits *= sum(1 << 8 * size * frame for frame in range(count))
-            mask = 0xFFFF * lowest_bits
-            raised_by = STILL_COUNTS * lowest_bits - (before & mask)
-            self._groups.append((mask, raised_by, ~((2 * STILL_COUNTS - 1) * lowest_bits)))
+        before, self._ids = int.from_bytes(b"".join(learnt)), ids
+        groups = _groups(size, count)
+        self._groups = [(mask, raised_by - (before & mask), beyond) for mask, raised_by, beyond in groups]
         return True
+
+
+@lru_cache(maxsize=256)
+def _groups(size: int, count: int) -> list[tuple[int, int, int]]:
+    """Return, for so many frames of a size, of each group: its readings' bits, STILL_COUNTS in each, and other bits."""
+    groups: list[tuple[int, int, int]] = []
+    for axes in _GROUPS:
+        lowest_bits = sum(1 << 8 * (size - _XYZ - 2 * axis - 2) for axis in axes)
+        lowest_bits *= sum(1 << 8 * size * frame for frame in range(count))
+        groups.append((0xFFFF * lowest_bits, STILL_COUNTS * lowest_bits, ~((2 * STILL_COUNTS - 1) * lowest_bits)))
+    return groups
 
 
 def _frames(text: bytes, line_bytes: int) -> bytes:
