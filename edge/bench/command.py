@@ -143,7 +143,7 @@ def _make_folder(folder: Path | None) -> None:
 def _facts(subject: Subject) -> Facts:
     if subject.path is None:
         return Facts(subject.name, subject.kind, method_macs(subject.name, subject.scale))
-    macs = macs_of(Path(subject.path))
+    macs = macs_of(Path(subject.path), subjects.taps_of(subject))
     weights = subjects.peer_weights(Path(subject.path)) if subject.kind == "peer" else None
     return Facts(subject.name, subject.kind, macs.count, macs.uncounted, weights)
 

@@ -137,8 +137,22 @@ def _opened_peer(path: Path, threads: int) -> Infer:
     return infer
 
 
-def random_feeds(session: Any, path: Path) -> dict[str, NDArray[np.floating]]:
-    """Return seeded normal numbers for every input; a dimension that is not fixed is 1.
+def taps_of(subject: Subject) -> int:
+    """Return the number of taps of a window, all that the subject takes; 1 for a peer, whose taps are unknown.
+
+    Raises:
+        ModelError: it cannot be used.
+    """
+    return ModelSession(Path(subject.path)).contract.taps if subject.path and subject.kind == "model" else 1
+
+
+def random_feeds(session: Any, path: Path, taps: int = 1) -> dict[str, NDArray[np.floating]]:
+    """Return seeded normal numbers for every input.
+
+    Args:
+        session: of the network.
+        path: of the network.
+        taps: size of each dimension named "taps"; another one that is not fixed is 1.
 
     Raises:
         ModelError: an input is not of floats.
@@ -151,6 +165,6 @@ def random_feeds(session: Any, path: Path) -> dict[str, NDArray[np.floating]]:
             raise ModelError(
                 f"{path}: input {tensor.name} is {tensor.type}, expected floats: export it with float inputs"
             )
-        shape = [size if isinstance(size, int) else 1 for size in tensor.shape]
+        shape = [size if isinstance(size, int) else taps if size == "taps" else 1 for size in tensor.shape]
         feeds[tensor.name] = rng.standard_normal(shape).astype(types[tensor.type])
     return feeds

@@ -68,8 +68,12 @@ _COUNTED: Final[dict[str, Callable[[list[Shape], Shape], int]]] = {
 _UNCOUNTED: Final = frozenset({"LSTM", "GRU", "RNN", "Einsum", "Attention", "MultiHeadAttention", "DeformConv"})
 
 
-def macs_of(path: Path) -> Macs:
+def macs_of(path: Path, taps: int = 1) -> Macs:
     """Run a file once, on random numbers, and count.
+
+    Args:
+        path: of the file.
+        taps: of the window, where the file takes any number.
 
     Raises:
         ModelError: it cannot be run.
@@ -85,7 +89,7 @@ def macs_of(path: Path) -> Macs:
             session = onnxruntime.InferenceSession(
                 read_model(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
-            session.run(None, random_feeds(session, path))
+            session.run(None, random_feeds(session, path, taps))
         except ORT_ERRORS as error:
             raise ModelError(f"{path}: cannot be run to count its multiply-accumulates: {error}") from error
         events = json.loads(Path(session.end_profiling()).read_text())

@@ -6,7 +6,7 @@ import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from edge.bench.contenders import peer_weights
+from edge.bench.contenders import Subject, peer_weights, taps_of
 from edge.bench.macs import counted, macs_of
 from edge.bench.peak import peak_gmac_s, product_model
 from edge.errors import ModelError
@@ -27,6 +27,13 @@ def test_bundled_models_have_those_of_their_network_in_floats_and_in_integers(na
     for path in (find_model(name), find_model(f"{name}-int8")):
         found = macs_of(path)
         assert (found.count, found.uncounted) == (expected, ())
+
+
+def test_a_model_of_any_number_of_taps_has_those_of_as_many_as_it_takes():
+    path = find_model("mtsr7-int8")
+    one, two, seven = (macs_of(path, taps).count for taps in (1, 2, 7))
+    assert one == macs_of(find_model("stsr-int8")).count  # a graph of its own
+    assert one < two < seven and taps_of(Subject("mtsr7-int8", "model", str(path))) == 7
 
 
 def test_a_peer_of_random_weights_says_so_is_seeded_and_has_those_of_its_network(tmp_path):
