@@ -19,7 +19,7 @@ ALL: Final = 500
 PLAIN, IDLE, IDLE_RECORDED = "plain loop", "at rest", "at rest, recorded"
 FAST_HZ: Final = 5000.0
 FAST: Final = f"at rest, {FAST_HZ:g} Hz"
-HELD, MOVING = "held still", "every scan new"
+HELD, MOVING, FEW = "held still", "every scan new", "every scan new, pattern alone"
 TWO, TWO_RECORDED = "two sensors, every scan new", "two sensors, every scan new, recorded"
 TWO_BUSY = "two sensors, every scan new, recorded, other core busy"
 HAND: Final = 16
@@ -85,7 +85,7 @@ class StartUp:
     resident_mb: float
 
 
-ROWS: Final = 9
+ROWS: Final = 10
 """Number of rows that `rows` yields."""
 HAND_ROWS: Final = 4
 """Number of rows that `hand_rows` yields."""
@@ -115,6 +115,7 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
             (IDLE_RECORDED, Play(), (), False),
             (HELD, Play(pressed=ALL), (), False),
             (MOVING, moving, ("--every-scan",), False),
+            (FEW, moving, ("--every-scan", "--fields", "run_time_us,pattern"), False),
             (TWO_RECORDED, two, ("--every-scan",), False),
             (TWO_BUSY, two, ("--every-scan",), True),
             (FAST, Play(rate_hz=FAST_HZ, waits=True), (), False),
