@@ -32,7 +32,9 @@ from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 VIEW_PORT: Final = 8077
 SINK_HELP: Final = "output for results, such as jsonl:-; repeat it for several; edge-sr --help lists all"
 
-_FIELDS_HELP: Final = "fields of JSON records, such as force_n,pattern, in addition to those of every record (default: all)"
+_FIELDS_HELP: Final = (
+    "fields of JSON records, such as force_n,pattern, in addition to those of every record (default: all)"
+)
 _MODEL_HELP: Final = (
     "bundled model, of those that edge-sr models lists, or model file (default "
     f"{DEFAULT_MODEL}; where poses of the pad come, as in the demo, {POSED_MODEL})"

@@ -163,6 +163,22 @@ def test_a_tap_beyond_reach_is_left_out_until_the_pad_comes_near_again():
     assert pad.events == ["tap_out_of_reach"]
 
 
+def test_of_taps_at_one_place_the_newest_counts_alone():
+    """What is wrong with a taxel is wrong in all of them, and would count as seen several times."""
+    pad = Pad(make_runtime(PosedModel(), options=EVERY))
+    for pose, expected_mm in (
+        (PadPose(0, 0), [0]),
+        (PadPose(0.3, 0.3), [0]),
+        (PadPose(0.3, 0.3, 359), [0]),
+        (PadPose(2.3, 0.3), [0, 2]),
+        (PadPose(2.3, 0.3, 3), [0, 2]),  # at the corners .5 mm, root mean square over the pad .4
+        (PadPose(2.3, 0.3, 8), [0, 0, 2]),
+    ):
+        result = pad.tap(pose)
+        assert np.hypot(*result.poses[:, :2].T) == pytest.approx(np.abs(expected_mm), abs=1e-6)
+    assert pad.events == []
+
+
 def test_no_more_taps_than_the_model_takes_the_newest_of_them():
     pad = Pad(make_runtime(PosedModel(make_posed_contract(taps=3)), options=EVERY))
     for number in range(5):
