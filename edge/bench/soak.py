@@ -88,9 +88,9 @@ def soak(minutes: float, sensors: int = 1) -> Soak:
 
 
 def evaluated(windows: Sequence[Window]) -> Soak:
-    """Compute the result of a soak from its windows, three at least."""
+    """Compute the result of a soak from its windows, three at least; the latency is NaN where no pattern was made."""
     third = len(windows) // 3
-    first, last = (np.median([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))
+    first, last = (np.nanmedian([w.quiet_us for w in part]) for part in (windows[:third], windows[-third:]))
     growth, half = slope([w.end_s / 60 for w in windows], [w.resident_mb for w in windows])
     return Soak(windows[-1].end_s / 60, growth, half, float(last / first), tuple(windows))
 

@@ -15,9 +15,9 @@ from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.pose_track import PoseTrack
 
 LEAST_APART_MM: Final = 0.5
-"""Least distance between the pads of two taps, in [mm], root mean square over their taxels: what is wrong with a taxel is
-wrong in the same way in taps at one place, and the model takes it for seen several times. On real grips such taps made
-five times as many holes as one alone (docs/log.md)."""
+"""Least distance between the pads of two taps, in [mm], root mean square over their taxels. The error of a taxel is the
+same in all taps at one place, and the model takes it for seen several times: on real grips such taps made five times as
+many holes as one alone (docs/log.md)."""
 
 
 class PosedTaps(NamedTuple):

@@ -62,11 +62,14 @@ class ScanAssembler:
         """
         self._readings += 1
         self._newest_ns = time_ns
-        sensor = self._sensors.get(reading.sensor)
+        return self._sensor(reading.sensor).feed(reading, time_ns, device)
+
+    def _sensor(self, name: str) -> "_Sensor":
+        sensor = self._sensors.get(name)
         if sensor is None:
-            order = [taxel for _, taxel in self._model.wire_order(reading.sensor)]
-            sensor = self._sensors[reading.sensor] = _Sensor(reading.sensor, self._geometry, order)
-        return sensor.feed(reading, time_ns, device)
+            order = [taxel for _, taxel in self._model.wire_order(name)]
+            sensor = self._sensors[name] = _Sensor(name, self._geometry, order)
+        return sensor
 
     def longest_cycle_ns(self, cycle: Cycle) -> int:
         """Return the longest time, in [ns], that a cycle fed as one may span; 0: feed its readings one by one."""
@@ -96,6 +99,11 @@ class ScanAssembler:
         """Discard open scans: the link broke, and the next readings do not belong to them."""
         for sensor in self._sensors.values():
             sensor.begin_anew()
+
+    def abandon(self, sensor: str, readings: int) -> None:
+        """Count readings of a sensor that were not fed when the link broke; no scan closes by them."""
+        self._readings += readings
+        self._sensor(sensor).counts["abandoned"] += readings
 
     def fewest_missing(self) -> int:
         """Return the number of readings that must come at least before a scan can close whole.

@@ -34,7 +34,6 @@ class SlcanScans:
         self._device = DeviceTime(0, 0)
         self._cycles: dict[bytes, Cycle | None] = {}
         self._mixed = MixedCycles(model)
-        self._newest_ns = 0
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
         self._stillness = Stillness()
@@ -57,7 +56,9 @@ class SlcanScans:
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken; the adapter's clock may have restarted as well."""
         self.decoder.begin_anew()
-        self._give_up_begun(self._newest_ns, [])
+        for number, (frames, _) in self._mixed.begun.items():
+            self._assembler.abandon(self._mixed.names[number], len(frames) // STAMPED_BYTES)
+        self._mixed.begun.clear()
         self._assembler.begin_anew()
         self._clock, self._stamped = _millisecond_clock(), None
 
@@ -95,7 +96,6 @@ class SlcanScans:
 
     def _feed_frames(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan]) -> None:
         """Feed a run of usual frames: the cycles of a sensor that come in one piece, and then the others, parted."""
-        self._newest_ns = time_ns
         start, cycle_bytes = 0, self._taxels * frame_bytes
         stamped = frame_bytes == STAMPED_BYTES
         if not stamped:

@@ -85,6 +85,27 @@ def test_most_whole_cycles_are_decoded_as_such(monkeypatch):
     assert sum(decoded) < 0.1 * len(lines)
 
 
+def test_no_scan_closes_when_a_link_breaks():
+    """Frames wait for the end of their cycle, with a pause among them; whoever breaks the link takes no scan."""
+    seen = 0
+    for seed in range(12):
+        rng = random.Random(seed)
+        scans, got, text, late_ms = SlcanScans(), 0, b"", 0
+        for time_ms, line in on_the_bus(rng, 30, stamped=False, faults=0.02):
+            late_ms += rng.choice([5, 30, 200]) if rng.random() < 0.01 else 0
+            stamp_ms = int(time_ms + late_ms)
+            text += line[:-1] + b"%04X\r" % stamp_ms
+            if rng.random() < 0.05:
+                got, text = got + len(scans.feed(text, stamp_ms * 1_000_000)), b""
+                if rng.random() < 0.2:
+                    seen += len(scans._mixed.begun)
+                    scans.begin_anew()
+        counts = scans.counters()
+        assert counts["scans"] == got > 0
+        assert counts["frames"] == counts["readings"] + counts["foreign"]
+    assert seen > 20
+
+
 def test_without_stamps_nothing_waits_and_a_broken_link_leaves_nothing():
     scans = SlcanScans()
     for stamped in (False, True, False, True):
