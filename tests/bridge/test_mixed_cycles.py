@@ -86,7 +86,7 @@ def test_most_whole_cycles_are_decoded_as_such(monkeypatch):
 
 
 def test_no_scan_closes_when_a_link_breaks():
-    """Frames wait for the end of their cycle, with a pause among them; whoever breaks the link takes no scan."""
+    """Frames wait for the end of their cycle, with a pause among them; a break of the link closes no scan."""
     seen = 0
     for seed in range(12):
         rng = random.Random(seed)

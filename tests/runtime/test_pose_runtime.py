@@ -164,7 +164,7 @@ def test_a_tap_beyond_reach_is_left_out_until_the_pad_comes_near_again():
 
 
 def test_of_taps_at_one_place_the_newest_counts_alone():
-    """What is wrong with a taxel is wrong in all of them, and would count as seen several times."""
+    """The error of a taxel is in all of them, and would count as seen several times."""
     pad = Pad(make_runtime(PosedModel(), options=EVERY))
     for pose, expected_mm in (
         (PadPose(0, 0), [0]),
