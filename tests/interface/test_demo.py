@@ -267,7 +267,8 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     write_posed_model(
         path, make_posed_contract(interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True)
     )
-    done = cli_samples.run("demo", "--model", str(path), "--rate-hz", "300", "--sink", "jsonl:-")
+    # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
+    done = cli_samples.run("demo", "--model", str(path), "--sink", "jsonl:-")
     assert done.returncode == 0, done.stderr
     assert "taps 'S' 4 times, where it is proposed" in done.stderr and "4 of 4 taps scored" in done.stderr
     results = [one for one in cli_samples.records(done.stdout) if one["state"] != "event"]
