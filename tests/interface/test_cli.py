@@ -220,9 +220,7 @@ class TestDemo:
         assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
 
     def test_the_demo_scores_its_taps_and_draws_the_last(self, files):
-        done = run(
-            "--source", "demo", "--model", files / "tiny.onnx", "--rate-hz", "300", env=os.environ | {"COLUMNS": "80"}
-        )
+        done = run("--source", "demo", "--model", files / "tiny.onnx", env=os.environ | {"COLUMNS": "80"})
         assert done.returncode == 0, done.stderr
         assert "demo: an emulated sensor taps" in done.stderr and f"EMULATED demo: {DEMO_SCANS} scans" in done.stderr
         assert "4 of 4 taps scored" in done.stdout
