@@ -289,8 +289,6 @@ def open_sink(
         UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open.
         SinkError: it cannot be opened.
     """
-    from edge.sinks.json_encoding import chosen_fields
-
     return forms.open_sink(
         text,
         contract,
@@ -303,7 +301,7 @@ def open_sink(
         origin=source.origin,
         stop=stop,
         commands=commands,
-        fields=None if fields is None else chosen_fields(fields),
+        fields=fields,
     )
 
 

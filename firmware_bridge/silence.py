@@ -48,5 +48,5 @@ SHOWN_AT_REST_S: Final = 0.25
 GIVEN_UP_S: Final = 10.0
 """Time without a scan after which zeroing and the doctor give up, in [s]: a sensor just plugged in has come by then."""
 POLL_S: Final = 0.25
-"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces. As
-long as scans at rest may wait, so that these waits seldom end before them: each end wakes two threads."""
+"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces.
+Scans at rest come as seldom, so that these waits seldom end before them: each end wakes two threads."""

@@ -112,8 +112,8 @@ class NewestResults:
 
     def why_none(self, sensor: str | None) -> str:
         """Return what is known about a sensor without a new result, in a user's words."""
-        heard = ", ".join(sorted(self._sensors)) or "none"
-        return f"link {self._link(sensor)}, sensors so far: {heard}"
+        names = ", ".join(sorted(self._sensors)) or "none"
+        return f"link {self._link(sensor)}, sensors so far: {names}"
 
     def _of(self, sensor: str | None) -> _Newest | None:
         if sensor is not None:

@@ -298,7 +298,7 @@ class Stream:
         import asyncio
 
         if self._between and not self._source.patient:
-            await self._source.heard(wait_s)
+            await self._source.wait_async(wait_s)
         if self._worker is None:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
         await asyncio.get_running_loop().run_in_executor(self._worker, self._keep_step)

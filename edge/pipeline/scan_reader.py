@@ -194,7 +194,7 @@ class Source:
             self._reader.reading.result()
         return None
 
-    async def heard(self, timeout_s: float) -> None:
+    async def wait_async(self, timeout_s: float) -> None:
         """Return once something waits, or no more will come, or after `timeout_s`; other tasks run meanwhile."""
         import asyncio
 

@@ -7,12 +7,12 @@ from edge.errors import UsageError
 from edge.perception.event import Event
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
-from edge.perception.result_fields import FIELDS
+from edge.perception.result_fields import FIELDS, MAPS
 
 ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "pattern_unit")
 """Fields of every record: which scan it is of, and whether a robot may act on it."""
-_MAPS: Final = tuple(field.name for field in FIELDS if Out.MAP in field.out)
-_NAMES: Final = tuple(field.name for field in FIELDS if Out.RECORD in field.out)
+_HEADS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
+_ALL: Final = tuple(field.name for field in (*_HEADS, *MAPS))
 
 
 class RecordForm:
@@ -25,9 +25,9 @@ class RecordForm:
             names: of `chosen_fields`, to which those of ALWAYS are added; None for all.
             maps: append maps: those named, or all.
         """
-        wanted = {*_NAMES, *_MAPS} if names is None else {*ALWAYS, *names}
-        heads = [field for field in FIELDS if field.name in wanted and Out.RECORD in field.out]
-        appended = [field for field in FIELDS if maps and field.name in wanted and Out.MAP in field.out]
+        wanted = _ALL if names is None else {*ALWAYS, *names}
+        heads = [field for field in _HEADS if field.name in wanted]
+        appended = [field for field in MAPS if maps and field.name in wanted]
         self._names = tuple(field.name for field in heads)
         self._maps = tuple(field.name for field in appended)
         self._left_out = tuple(field.name for field in heads if field.left_out)
@@ -54,10 +54,9 @@ def chosen_fields(text: str) -> frozenset[str]:
     from difflib import get_close_matches
 
     names = frozenset(name.strip() for name in text.split(","))
-    fields = (*_NAMES, *_MAPS)
-    for name in sorted(names - {*fields}):
-        near = get_close_matches(name, fields, n=1)
-        meant = f"did you mean {near[0]}?" if near else f"expected {', '.join(fields)}"
+    for name in sorted(names.difference(_ALL)):
+        near = get_close_matches(name, _ALL, n=1)
+        meant = f"did you mean {near[0]}?" if near else f"expected {', '.join(_ALL)}"
         raise UsageError(f"no field {name!r}: {meant}")
     return names
 

@@ -1,7 +1,7 @@
 """Registry of the sinks, by the names that a user writes."""
 
 import threading
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -69,7 +69,7 @@ def open_sink(
     origin: SourceKind | None = None,
     stop: threading.Event | None = None,
     commands: Commands | None = None,
-    fields: Collection[str] | None = None,
+    fields: str | None = None,
 ) -> Sink:
     """Open the sink that `text` names.
 
@@ -85,7 +85,7 @@ def open_sink(
         origin: kind of source that the scans come from, where a recording names it.
         stop: set when the run is to end: then no slow reader is waited for.
         commands: takes those that come over a sink that was asked to accept them.
-        fields: those of JSON records, as `chosen_fields` returns them; None for all.
+        fields: those of JSON records, such as "force_n,pattern"; None for all.
 
     Raises:
         UsageError: no such form, and the forms are listed; or a sink in metres, and a model whose patterns have no unit
@@ -99,9 +99,11 @@ def open_sink(
 
         return StatusSink()
     if form == "jsonl":
+        from edge.sinks.json_encoding import chosen_fields
         from edge.sinks.jsonl import JsonLinesSink
 
-        return JsonLinesSink(target, lossless=lossless, source=source, stop=stop, fields=fields)
+        chosen = None if fields is None else chosen_fields(fields)
+        return JsonLinesSink(target, lossless=lossless, source=source, stop=stop, fields=chosen)
     if form == "npz":
         from edge.sinks.npz import NpzSink
 

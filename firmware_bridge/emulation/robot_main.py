@@ -75,9 +75,9 @@ class Robot:
             yield from self._sends(track.counts[number], self._poses.get(number))
             number += 1
 
-    def hear(self, told: bytes) -> None:
+    def take(self, text: bytes) -> None:
         """Take lines that ask for the next tap."""
-        *lines, self._partial = (self._partial + told).split(b"\n")
+        *lines, self._partial = (self._partial + text).split(b"\n")
         for asked in map(json.loads, lines):
             if asked == FOLLOW:
                 self._steered = True
@@ -121,7 +121,7 @@ def _emulator(
     robot = Robot(recordings[0], _options(recordings[0].path))
     with suppress(OSError):
         os.set_blocking(sys.stdout.fileno(), False)
-    return Emulator(recordings, **{**usual, "on_scan": robot.state, "played": robot.played, "hear": robot.hear})
+    return Emulator(recordings, **{**usual, "on_scan": robot.state, "played": robot.played, "hear": robot.take})
 
 
 def _options(path: Path) -> dict[str, NDArray[Any]]:

@@ -95,7 +95,8 @@ class CanBusLink(Link):
             self._errors.reopened()  # a socket restarts no controller, and the kernel reports bus-off once
         else:
             self._errors.restarted()
-        self._scans.begin_anew()
+        with self._counting:
+            self._scans.begin_anew()
         self._device_clock.begin_anew()
         self._unread.empty_ns = self._clock_ns()
         self._bus = self._open()

@@ -87,7 +87,8 @@ class GsUsbLink(Link):
         self._packet = array.array("B", bytes(USUAL_PACKET_BYTES))
 
     def __enter__(self) -> Self:
-        self._scans.begin_anew()
+        with self._counting:
+            self._scans.begin_anew()
         described, device = find_gs_usb(self.serial_number, self._backend)
         try:
             self._claim(device)

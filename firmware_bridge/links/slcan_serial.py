@@ -114,8 +114,7 @@ class SlcanSerialLink(Link):
         self._paced = PacedReader(self._scans)
 
     def __enter__(self) -> Self:
-        self._scans.begin_anew()
-        self._dropped_bytes += self._paced.reset()
+        self._begin_anew()
         self._stamps_to_set = None
         self.port = self._plugged.find(serial_ports())
         self._serial = self._open_port()
@@ -274,9 +273,13 @@ class SlcanSerialLink(Link):
             self._drop_old_bytes(port)
             if self._bursts is not None:
                 self._bursts.look()
-        self._scans.begin_anew()
-        self._dropped_bytes += self._paced.reset()
+        self._begin_anew()
         _say(port, OPEN)
+
+    def _begin_anew(self) -> None:
+        with self._counting:
+            self._scans.begin_anew()
+            self._dropped_bytes += self._paced.reset()
 
     def _drop_old_bytes(self, port: serial.Serial) -> None:
         """Drop and count the bytes that arrive before the line falls silent."""

@@ -70,3 +70,24 @@ def test_they_are_of_whole_pieces(opening):
         (other,) = whole
         other.join()
         assert whole[other] == 0, "it was answered in the middle of a piece"
+
+
+@pytest.mark.parametrize("opening", [serial, gs_usb, python_can])
+def test_they_wait_while_a_link_begins_anew(opening):
+    """It moves readings from those that wait to those that are abandoned."""
+    asked = []
+    with opening() as link:
+        begin_anew, early = link._scans.begin_anew, []
+
+        def begin_and_be_asked():
+            other = threading.Thread(target=lambda: asked.append(link.counters()))
+            other.start()
+            other.join(0.1)  # a thread that need not wait is done by then
+            early.append(len(asked))
+            begin_anew()
+
+        link.__exit__(None, None, None)
+        link._scans.begin_anew = begin_and_be_asked
+        link.__enter__()
+        link._scans.begin_anew = begin_anew
+    assert early == [0], "it was answered in the middle"

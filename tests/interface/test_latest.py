@@ -298,11 +298,11 @@ def test_a_task_wakes_as_soon_as_scans_wait():
     async def main():
         link = StagedLink(scans(0), endless=True)
         with Source(link) as source:
-            waiting = asyncio.create_task(source.heard(1000))
+            waiting = asyncio.create_task(source.wait_async(1000))
             await asyncio.sleep(0)
             link.gates[0].set()
             await asyncio.wait_for(waiting, 10)
-            await asyncio.wait_for(source.heard(1000), 10)  # they still wait
+            await asyncio.wait_for(source.wait_async(1000), 10)  # they still wait
             assert [scan.number for scan in source.take(0)] == [0]
 
     asyncio.run(main())
