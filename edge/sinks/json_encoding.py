@@ -9,8 +9,8 @@ from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS, MAPS
 
-ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "pattern_unit")
-"""Fields of every record: which scan it is of, and whether a robot may act on it."""
+ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "note", "pattern_unit")
+"""Fields of every record: which scan it is of, and whether a robot may act on it; `note` names old readings."""
 _HEADS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
 _ALL: Final = tuple(field.name for field in (*_HEADS, *MAPS))
 

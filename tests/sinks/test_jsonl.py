@@ -51,7 +51,7 @@ class TestJsonLines:
         sink.write(whole, RUN)
         sink.close()
         record, expected = json.loads(path.read_bytes()), json.loads(record_line(whole, RUN | {"unwritten": 0}))
-        assert whole.pattern is not None and {"source", "state", "trusted", "pattern_unit"} < record.keys()
+        assert whole.pattern is not None and {"source", "state", "trusted", "note", "pattern_unit"} < record.keys()
         assert record.keys() == {*ALWAYS, "counters", *more}
         assert record == {name: expected[name] for name in record}
 
