@@ -307,6 +307,12 @@ def test_the_injector_says_when_the_link_is_out():
     assert injector.latency_s(6.5, 0.001) == BURST_S and injector.latency_s(7.5, 0.001) == 0.001
 
 
+def test_bursts_may_lie_within_one_another():
+    injector = Injector(parse_stretches("bursts@6+3,bursts@7+.5,bursts@20+1"), Truth())
+    held_s = [injector.latency_s(time_s, 0.001) for time_s in (5.9, 6.0, 7.2, 8.0, 9.0, 20.5, 21.0)]
+    assert held_s == [0.001, BURST_S, BURST_S, BURST_S, 0.001, BURST_S, 0.001]
+
+
 def test_chance_is_the_seeds_alone():
     assert Played("mixed@0+4,lost=.2@0+1", 1).bus == Played("mixed@0+4,lost=.2@0+1", 1).bus
     assert Played("lost=.2@0+1", 1).bus != Played("lost=.2@0+1", 2).bus

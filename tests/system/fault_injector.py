@@ -1,8 +1,10 @@
 """Injector of faults: frames from the bus in, pieces for the reader out."""
 
 import random
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 from fault_frames import FRAME_FAULTS, BusFrame, FrameFault
@@ -65,13 +67,17 @@ class Injector:
         self._waiting = list(enumerate(self.stretches))
         self._active: list[_Active] = []
         self._sent: Counter[int] = Counter()
+        # Asked for at every frame: an hour of a mixture has thousands of stretches.
+        bursts = [one for one in self.stretches if one.name == BURSTS]
+        self._burst_starts_s = [one.start_s for one in bursts]
+        self._burst_ends_s = list(accumulate((one.end_s for one in bursts), max))
         for number, stretch in self._waiting:
             self._start(number, stretch)  # started once for its errors, before anything runs
 
     def latency_s(self, time_s: float, usual_s: float) -> float:
         """Return the time for which the adapter holds back a frame that was on the bus at `time_s`, in [s]."""
-        bursts = any(one.name == BURSTS and one.start_s <= time_s < one.end_s for one in self.stretches)
-        return max(BURST_S, usual_s) if bursts else usual_s
+        begun = bisect_right(self._burst_starts_s, time_s)
+        return max(BURST_S, usual_s) if begun and time_s < self._burst_ends_s[begun - 1] else usual_s
 
     def advance(self, time_s: float) -> list[BusFrame]:
         """Begin and end the faults that are due; return the frames that an ended fault had held back."""
