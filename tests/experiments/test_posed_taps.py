@@ -103,6 +103,23 @@ def test_proposed_taps_in_miniature(models, tmp_path, capsys):
     assert all(row["proposed over turns"] and row["proposed over half-pitch"] for row in rows[1:])
 
 
+def test_limits_of_taps_in_miniature(models, tmp_path, capsys):
+    places = [f"--{place}={tmp_path / place}" for place in ("reports", "data", "checkpoints")]
+    main(["tap-limits", "--quick", *places, f"--models={models}"])
+    report = tmp_path / "reports" / "tap-limits"
+    assert capsys.readouterr().out.endswith(f"{report}.md\n")
+    tables = {}
+    for part in ("", "-known", "-mirrored"):
+        with report.with_name(f"tap-limits{part}.csv").open() as file:
+            tables[part] = list(csv.DictReader(file))
+    assert [row["known"] for row in tables["-known"]] == ["nothing", "pad", "gains", "pad and gains"]
+    figures = {tuple(row[name] for name in row if "dB" in name or "gain of" in name) for row in tables["-known"]}
+    assert len(figures) == 4, "each row knows something else"
+    assert len({row["without"] for row in tables[""]}) == 7
+    plain, both = tables["-mirrored"]
+    assert plain["one tap dB"] != both["one tap dB"] and int(both["one tap us"]) > int(plain["one tap us"])
+
+
 def test_poses_are_off_by_just_so_much():
     true = np.zeros((50, 4, 3), dtype=np.float32)
     poses = _off(true, (2.0, 5.0), (0.2, 1.0))

@@ -21,6 +21,7 @@ EXPERIMENTS: Final = {
     "pads": "the shipped model on pads that are off the nominal one",
     "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
     "posed-taps": "taps from known poses: one to seven, by schedule, and with wrong poses",
+    "tap-limits": "what limits the gain of several taps",
     "proposed-taps": "taps that the runtime proposes, next to taps by schedule",
     "map": "a figure larger than the pad, from slides over it",
     "wrench": "the shipped model's force, twist and centre of pressure",

@@ -19,6 +19,7 @@ from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED
 from train.data.make_presses import make_presses
 from train.data.posed_batches import stated_poses
+from train.data.presses import PressSet
 from train.data.world import World
 from train.experiments.support import kalman_fusion
 from train.experiments.support.shipped import ALL, NOTHING, infer, known_pads
@@ -34,7 +35,8 @@ PEER_ON: Final = World(count=40_000, taps=4, seed=3)
 """Settings of data/taps4.npz in the Makefile, of which the peer is fitted."""
 _COUNT: Final = 420
 _SEED: Final = 2_000_003
-_USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
+USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
+"""Errors of poses, in [mm] and [deg], where a robot states none."""
 _OFF: Final = ((0.2, 0.0), (0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 3.0), (0.0, 5.0))
 """Errors of every earlier tap's pose in the rows on robustness, in [mm] and [deg]."""
 _SHOWN: Final = (1, 2, 3, 4, 7)
@@ -45,7 +47,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses, and its peer, and write the report `posed-taps`."""
     model = ModelSession(bench.use(bench.models / f"{MODEL}.onnx"))
     peer = kalman_fusion.fit(bench.presses("taps4", PEER_ON))
-    sets = {name: _frozen(bench, name, figures=True) for name in SCHEDULES}
+    sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"`{model.name}` (training {model.contract.training_sha256[:12]}) through the runtime's session. Figures that "
@@ -60,14 +62,15 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(rows, "By schedule and number of taps, nothing known of pad and gains.", "schedules")
     known = [row for name in SCHEDULES[:3] for row in _rows(model, None, name, sets[name], ALL, (1, 4, 7))]
     report.table(known, "The same with the pad's constants and the gains known.", "known")
-    wide = _frozen(bench, "mixed", figures=False)
+    wide = freeze_presses(presses_of(bench, "mixed", figures=False), SEED)
     report.table(
         _rows(model, peer, "mixed", wide, NOTHING, (1, 2, 4, 7)),
         f"Every family, as many presses of each ({len(wide)}, sha256 {wide.presses.sha256()[:12]}), in schedules of "
         "all kinds.",
         "families",
     )
-    light = {name: _frozen(bench, name, figures=True, begun=1.0) for name in SCHEDULES}
+    begun = {name: presses_of(bench, name, figures=True, begun=1.0) for name in SCHEDULES}
+    light = {name: freeze_presses(presses, SEED) for name, presses in begun.items()}
     rows = [row for name, one in light.items() for row in _rows(model, peer, name, one, NOTHING, (1, 4, 7))]
     report.table(rows, "The newest press has only begun, at a fifth of the earlier ones' depth and more.", "begun")
     report.table(
@@ -80,7 +83,8 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def _frozen(bench: Workbench, schedule: str, *, figures: bool, begun: float = 0.0) -> FrozenPresses:
+def presses_of(bench: Workbench, schedule: str, *, figures: bool, begun: float = 0.0) -> PressSet:
+    """Return the presses of a schedule, of unseen figures or of every family, that these reports evaluate on."""
     families = dict.fromkeys(FIGURES[1:] if figures else SHARES, 1.0)
     world = World(
         count=_COUNT,
@@ -95,7 +99,7 @@ def _frozen(bench: Workbench, schedule: str, *, figures: bool, begun: float = 0.
     if bench.quick:
         name, world = f"quick-{name}", replace(world, count=8, per_pad=4)
     bench.data_folder.mkdir(parents=True, exist_ok=True)
-    return freeze_presses(make_presses(world, bench.data_folder / f"{name}.npz"), SEED)
+    return make_presses(world, bench.data_folder / f"{name}.npz")
 
 
 def _rows(
@@ -107,7 +111,7 @@ def _rows(
     numbers: tuple[int, ...] = _SHOWN,
 ) -> list[Row]:
     """Return a row for each number of taps."""
-    poses = stated_poses(np.random.default_rng(SEED), frozen.presses.poses, _USUAL)
+    poses = stated_poses(np.random.default_rng(SEED), frozen.presses.poses, USUAL)
     each, alone = np.arange(len(frozen)), _psnr(model, frozen, poses[:, :1], known)[0]
     rows: list[Row] = []
     for taps in numbers:
@@ -129,11 +133,11 @@ def _wrong(model: ModelSession, frozen: FrozenPresses) -> list[Row]:
     rows: list[Row] = []
     for error_mm, error_deg in _OFF:
         row: Row = {"off mm": error_mm, "off deg": error_deg}
-        for name, stated in (("stated", (error_mm, error_deg)), ("not stated", _USUAL)):
+        for name, stated in (("stated", (error_mm, error_deg)), ("not stated", USUAL)):
             poses = _off(true, (error_mm, error_deg), stated)
             found, run_time_us = _psnr(model, frozen, poses, NOTHING)
             row |= {f"over one tap, {name}": with_interval(found - alone, each), "run time us": round(run_time_us)}
-            if stated is _USUAL:
+            if stated is USUAL:
                 windows, left_out = _guarded(model, frozen.windows(_WINDOW), poses)
                 done = infer(model, windows, known_pads(frozen, NOTHING), np.where(left_out[..., None], 0, poses))
                 found = psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM)
