@@ -40,6 +40,7 @@ from edge.cli.run_options import runtime_options
 from edge.cli.silence_hint import silence_hint
 from edge.cli.user_commands import user_commands
 from edge.sinks.event_printer import MessageSink
+from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def run(
         BridgeError: the source cannot be used.
     """
     stdout_taken = "jsonl:-" in options.sink
+    share_one_heap()
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
     with stop_on_signals() as stop, user_commands() as commands:
@@ -135,6 +137,7 @@ def run(
                 counts_per_newton=options.counts_per_newton,
                 **asdict(asked),
             )
+            give_back()
             sinks: list[Sink] = []
             if played is not None:
                 sinks += played.sinks([messages, *(() if view is None else view.sinks)], commands)

@@ -1,6 +1,5 @@
 """Zeroing: the baseline of a free pad, and the difference of a scan to it. Counts wrap round at 2^16."""
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,6 +17,7 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
+from firmware_bridge.zeroing.sha256 import sha256_hex
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
@@ -97,8 +97,8 @@ class Baseline:
         """Return a baseline of counts (3, rows, cols), with its id."""
         own = np.array(counts, dtype=np.float32)
         own.setflags(write=False)
-        digest = hashlib.sha256(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
-        return cls(sensor, own, created_unix_s, scans, origin, digest.hexdigest()[:8])
+        digest = sha256_hex(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
+        return cls(sensor, own, created_unix_s, scans, origin, digest[:8])
 
     def age_s(self, now_unix_s: float) -> float:
         """Return its age at `now_unix_s`, in [s]."""

@@ -48,9 +48,10 @@ FRONT = {
     *(
         "edge.cli.user_commands",
         "edge.terminal.stop_signals",
+        "edge.terminal.heap",
         "edge.cli.standard_streams",
         "edge.cli.realtime",
-    ),  # keys, lines, signals, ...: of a process
+    ),  # keys, lines, signals, memory, ...: of a process
     *(
         "edge.sinks.event_printer",
         "edge.cli.devices_command",
