@@ -50,6 +50,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(BIN)/edge-sr bench --system --out reports/system
 	$(REPORT) tests/system/cycles.py --out reports/cycles.md
 	$(BIN)/python tests/system/faults.py 10 --seed 2 --out reports
+	$(BIN)/python tests/system/hand_soak.py 60 --out reports
 	$(BIN)/python tests/system/zenoh_load.py --out reports
 	$(REPORT) tests/system/fuzz.py --inputs 10000000 --seed 1 --blind --out reports/fuzz.md
 	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
