@@ -17,6 +17,8 @@ FOREIGN: Final = 255
 BEFORE: Final = -1
 """Place of frames that came before the present ones."""
 _IDS: Final = 1 << 11
+_TWO_BYTES: Final = np.dtype(">u2")
+"""The first two of a frame: its id, and 4 bits of its length."""
 
 
 class MixedCycles:
@@ -47,13 +49,19 @@ class MixedCycles:
             time_ns: monotonic time of their arrival, in [ns].
             waits: True to let begun cycles wait; those that came so far are returned if they do not go on.
         """
-        frames = np.frombuffer(packed, dtype=np.uint8).reshape(-1, frame_bytes)
-        ids = frames[:, 0].astype(np.uint16) << 4 | frames[:, 1] >> 4
-        sensors, places = self._sensors[ids], self._places[ids]
+        ids = np.frombuffer(packed, dtype=_TWO_BYTES)[:: frame_bytes // 2] >> 4
+        sensors = self._sensors[ids]
+        # Sorted once: to look for the frames of each sensor takes as long for every sensor as this for all.
+        by_sensor = sensors.argsort(kind="stable")
+        frames = np.frombuffer(packed, dtype=f"V{frame_bytes}")[by_sensor].tobytes()
+        all_places, all_at = self._places[ids[by_sensor]].tobytes(), by_sensor.tolist()
+        numbers = sensors[by_sensor].tobytes()
         parted: list[tuple[int, bytes]] = []
-        for number in set(sensors.tobytes()):
-            mine = np.flatnonzero(sensors == number)
-            text, order, at = frames[mine].tobytes(), places[mine].tobytes(), mine.tolist()
+        end = 0
+        while end < len(numbers):
+            first, number = end, numbers[end]
+            end += numbers.count(number)
+            text, order, at = frames[first * frame_bytes : end * frame_bytes], all_places[first:end], all_at[first:end]
             begun, since_ns = self.begun.pop(number, (b"", time_ns))
             if begun:
                 count = len(begun) // frame_bytes
