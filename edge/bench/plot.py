@@ -53,7 +53,7 @@ def draw(rows: Sequence[FrontRow], path: Path, title: str) -> None:
                 fontsize=7,
                 va="center",
                 color=colours[i],
-                arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": "0.6"},
+                arrowprops={"arrowstyle": "-", "linewidth": 0.4, "color": "0.6", "relpos": (0, 0.5)},
                 annotation_clip=False,
             )
         axes.set(xscale="log", xlabel=label)

@@ -90,9 +90,10 @@ def run_time_text(peak_gmac_s: dict[int, float]) -> str:
         f"{peak:.0f} GMAC/s on {threads} thread{'s' * (threads > 1)}" for threads, peak in peak_gmac_s.items()
     )
     return (
-        "Each row in a process of its own; run times do not depend on the taps given. Missed: ticks whose inference "
-        "was not done when the next was due. Start-up is from the spawn to the first pattern, MB the most memory "
-        "resident till then. % of peak is of the best float32 matrix product of numpy or onnxruntime, measured in this "
+        "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is "
+        "faster with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due. "
+        "Start-up is from the spawn to the first pattern, MB the most memory resident till then. % of peak is of the "
+        "best float32 matrix product of numpy or onnxruntime, measured in this "
         f"run: {peaks}. Rows in 8-bit integers may pass 100 %, as one instruction does more of them."
     )
 
