@@ -1,4 +1,4 @@
-"""Take the pictures of the live page: an emulated sensor taps the demo's letter four times, and stays on it.
+"""Take the pictures of the live page: an emulated sensor taps the demo's figure four times, and stays on it.
 
 python docs/live_pictures.py        # needs playwright, and chromium of the system
 """

@@ -11,7 +11,7 @@ from firmware_bridge.poses.pad_pose import PadPose
 
 
 class DemoRobot(Sink):
-    """Sink that passes on the proposal after each tap of the demo's letter, or that there is none."""
+    """Sink that passes on the proposal after each tap of the demo's figure, or that there is none."""
 
     def __init__(self, recording: Path, touch: Callable[[PadPose | None], object]) -> None:
         """Load the taps.

@@ -61,7 +61,7 @@ Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
 """
 
 DEMO_ABOUT: Final = (
-    "Shows what edge-sr does without hardware: an emulated sensor taps a letter four times, and each pattern is "
+    "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
     "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C."
 )
 

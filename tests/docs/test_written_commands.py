@@ -52,7 +52,6 @@ PARSED = {
     r"edge-sr .*--realtime.*": "takes a processor from the other tests; test_realtime runs it",
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
-    r"python -m edge\.bench\.soak .*": "takes minutes; test_soak runs it",
     r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench, test_zenoh_programs run them",
     r"python tests/system/hand_soak\.py.*": "takes minutes; test_soak runs it",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
