@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
-from edge.inference.bundled import demo_recording, find_model
+from edge.inference.bundled import POSED_MODEL, demo_recording, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.heatmap import colours
 
@@ -65,7 +65,7 @@ def main() -> None:
     rest = np.median(counts[: np.argmax(tap >= 0)], axis=0)
     peaks = [int(np.argmax(np.where(tap == k, depth_mm, -1))) for k in range(len(angles))]
     felt = np.stack([counts[frame] - rest for frame in peaks]).astype(np.float32)
-    session = ModelSession(find_model("mtsr4"))
+    session = ModelSession(find_model(POSED_MODEL))
     pattern = session.run(session.contract.scale_window(felt[::-1].copy()))
     truth = truth_mm[-1] * depth_mm[peaks[-1]]
     error_db = float(psnr_db(pattern, truth, session.contract.output_full_scale))
@@ -83,7 +83,7 @@ def main() -> None:
     parts.append(f'<path d="M{left} {middle}h40m-9 -7l9 7l-9 7" stroke="#777" stroke-width="2.5" fill="none"/>')
     left += 40 + GAP_PX
     high = float(max(pattern.max(), truth.max()))
-    for image, text in ((pattern, f"MTSR-4, 40 x 40: {error_db:.1f} dB"), (truth, "truth")):
+    for image, text in ((pattern, f"MTSR, 40 x 40: {error_db:.1f} dB"), (truth, "truth")):
         parts.append(squares(image, high, left, GAP_PX, SIDE_PX))
         parts.append(caption(text, left + SIDE_PX / 2, GAP_PX + SIDE_PX + 18))
         left += SIDE_PX + GAP_PX
