@@ -22,6 +22,7 @@ from edge.inference.bundled import demo_recording
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
+from train.demo import MAGNET_SCENE
 
 PICTURES: Final = Path(__file__).with_name("pictures")
 TAKEN: Final = 6
@@ -48,7 +49,7 @@ def magnet_near() -> NDArray[np.int32]:
     """Return counts (n, 3, 4, 4) of the demo's pad at rest, followed by a long press with the magnet near it."""
     with np.load(demo_recording()) as data:
         counts, tap, scene = data["counts"].astype(np.int32), data["tap"], data["scene"]
-    rest, scenes = counts[: np.argmax(tap >= 0)], counts[scene == scene.max()]
+    rest, scenes = counts[: np.argmax(tap >= 0)], counts[scene == MAGNET_SCENE]
     peak = scenes[scenes[:, 2].sum(axis=(1, 2)).argmax()]
     return np.concatenate([rest, np.broadcast_to(peak, (HELD_SCANS, *peak.shape)) + noise()])
 
