@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from edge_samples import ROOT
 
+from edge.api import load_model
 from edge.inference.bundled import demo_recording
 from edge.terminal.heatmap import colours
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -174,10 +175,12 @@ def noise(count, seed=1):
 
 
 def pressed(demo):
-    """Return counts of the demo's first tap at its deepest, and the true pattern."""
-    taps = np.flatnonzero(demo["tap"] == 0)
-    peak = taps[np.argmax(demo["indentation_mm"][taps])]
-    return demo["counts"][peak], demo["unit_patterns"][0].astype(float) * float(demo["indentation_mm"][peak])
+    """Return counts of the demo's first tap at three fifths of its depth, and the pattern that they are shown as."""
+    depth_mm = np.where(demo["tap"] == 0, demo["indentation_mm"], np.nan)
+    counts = demo["counts"][np.nanargmin(abs(depth_mm - 0.6 * np.nanmax(depth_mm)))]
+    model = load_model("stsr-int8")
+    window = (counts - zeroed(demo, "4").counts)[None].astype(np.float32)
+    return counts, model.run(model.contract.scale_window(window)).copy()
 
 
 # What a person sees of a page.

@@ -56,10 +56,10 @@ WATCH_SOCKETS = """
 
 @pytest.fixture(scope="module")
 def held(demo, folder):
-    """A run whose pad is pressed onto the demo's letter all the time, and the truth of it."""
-    counts, truth = pressed(demo)
+    """A run whose pad is pressed onto the demo's figure all the time, and its pattern."""
+    counts, pattern = pressed(demo)
     with emulated(folder, counts + noise(200), options=["--view-record-dir", folder]) as run:
-        run.truth, run.folder = truth, folder
+        run.pattern, run.folder = pattern, folder
         yield run
 
 
@@ -108,20 +108,20 @@ def frames_of(page):
 
 
 class TestHeld:
-    def test_the_canvas_shows_the_truth_on_the_models_scale_or_on_its_own(self, page, held):
+    def test_the_canvas_shows_the_pattern_on_the_models_scale_or_on_its_own(self, page, held):
         word(page, "contact")
         playwright.expect(part(page, "pattern-high")).to_contain_text("largest so far")
         page.keyboard.press("s")
         playwright.expect(part(page, "pattern-high")).to_contain_text("full scale")
         shown = shares(part(page, "pattern").evaluate(RGBA))
-        assert shown.shape == (40, 40) and likeness(shown, held.truth) > 0.95
-        assert np.sqrt(np.mean((0.5 * shown - held.truth) ** 2)) < 0.03  # [mm], of .5 full scale
+        assert shown.shape == (40, 40) and likeness(shown, held.pattern) > 0.99
+        assert np.sqrt(np.mean((0.5 * shown - held.pattern) ** 2)) < 0.01  # [mm], of .5 full scale
         playwright.expect(part(page, "pattern-high")).to_contain_text("0.50\u202fmm, full scale")
         page.keyboard.press("s")
         playwright.expect(part(page, "pattern-high")).to_contain_text("largest so far")
         wait_for(lambda: shares(part(page, "pattern").evaluate(RGBA)).max() > 0.9)  # painted with the next frame
         stretched = shares(part(page, "pattern").evaluate(RGBA))
-        assert shown.max() < 0.7 and likeness(stretched, held.truth) > 0.95
+        assert shown.max() < 0.7 and likeness(stretched, held.pattern) > 0.99
         page.keyboard.press("s")
         page.reload()
         live(page)
@@ -188,7 +188,7 @@ class TestHeld:
             r"x (\S+), y (\S+)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm", text
         ).groups()
         assert (x.replace("\u2212", "-"), y) == ("-0.2", "2.6")  # pixel 19, 25 of 40, .47 mm wide
-        assert abs(float(value) - held.truth[25, 19]) < 0.1 and float(doubt) > 0
+        assert abs(float(value) - held.pattern[25, 19]) < 0.02 and float(doubt) > 0
         playwright.expect(page.locator("#live")).to_contain_text("mm")
         page.keyboard.press("Escape")
         playwright.expect(part(page, "readout")).to_contain_text("arrow keys")
