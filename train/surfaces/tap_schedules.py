@@ -1,6 +1,6 @@
 """Schedules of taps: where the pad was in earlier taps, in the newest one's axes.
 
-A pose is x, y in [mm] and a turn in [deg], as in `firmware_bridge.scans.pad_pose`; schedules are newest tap first.
+A pose is x, y in [mm] and a turn in [deg], as in `firmware_bridge.poses.pad_pose`; schedules are newest tap first.
 """
 
 from collections.abc import Callable, Mapping
@@ -80,6 +80,15 @@ SCHEDULES: Final[Mapping[str, Schedule]] = {
     "mixed": mixed,
 }
 """Schedules by name."""
+
+
+def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return poses (..., 3) of earlier taps in newer ones' axes, both in those of a third; see `PadPose.seen_from`."""
+    turn = np.radians(newest[..., 2])
+    x_mm, y_mm = np.moveaxis(earlier[..., :2] - newest[..., :2], -1, 0)
+    turned_deg = (earlier[..., 2] - newest[..., 2] + 180) % 360 - 180
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.stack([cosine * x_mm + sine * y_mm, cosine * y_mm - sine * x_mm, turned_deg], axis=-1).astype(np.float32)
 
 
 def _within(rng: np.random.Generator, taps: int, reach_mm: float, turn_deg: float) -> NDArray[np.float64]:
