@@ -1,6 +1,7 @@
-"""Workers of joblib that ignore SIGINT, so that an interruption reaches the caller alone."""
+"""Workers of joblib that ignore SIGINT, so that Ctrl-C reaches the caller alone, and leave two warnings out."""
 
 import signal
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,12 +15,14 @@ def quiet_workers(jobs: int) -> Iterator[None]:
     They inherit what is ignored. A mask is not enough: the tracker of resources, which joblib starts before them, lifts
     it. Calls of joblib with as many jobs in the with statement use these processes, and those that replace them: joblib
     ends a process that has grown by 300 MB, and another, which inherits nothing, sets for itself what it ignores. An
-    interrupted call ends them. Enter from the main thread; until then, Ctrl-C does nothing.
+    interrupted call ends them. Enter from the main thread; until then, Ctrl-C does nothing. joblib's warning of a
+    process that it has ended is left out, since another one does its work.
 
     Args:
         jobs: processes, -1 for one on each core.
     """
-    with joblib.parallel_config("loky", initializer=_ignore_interruptions):
+    with joblib.parallel_config("loky", initializer=_begin_quietly), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
             joblib.Parallel(n_jobs=jobs)(joblib.delayed(int)() for _ in range(2))
@@ -28,5 +31,7 @@ def quiet_workers(jobs: int) -> Iterator[None]:
         yield
 
 
-def _ignore_interruptions() -> None:
+def _begin_quietly() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # shapely divides by the length of an edge, and leaves out those without length afterwards.
+    warnings.filterwarnings("ignore", category=RuntimeWarning, module="shapely")
