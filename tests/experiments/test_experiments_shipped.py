@@ -16,9 +16,11 @@ from train.data.frozen_presses import load_frozen_presses
 from train.errors import TrainError
 from train.experiments.sensor import families, pads, wrench
 from train.experiments.support import baselines, kriging, nominal, oracle, scores, shipped
+from train.experiments.support.tap_oracle import KnownTaps
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import NOMINAL
 from train.physics.sensor_noise import Nuisances
+from train.surfaces.tap_schedules import SCHEDULES
 
 
 @pytest.fixture(scope="module")
@@ -141,13 +143,31 @@ class TestWrench:
 
 def test_the_oracle_finds_a_press_again_from_a_place_nearby():
     known = oracle.KnownSurface("small triangle", NOMINAL)
-    start = oracle._PRIOR_MEAN + np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0])
+    start = oracle.PRIOR_MEAN + np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0])
     numbers = start + np.array([0.4, -0.3, 4, 0.002, 0, 0.1, 0.1, 0, 0, 0])
     press = known.press(numbers[None])
     found = known.fit(press.counts.reshape(-1), start, 3)
     off = [
         np.sqrt(np.mean((pattern - press.patterns[0]) ** 2))
         for pattern in (known.press(start[None]).patterns[0], found)
+    ]
+    assert off[1] < 0.2 * off[0]
+
+
+def test_the_oracle_of_several_taps_finds_them_again_though_their_poses_are_off():
+    shifts = SCHEDULES["half-pitch"](np.random.default_rng(0), 3)
+    taps = KnownTaps(oracle.KnownSurface("small triangle", NOMINAL), shifts)
+    place = np.array([0.5, 0.0, 10.0])
+    start, off = taps.mean(place), np.zeros_like(taps.spread)
+    off[:5] = 0.4, -0.3, 3, 0.002, 0
+    off[-6:] = 0.2, 0.1, 1, -0.2, 0.2, -1
+    press = taps.press((start + off)[None])
+    assert len(press.counts) == 3 and taps.off(off)[1:].ravel() == pytest.approx(off[-6:])
+    moved = np.abs(press.counts[0] - press.counts[1]).max() / np.abs(press.counts[0]).max()
+    assert moved > 0.1, "taps are at other places"
+    found = taps.fit(press.counts.reshape(3, -1), place, 3)
+    off = [
+        np.sqrt(np.mean((pattern - press.patterns[0]) ** 2)) for pattern in (taps.press(start[None]).patterns[0], found)
     ]
     assert off[1] < 0.2 * off[0]
 

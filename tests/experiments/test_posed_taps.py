@@ -75,6 +75,8 @@ def test_it_runs_in_miniature(models, tmp_path, capsys):
     assert {row["schedule"] for row in tables["schedules"]} == set(SCHEDULES)
     assert {row["taps"] for row in tables["schedules"]} == {"1", "2", "3", "4", "7"}
     assert all(row["run time us"] and row["over the peer"] for row in tables["schedules"] + tables["begun"])
+    mapped = {(row["schedule"], row["taps"]) for row in tables["schedules"] if row["linear map dB"]}
+    assert mapped == {(name, taps) for name in ("half-pitch", "turns") for taps in ("1", "4")}
     assert all(row["over one tap, not stated, guarded"] and row["left out %"] for row in tables["wrong-poses"])
     assert [row["off mm"] for row in tables["wrong-poses"]][:4] == ["0.2", "0.5", "1.0", "2.0"]
 
@@ -109,13 +111,15 @@ def test_limits_of_taps_in_miniature(models, tmp_path, capsys):
     report = tmp_path / "reports" / "tap-limits"
     assert capsys.readouterr().out.endswith(f"{report}.md\n")
     tables = {}
-    for part in ("", "-known", "-mirrored"):
+    for part in ("", "-known", "-mirrored", "-oracle"):
         with report.with_name(f"tap-limits{part}.csv").open() as file:
             tables[part] = list(csv.DictReader(file))
     assert [row["known"] for row in tables["-known"]] == ["nothing", "pad", "gains", "pad and gains"]
     figures = {tuple(row[name] for name in row if "dB" in name or "gain of" in name) for row in tables["-known"]}
     assert len(figures) == 4, "each row knows something else"
     assert len({row["without"] for row in tables[""]}) == 7
+    assert [row["method"] for row in tables["-oracle"]] == ["oracle", "model", "model, all known"]
+    assert all(row["gain of 4 taps"] and int(row["4 taps us"]) > 0 for row in tables["-oracle"])
     plain, both = tables["-mirrored"]
     assert plain["one tap dB"] != both["one tap dB"] and int(both["one tap us"]) > int(plain["one tap us"])
 

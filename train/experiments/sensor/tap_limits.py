@@ -1,6 +1,7 @@
 """Limits of what several taps tell the shipped model: what is known, what disturbs the readings, and its own variance.
 
-Four and seven taps half a pitch apart, of the figures of `posed-taps`; no choice depended on them.
+Four and seven taps half a pitch apart, of the figures of `posed-taps`; no choice depended on them. An oracle that knows
+the figure shows what the readings hold.
 """
 
 from pathlib import Path
@@ -17,6 +18,7 @@ from train.data.generation_config import SEED
 from train.data.posed_batches import stated_poses
 from train.experiments.sensor.posed_taps import MODEL, USUAL, presses_of
 from train.experiments.support.shipped import ALL, NOTHING, PAD, infer, known_pads
+from train.experiments.support.tap_oracle import SCHEDULE, tap_oracle_rows
 from train.experiments.support.workbench import Workbench
 from train.physics.sensor_noise import Nuisances
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
@@ -48,7 +50,7 @@ _MIRRORED_POSE: Final = np.array([-1, 1, -1, 1, 1], dtype=np.float32)
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses with one limit after another lifted, and write the report `tap-limits`."""
     model = ModelSession(bench.use(bench.models / f"{MODEL}.onnx"))
-    presses = presses_of(bench, "half-pitch", figures=True)
+    presses = presses_of(bench, SCHEDULE, figures=True)
     usual = freeze_presses(presses, SEED)
     report = Report("tap-limits", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -75,6 +77,14 @@ def run(bench: Workbench, folder: Path) -> Path:
         "Averaged with the mirror image of the pattern of the mirrored window, which ought to be the same: what that "
         "gains is the network's own error, and takes twice the run time.",
         "mirrored",
+    )
+    report.table(
+        tap_oracle_rows(model, quick=bench.quick),
+        f"What the readings hold: other figures, on pads of their own, {SCHEDULE}. The oracle knows figure, pad, "
+        "gains, the place to 0.5 mm and 5 degrees, and the poses as the model does (standard deviations), and fits the "
+        "simulator to the readings of all taps by Gauss-Newton. No method that does not know the figure can be "
+        "expected to do as well.",
+        "oracle",
     )
     return report.write()
 

@@ -5,7 +5,7 @@ twist, and friction. Their Gaussian prior is the distribution they are drawn fro
 Gaussian. Gauss-Newton finds the most probable press, whose pattern is the oracle's.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, cast
@@ -13,6 +13,7 @@ from typing import Final, cast
 import joblib
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from edge.evaluation.evaluate import judge
 from edge.inference.onnx_session import ModelSession
@@ -36,13 +37,13 @@ from train.surfaces.poses import as_poses, random_targets, turned_back
 PRESSES: Final = 30
 SEED: Final = 31
 STEPS: Final = 4
-_NUDGE: Final = np.array([0.15, 0.15, 1.5, 0.002, 0.002, 0.01, 0.03, 0.03, 0.01, 0.2])
-_PRIOR_SD: Final = np.array([0.5, 0.5, 5.0, 0.005, 0.005, 0.12, 0.15, 0.15, 0.02, 0.4])
+NUDGE: Final = np.array([0.15, 0.15, 1.5, 0.002, 0.002, 0.01, 0.03, 0.03, 0.01, 0.2])
+PRIOR_SD: Final = np.array([0.5, 0.5, 5.0, 0.005, 0.005, 0.12, 0.15, 0.15, 0.02, 0.4])
 """Prior deviation of x and y in [mm], turn in [deg], slopes, depth and slides in [mm], twist in [rad], log friction."""
-_PRIOR_MEAN: Final = np.array([0, 0, 0, 0, 0, 0.27, 0, 0, 0, np.log(0.6)])
+PRIOR_MEAN: Final = np.array([0, 0, 0, 0, 0, 0.27, 0, 0, 0, np.log(0.6)])
 """Prior mean in the same order; the mean of the place is set to the nominal place of the surface."""
-_DEPTH: Final = 5
-_LEAST_DEPTH_MM: Final = 0.1
+DEPTH: Final = 5
+LEAST_DEPTH_MM: Final = 0.1
 _SHORTER: Final = (1.0, 0.5, 0.2)
 _MODEL_SHARE: Final = 0.03
 """Share of a reading that no press explains, from hysteresis and cross-talk."""
@@ -78,7 +79,7 @@ class KnownSurface:
         heights = -footprints([self._relief] * len(numbers), places, pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm
         slopes = numbers[:, 3:5, None, None]
         heights = (heights + slopes[:, 0] * pad.places_mm[0] + slopes[:, 1] * pad.places_mm[1]).astype(np.float32)
-        depth_mm = np.clip(numbers[:, _DEPTH], *INDENTATION_MM)
+        depth_mm = np.clip(numbers[:, DEPTH], *INDENTATION_MM)
         return pad.press(heights, depth_mm, numbers[:, 6:8], numbers[:, 8], np.exp(numbers[:, 9]))
 
     def fit(self, reading: NDArray[np.floating], start: NDArray[np.floating], steps: int) -> NDArray[np.float32]:
@@ -89,22 +90,42 @@ class KnownSurface:
             start: mean of the prior, where the search starts.
             steps: Gauss-Newton steps.
         """
-        here = start.copy()
-        for _ in range(steps):
-            around = self.press(here + np.concatenate([np.zeros((1, len(here))), np.diag(_NUDGE)]))
-            counts = around.counts.reshape(len(_NUDGE) + 1, -1).astype(np.float64)
-            slope = (counts[1:] - counts[0]).T / _NUDGE
-            weight = np.linalg.inv(error_covariance(counts[0], Nuisances()))
-            information = slope.T @ weight @ slope + np.diag(_PRIOR_SD**-2.0)
-            step = np.linalg.solve(
-                information, slope.T @ weight @ (reading - counts[0]) - (here - start) / _PRIOR_SD**2
-            )
-            tried = here + np.concatenate([[0.0], _SHORTER])[:, None] * step
-            found = self.press(tried).counts.reshape(len(tried), -1)
-            off = reading - found
-            cost = np.einsum("ni,ij,nj->n", off, weight, off) + np.square((tried - start) / _PRIOR_SD).sum(axis=1)
-            here = tried[int(cost.argmin())]
+        here = most_probable(lambda tried: self.press(tried).counts, reading, start, PRIOR_SD, NUDGE, steps)
         return self.press(here[None]).patterns[0]
+
+
+def most_probable(
+    counts_of: Callable[[NDArray[np.float64]], NDArray[np.floating]],
+    reading: NDArray[np.floating],
+    mean: NDArray[np.floating],
+    spread: NDArray[np.floating],
+    nudge: NDArray[np.floating],
+    steps: int,
+) -> NDArray[np.float64]:
+    """Return the most probable numbers (p,) behind the readings of one or several taps, by Gauss-Newton.
+
+    Args:
+        counts_of: function from numbers (n, p) to counts of n times all taps, 48 each.
+        reading: (48 taps,) zeroed counts, divided by the gains.
+        mean: (p,) of the prior, where the search starts.
+        spread: (p,) standard deviations of the prior.
+        nudge: (p,) changes by which slopes are found.
+        steps: Gauss-Newton steps.
+    """
+    here = np.asarray(mean, dtype=np.float64)
+    for _ in range(steps):
+        around = counts_of(here + np.concatenate([np.zeros((1, len(here))), np.diag(nudge)]))
+        counts = around.reshape(len(nudge) + 1, -1).astype(np.float64)
+        slope = (counts[1:] - counts[0]).T / nudge
+        weights = [np.linalg.inv(error_covariance(tap, Nuisances())) for tap in counts[0].reshape(-1, 48)]
+        weight = np.asarray(block_diag(*weights), dtype=np.float64)
+        information = slope.T @ weight @ slope + np.diag(spread**-2.0)
+        step = np.linalg.solve(information, slope.T @ weight @ (reading - counts[0]) - (here - mean) / spread**2)
+        tried = here + np.concatenate([[0.0], _SHORTER])[:, None] * step
+        off = reading - counts_of(tried).reshape(len(tried), -1)
+        cost = np.einsum("ni,ij,nj->n", off, weight, off) + np.square((tried - mean) / spread).sum(axis=1)
+        here = tried[int(cost.argmin())]
+    return here
 
 
 def error_covariance(reading: NDArray[np.floating], nuisances: Nuisances) -> NDArray[np.float64]:
@@ -144,26 +165,28 @@ def _press_and_fit(number: int, steps: int) -> _Fitted:
     rng = np.random.default_rng([SEED, number])
     known = KnownSurface(str(rng.choice(SURFACES)), draw_pad(rng))
     place = turned_back(random_targets(rng, 1, [known.surface]), 1)[0, 0]
-    thought = _PRIOR_MEAN + np.concatenate([place, np.zeros(7)])
-    numbers = thought + rng.normal(0, _PRIOR_SD).clip(-2 * _PRIOR_SD, 2 * _PRIOR_SD)
-    numbers[_DEPTH] = np.clip(numbers[_DEPTH], _LEAST_DEPTH_MM, INDENTATION_MM[1])
-    frozen = freeze_presses(_as_set(known.press(numbers[None]), known.pad, number), SEED + number)
+    thought = PRIOR_MEAN + np.concatenate([place, np.zeros(7)])
+    numbers = thought + rng.normal(0, PRIOR_SD).clip(-2 * PRIOR_SD, 2 * PRIOR_SD)
+    numbers[DEPTH] = np.clip(numbers[DEPTH], LEAST_DEPTH_MM, INDENTATION_MM[1])
+    frozen = freeze_presses(as_set(known.press(numbers[None]), known.pad, number), SEED + number)
     reading = frozen.windows(1, gains_known=True).reshape(-1)
     return frozen, known.fit(reading, thought, steps)
 
 
-def _as_set(done: Presses, pad: Pad, number: int) -> PressSet:
+def as_set(done: Presses, pad: Pad, number: int) -> PressSet:
+    """Return the presses of the taps of one sequence on one pad, newest first, with the newest one's truth."""
+    taps = len(done.counts)
     return PressSet(
-        family=np.array(["paper"]),
+        family=np.array(["figure"]),
         pad=np.array([number]),
         constants=constants(pad)[None],
-        counts=done.counts[:, None],
-        angle_deg=np.zeros((1, 1), dtype=np.float32),
-        poses=np.zeros((1, 1, 3), dtype=np.float32),
-        patterns=done.patterns.astype(np.float16),
-        touching=done.touching,
-        traction_kpa=done.traction_kpa.astype(np.float16),
-        force_n=done.force_n,
-        twist_nmm=done.twist_nmm,
-        indentation_mm=done.indentation_mm,
+        counts=done.counts[None],
+        angle_deg=np.zeros((1, taps), dtype=np.float32),
+        poses=np.zeros((1, taps, 3), dtype=np.float32),
+        patterns=done.patterns[:1].astype(np.float16),
+        touching=done.touching[:1],
+        traction_kpa=done.traction_kpa[:1].astype(np.float16),
+        force_n=done.force_n[:1],
+        twist_nmm=done.twist_nmm[:1],
+        indentation_mm=done.indentation_mm[:1],
     )

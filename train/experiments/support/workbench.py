@@ -71,10 +71,13 @@ class Workbench:
         self.used.add(path)
         return path
 
-    def presses(self, name: str, world: World) -> PressSet:
-        """Return the presses of that world, read if they exist, else made."""
+    def presses(self, name: str, world: World, quick_taps: int = 1) -> PressSet:
+        """Return the presses of that world, read if they exist, else made; in a quick run a few of `quick_taps`."""
         if self.quick:
-            name, world = f"quick-{name}", replace(world, count=_QUICK_PRESSES, taps=1, per_pad=_QUICK_PRESSES // 2)
+            name, world = (
+                f"quick-{name}",
+                replace(world, count=_QUICK_PRESSES, taps=quick_taps, per_pad=_QUICK_PRESSES // 2),
+            )
         self.data_folder.mkdir(parents=True, exist_ok=True)
         return make_presses(world, self.data_folder / f"{name}.npz")
 
