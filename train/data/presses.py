@@ -22,7 +22,7 @@ _NO_POSES: Final = 2
 """Version without poses, which is still loaded: its taps were turned at one place."""
 _MOST_BYTES: Final = 1 << 33
 _OFF: Final = np.array([1e-2, 1e-2, ANGLE_STEP_DEG])
-"""Difference from the paper's schedule below which a tap follows it, in [mm] and [deg]; some sets have errors of poses."""
+"""Difference from the paper's schedule below which a tap follows it, in [mm] and [deg]; some sets have errors."""
 _AXES: Final[Axes] = {
     "family": ("U", "n"),
     "pad": ("int64", "n"),

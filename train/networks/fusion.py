@@ -8,6 +8,7 @@ chip and not to the place. Number and order of the earlier taps are free, and on
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from math import log
 from typing import Final
@@ -102,14 +103,15 @@ class FusionNet(CompactNet):
     def take_over(self, start: CompactNet) -> None:
         """Copy a network of one tap, or another one of this kind; what encodes earlier taps starts as its entrance.
 
+        From more symmetries to fewer, the function stays the same, without its correction of intervals.
+
         Raises:
             ValueError: another width, or another number of inputs for the pad.
         """
         if isinstance(start, FusionNet):
-            try:
-                self.load_state_dict(start.state_dict())
-            except RuntimeError as error:
-                raise ValueError(str(error).splitlines()[-1].strip()) from error
+            super().take_over(start)
+            for name in ("own_share", "log_reach"):
+                getattr(self, name).data.copy_(getattr(start, name))
             return
         super().take_over(start)
         weight = torch.zeros_like(self.enter_earlier.weight)
@@ -154,7 +156,9 @@ class FusionNet(CompactNet):
         if poses is None:
             rows_of_schedule = torch.from_numpy(scheduled_rows(taps.shape[1], ANGLE_STEP_DEG)).to(taps)
             poses = rows_of_schedule.expand(len(taps), -1, -1)
-        carrier = _Carrier(poses[:, 1:], there, (rows, cols), self._reaches())
+        # Places of cells need more digits than bfloat16 has; a traced graph has no such types to choose from.
+        with torch.autocast(window.device.type, enabled=False) if self.training else nullcontext():
+            carrier = _Carrier(poses[:, 1:], there, (rows, cols), self._reaches())
 
         sizes = (amplitude / (amplitude + 1))[:, 1:, 0, 0]
         pads = entered.about[:, None, :-1].expand(-1, there.shape[1], -1)
