@@ -29,11 +29,10 @@ docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 wheels: $(VENV)/.dev  ## two wheels in dist/: the runtime, with completion and man page; and training, export, bench
 	$(BIN)/python release/wheels.py
 
-TAPS := data/gripped.npz data/gripped4.npz data/each4.npz data/each7.npz
-POSED := data/figures4.npz data/more-figures4.npz data/each4.npz data/each7.npz
+TAPS := data/gripped.npz data/gripped4.npz data/taps4.npz data/taps7.npz data/more4.npz data/more7.npz
 
-models: $(VENV)/.dev $(TAPS) $(POSED) data/validation.npz  ## retrain and re-export the bundled models: some four hours on two cores
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --posed $(POSED) --validation data/validation.npz
+models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: some four hours on two cores
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
 	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
@@ -65,17 +64,17 @@ data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
 data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each, turned by 5 degrees
 	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 4 --schedule turns --seed 2
 
-data/each4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind, each of them once the newest
-	$(BIN)/python -m train.data.make_presses $@ --count 25000 --taps 4 --each-newest --begun 0.4 --seed 8
+data/taps4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind
+	$(BIN)/python -m train.data.make_presses $@ --count 40000 --taps 4 --seed 3
 
-data/each7.npz: $(VENV)/.dev  ## the same, seven taps each
-	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 7 --each-newest --begun 0.3 --seed 9
+data/taps7.npz: $(VENV)/.dev  ## the same, seven taps each
+	$(BIN)/python -m train.data.make_presses $@ --count 8000 --taps 7 --seed 4
 
-data/figures4.npz: $(VENV)/.dev  ## random figures, which tell most of what several taps are worth
-	$(BIN)/python -m train.data.make_presses $@ --families glyph,polygon --count 50000 --taps 4 --each-newest --begun 0.3 --seed 7
+data/more4.npz: $(VENV)/.dev  ## as many again
+	$(BIN)/python -m train.data.make_presses $@ --count 40000 --taps 4 --seed 5
 
-data/more-figures4.npz: $(VENV)/.dev  ## half as many again
-	$(BIN)/python -m train.data.make_presses $@ --families glyph,polygon --count 25000 --taps 4 --each-newest --begun 0.3 --seed 10
+data/more7.npz: $(VENV)/.dev
+	$(BIN)/python -m train.data.make_presses $@ --count 10000 --taps 7 --seed 6
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001

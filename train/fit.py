@@ -1,6 +1,6 @@
 """Train the bundled networks from nothing to their final error, or one network by name; in one seeded run.
 
-    python -m train.fit checkpoints --data data/gripped.npz data/each7.npz --validation data/validation.npz
+    python -m train.fit checkpoints --data data/gripped.npz data/taps7.npz --validation data/validation.npz
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
     python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start-from seed-stsr --steps 5000
 
@@ -21,7 +21,7 @@ from train.data.dataset import Sequences
 from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
-from train.data.presses import PressSet, join_presses, load_presses
+from train.data.presses import PressSet, load_presses
 from train.errors import DatasetError, TrainError
 from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, fit_network
@@ -34,11 +34,7 @@ GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.06, 0
 """Share of windows with 1, 2, ... K taps; of batches, for a network that takes poses."""
 
 _KNOWN: Final = {"known": KNOWN}
-_FREE: Final = {"known": KNOWN, "group": "p1"}
-"""Options of a network of taps from any poses: with free weights in place of symmetric ones four taps gain more at the
-same run time, because training turns and mirrors its windows (docs/log.md)."""
-_FUSION: Final = "fusion-"
-_COMPACT: Final = ("compact-", "small-", _FUSION)
+_COMPACT: Final = ("compact-", "small-", "fusion-")
 """Networks that take constants of the pad and give deviations."""
 BUNDLED: Final = (
     Training("stsr", "compact-stsr", Recipe(steps=24_000, learning_rate=3e-3), options=_KNOWN),
@@ -49,21 +45,8 @@ BUNDLED: Final = (
     Training(
         "mtsr2", "compact-mtsr2", Recipe(steps=1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
     ),
-    Training(
-        "mtsr7",
-        "fusion-mtsr7",
-        Recipe(steps=56_000, learning_rate=1.5e-3, given=GIVEN[7], bf16=True),
-        start="stsr",
-        options=_FREE,
-    ),
+    Training("mtsr7", "fusion-mtsr7", Recipe(steps=56_000, given=GIVEN[7]), start="stsr", options=_KNOWN),
 )
-
-
-def options_of(network: str) -> dict[str, Any]:
-    """Return the options with which a network is trained on presses."""
-    if network.startswith(_FUSION):
-        return _FREE
-    return _KNOWN if network.startswith(_COMPACT) else {}
 
 
 def given_taps(taps: int) -> tuple[float, ...]:
@@ -74,33 +57,21 @@ def given_taps(taps: int) -> tuple[float, ...]:
     return tuple(shares)
 
 
-def fit_bundled(
-    data: PressSet, validation: PressSet, folder: Path, shorten: int = 1, posed: PressSet | None = None
-) -> None:
+def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
     """Train the bundled networks, one from another; `shorten` divides their steps, for tests.
-
-    Args:
-        data: presses to train on.
-        validation: presses to calibrate on.
-        folder: of the checkpoints.
-        shorten: divisor of the steps.
-        posed: presses for the networks that take poses; None for `data`.
 
     Raises:
         DatasetError: no sequence has as many taps as a network takes.
     """
-    sets = [posed if posed is not None and one.network.startswith(_FUSION) else data for one in BUNDLED]
-    for training, presses in zip(BUNDLED, sets, strict=True):  # before hours of training of those that come first
-        most, needed = int(presses.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), len(training.recipe.given)
-        if most < needed:
-            where = "--data" if presses is data else "--posed"
-            raise DatasetError(
-                f"the presses of {where} have at most {most} taps, {training.name} takes {needed}: add data/each7.npz, "
-                "or train one network with --network"
-            )
+    most, needed = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), max(len(one.recipe.given) for one in BUNDLED)
+    if most < needed:  # before hours of training of those that come first
+        raise DatasetError(
+            f"the presses have at most {most} taps, the bundled networks take {needed}: add data/taps7.npz, or train "
+            "one network with --network"
+        )
     frozen = freeze_presses(validation, SEED).as_frozen_set()
-    for training, presses in zip(BUNDLED, sets, strict=True):
-        _say(_line(fit_network(_shortened(training, shorten), presses, frozen, folder)))
+    for training in BUNDLED:
+        _say(_line(fit_network(_shortened(training, shorten), data, frozen, folder)))
 
 
 def _shortened(training: Training, divisor: int) -> Training:
@@ -129,15 +100,12 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     started_s = time.monotonic()
     try:
-        if options.network is not None and options.posed is not None:
-            raise ValueError("--posed is of the bundled networks: name the presses of one network with --data")
         data = load_taps(options.data)
         validation = None if options.validation is None else load_presses(options.validation)
         if options.network is None:
             if not isinstance(data, PressSet) or validation is None:
                 raise ValueError("the bundled networks are trained on presses: give --data and --validation such files")
-            posed = None if options.posed is None else join_presses([*map(load_presses, options.posed)])
-            fit_bundled(data, validation, options.folder, options.shorten, posed)
+            fit_bundled(data, validation, options.folder, options.shorten)
         else:
             training = _training(options, data)
             if validation is None:
@@ -163,6 +131,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
         bf16=options.bf16,
         minutes=options.minutes,
     )
+    compact = options.network.startswith(_COMPACT)
     return Training(
         options.name or _name(options.network),
         options.network,
@@ -170,7 +139,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
         options.scale,
         options.start_from,
         seed=options.seed,
-        options=options_of(options.network) if isinstance(data, PressSet) else {},
+        options=_KNOWN if compact and isinstance(data, PressSet) else {},
     )
 
 
@@ -186,9 +155,6 @@ def _parser() -> argparse.ArgumentParser:
         "--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses, or of train.generate"
     )
     parser.add_argument("--validation", type=Path, help="presses of the validation set, not used for training")
-    parser.add_argument(
-        "--posed", type=Path, nargs="+", metavar="DATA", help="presses for networks that take poses, instead of --data"
-    )
     parser.add_argument("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
     one = parser.add_argument_group("one network instead of the bundled ones")
     one.add_argument("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))

@@ -1,7 +1,5 @@
 """Network that fuses taps from any poses: one tap is a network of one tap, and the geometry is exact."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -61,13 +59,6 @@ def test_after_training_one_tap_is_one_tap_whatever_the_weights_of_earlier_ones(
     empty = torch.cat([window[:, :3], torch.zeros(2, 6, 4, 4)], dim=1)
     assert torch.equal(run(net, empty, pad, poses)[0], alone)
     assert not torch.allclose(run(net, window, pad, poses)[0], alone, atol=1e-3)
-
-
-def test_free_weights_begin_with_the_function_of_symmetric_ones(net, inputs):
-    free = grown(net, "fusion-mtsr7", 10, channels=16, blocks=2, known=KNOWN, group="p1").eval()
-    assert sum(map(torch.numel, free.parameters())) > 3 * sum(map(torch.numel, net.parameters()))
-    for ours, theirs in zip(run(free, *inputs), run(net, *inputs), strict=True):
-        assert torch.allclose(ours, theirs, atol=1e-5)
 
 
 def test_places_of_cells_keep_their_digits_in_bfloat16(net, inputs):
@@ -180,36 +171,6 @@ class TestBatches:
         image = batch.mirrored(torch.ones(16, dtype=torch.bool))
         assert torch.equal(image.poses, batch.poses * torch.tensor([-1.0, 1, -1, 1, 1]))
         assert torch.equal(image.mirrored(torch.ones(16, dtype=torch.bool)).window, batch.window)
-
-    def test_a_turned_batch_is_one_of_a_turned_pad(self, net):
-        """The symmetric network, which knows no directions, gives the turned patterns for it."""
-        batch = PosedBatches(make_press_set(48, taps=4), (0, 0, 0, 1.0), 16, seed=3)(0)
-        quarters = torch.arange(16) % 4
-        turned, no_pad = batch.turned(quarters), torch.zeros(16, KNOWN)
-        for name in ("pattern", "traction"):
-            assert torch.equal(getattr(turned, name)[quarters == 0], getattr(batch, name)[quarters == 0]), name
-        assert torch.equal(turned.pattern[5], batch.pattern[5].rot90(1, (-2, -1)))
-        found, expected = (run(net, one.window, no_pad, one.poses) for one in (turned, batch))
-        again = replace(batch, pattern=expected[0], traction=expected[2]).turned(quarters)
-        assert torch.allclose(found[0], again.pattern, atol=1e-4)
-        assert torch.allclose(found[2], again.traction, atol=1e-3 * float(again.traction.abs().max()))
-        assert torch.equal(turned.turned(-quarters % 4).window, batch.window)
-
-    def test_batches_turn_their_windows(self):
-        presses = make_press_set(48, taps=4)
-        presses = replace(presses, patterns=np.zeros_like(presses.patterns))
-        presses.patterns[:, 0, 0] = 1
-        corners = PosedBatches(presses, (0, 0, 0, 1.0), 48, seed=3)(0).pattern[:, [0, 0, -1, -1], [0, -1, 0, -1]]
-        assert (corners.sum(dim=1) == 1).all() and (corners.sum(dim=0) > 4).all()
-
-    def test_newest_taps_that_have_only_begun_are_drawn_more_often_than_they_are_there(self):
-        presses = make_press_set(200, taps=4)
-        counts = np.full_like(presses.counts, 1000.0)
-        counts[:10, 0] *= 0.4
-        draw = PosedBatches(replace(presses, counts=counts), (0.2, 0, 0, 0.8), 64, seed=3)
-        sizes = [draw(number).window.abs().mean(dim=(2, 3)) for number in range(30)]
-        begun = np.array([float((size[:, 2] < 0.7 * size[:, 5]).float().mean()) for size in sizes if size.shape[1] > 3])
-        assert 0.25 < begun.mean() < 0.45
 
     def test_too_few_taps_are_refused(self):
         with pytest.raises(DatasetError, match="no sequences of 5 taps"):

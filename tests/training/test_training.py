@@ -4,12 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from press_samples import make_press_set
 
 from edge.evaluation.metrics import psnr_db
 from train.data.generation_config import SEED, Generation, solve_all
-from train.errors import CheckpointError, DatasetError
-from train.fit import BUNDLED, fit_bundled, given_taps, main
+from train.errors import CheckpointError
+from train.fit import BUNDLED, given_taps, main
 from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
 from train.learning.interval_calibration import interval_coverage
@@ -151,26 +150,9 @@ def test_windows_of_every_number_of_taps_are_drawn(taps):
 def test_bundled_networks_start_from_nothing_or_one_before_and_take_what_is_known_of_the_pad():
     before = [None]
     for training in BUNDLED:
-        free = {"group": "p1"} if training.network.startswith("fusion-") else {}
-        assert training.start in before and training.options == {"known": KNOWN} | free
+        assert training.start in before and training.options == {"known": KNOWN}
         before.append(training.name)
     assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2", "mtsr7"]
-
-
-def test_networks_that_take_poses_are_trained_on_presses_of_their_own(tmp_path):
-    """Presses that lack taps are refused before any training, by the name of the network that needs them."""
-    one, four = (make_press_set(8, taps=taps) for taps in (1, 4))
-    with pytest.raises(DatasetError, match="of --data have at most 1 taps, mtsr4 takes 4"):
-        fit_bundled(one, one, tmp_path, posed=four)
-    with pytest.raises(DatasetError, match=r"of --posed have at most 1 taps, mtsr7 takes 7: add data/each7\.npz"):
-        fit_bundled(four, one, tmp_path, posed=one)
-
-
-def test_presses_with_poses_belong_to_the_bundled_networks(data, tmp_path):
-    data.save(tmp_path / "data.npz")
-    given = str(tmp_path / "data.npz")
-    with pytest.raises(SystemExit, match="--posed is of the bundled networks"):
-        main([str(tmp_path), "--data", given, "--posed", given, "--network", "compact-stsr"])
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):

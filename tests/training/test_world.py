@@ -13,7 +13,6 @@ import pytest
 import trimesh
 from edge_samples import ROOT
 
-from firmware_bridge.poses.pad_pose import PadPose
 from train.data import make_presses as making
 from train.data.make_presses import main, make_presses
 from train.data.presses import load_presses
@@ -68,40 +67,6 @@ def test_newest_taps_that_have_only_begun_are_lighter_than_earlier_ones(begun):
     z_counts = solve_pad(world, 0).counts[:, :, 2].sum(axis=(2, 3))
     share = z_counts[:, 0] / z_counts[:, 1]
     assert np.median(share) == pytest.approx(1.0 if begun == 0 else 0.65, abs=0.15)
-
-
-def test_every_tap_can_be_the_newest_of_a_row_with_its_own_truth():
-    world = World(count=6, taps=3, per_pad=6, spread=0.0, begun=0.0, families={"glyph": 1.0}, schedule="near", seed=4)
-    first, each = solve_pad(world, 0), solve_pad(replace(world, each_newest=True), 0)
-    assert len(first) == 6 and len(each) == 18
-    for name in ("counts", "patterns", "traction_kpa", "force_n", "poses"):
-        assert np.allclose(getattr(each, name)[::3], getattr(first, name), atol=1e-6), name
-    assert np.array_equal(each.counts[1, 0], first.counts[0, 1]) and np.array_equal(
-        each.counts[2, 1], first.counts[0, 0]
-    )
-    taps = [PadPose(*pose) for pose in first.poses[0].tolist()]
-    seen = [taps[tap].seen_from(taps[1]) for tap in (1, 2, 0)]
-    assert np.allclose(each.poses[1], [(one.x_mm, one.y_mm, one.turn_deg) for one in seen], atol=1e-4)
-    pressed = (each.patterns > 0.5 * each.patterns.max(axis=(1, 2), keepdims=True)).reshape(18, -1)
-    assert (pressed[1] != pressed[0]).any(), "the truth is of the row's own pad"
-    shear = each.counts[:, 0, :2].sum(axis=(2, 3))  # drawn for each press alone
-    assert np.corrcoef(shear.ravel(), each.force_n[:, :2].ravel())[0, 1] > 0.9, "and so is the force"
-
-
-def test_rows_of_other_turns_than_the_schedules_are_not_of_it():
-    """Of turned taps each of which is once the newest, the first row alone follows the paper's schedule."""
-    world = World(count=6, taps=3, per_pad=6, begun=0.0, schedule="turns", each_newest=True, seed=4)
-    made = solve_pad(world, 0)
-    turned = made.only_turned()
-    assert len(turned) == len(made) // 3 and np.allclose(turned.poses[:, :, 2], [0, 5, 10])
-    assert len(made.with_taps(1).only_turned()) == len(made)
-    assert len(made.with_taps(2).only_turned()) == 2 * len(made) // 3, "and two of the next tap's"
-
-
-def test_a_tap_that_has_only_begun_is_alone_the_newest():
-    world = World(count=6, taps=3, per_pad=6, begun=1.0, families={"flat": 1.0}, each_newest=True, seed=4)
-    assert len(solve_pad(world, 0)) == len(solve_pad(replace(world, each_newest=False), 0)) > 3
-    assert world.facts()["each_newest"] is True and "each_newest" not in SMALL.facts()
 
 
 @pytest.mark.parametrize("name", ["spread", "begun"])

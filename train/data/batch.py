@@ -9,11 +9,6 @@ _MIRRORED = torch.tensor([-1.0, 1.0, -1.0, 1.0, 1.0])
 """Signs of a pose's x, y, turn and errors in a mirror image."""
 
 
-def _quarter(x: Tensor, y: Tensor, turns: int) -> tuple[Tensor, Tensor]:
-    """Return the parts of a vector after `turns` quarter turns from y to x: down becomes right, right becomes up."""
-    return ((x, y), (y, -x), (-x, -y), (-y, x))[turns]
-
-
 @dataclass(frozen=True, slots=True)
 class Batch:
     """Windows and their truth.
@@ -50,37 +45,6 @@ class Batch:
             pattern=flipped(self.pattern, False),
             traction=None if self.traction is None else flipped(self.traction, True),
             poses=None if self.poses is None else torch.where(which[:, None, None], self.poses * _MIRRORED, self.poses),
-        )
-
-    def turned(self, quarters: Tensor) -> "Batch":
-        """Return the batch with each window turned by so many quarters, (n,), from y to x.
-
-        Without poses the windows are of one tap, or of taps whose schedule a turn of all pads does not change.
-        """
-
-        def image_of(maps: Tensor, vectors: bool) -> Tensor:
-            image = maps.clone()
-            for turns in range(1, 4):
-                which = quarters == turns
-                part = maps[which].rot90(turns, (-2, -1))
-                if vectors:
-                    x, y = _quarter(part[:, ::3], part[:, 1::3], turns)
-                    part = torch.stack([x, y, part[:, 2::3]], dim=2).flatten(1, 2)
-                image[which] = part
-            return image
-
-        poses = self.poses
-        if poses is not None:
-            x, y, *others = poses.unbind(dim=2)
-            places = torch.stack([torch.stack(_quarter(x, y, turns)) for turns in range(4)])
-            x, y = places[quarters, :, torch.arange(len(quarters))].unbind(dim=1)
-            poses = torch.stack([x, y, *others], dim=2)
-        return replace(
-            self,
-            window=image_of(self.window, True),
-            pattern=image_of(self.pattern, False),
-            traction=None if self.traction is None else image_of(self.traction, True),
-            poses=poses,
         )
 
     def share(self, rank: int, world: int, device: torch.device) -> "Batch":

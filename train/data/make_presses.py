@@ -97,9 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("train.data.make_presses: interrupted; the same command continues\n")
         return _INTERRUPTED
-    rows = "rows" if world.each_newest else "sequences"
-    rate = world.count * world.taps / (time.monotonic() - started_s)
-    sys.stdout.write(f"{options.out}: {len(made)} {rows}, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
+    rate = len(made) * made.taps / (time.monotonic() - started_s)
+    sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
     return 0
 
 
@@ -121,7 +120,6 @@ def _world(options: argparse.Namespace) -> World:
         per_pad=options.per_pad,
         families=families,
         spread=options.spread,
-        each_newest=options.each_newest,
         seed=options.seed,
     )
 
@@ -137,16 +135,7 @@ def _parser() -> argparse.ArgumentParser:
         "--schedule", default="mixed", help=f"poses of a sequence's presses: {', '.join(SCHEDULES)} (mixed)"
     )
     parser.add_argument(
-        "--begun",
-        type=float,
-        default=0.5,
-        help="share of sequences, not of rows, whose newest press has only begun (0.5)",
-    )
-    parser.add_argument(
-        "--each-newest",
-        action="store_true",
-        help="make a row of each press of a sequence, in which it is the newest; of the newest alone where it has only "
-        "begun",
+        "--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)"
     )
     parser.add_argument("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     parser.add_argument(

@@ -15,12 +15,7 @@ from train.errors import DatasetError
 from train.physics.sensor_noise import Nuisances
 
 _SINGLE: Final = 0.7
-"""Share of batches of one tap that are drawn from presses of one tap, if there are any: no other batch has them."""
-_BEGUN: Final = 0.3
-"""Share of windows drawn from sequences whose newest tap is lighter than some earlier one: in use most have only begun,
-while sets whose every tap is once the newest hold few."""
-_LIGHTER: Final = 0.6
-"""Reading of a newest tap that has only begun, over the largest earlier one's, at most."""
+"""Share of batches of one tap that are drawn from presses of one tap, if there are any: they are many more."""
 _AS_MADE: Final = 0.5
 """Share of batches that keep a sequence's newest taps; in the others any of its earlier taps are left out."""
 _ERRORS_MM: Final = (0.05, 1.5)
@@ -59,8 +54,6 @@ class PosedBatches:
         self._given = np.array(given) / sum(given)
         there = presses.counts.any(axis=(2, 3, 4)).sum(axis=1)
         self._rows = [np.flatnonzero(there >= taps) for taps in range(1, len(given) + 1)]
-        sizes = np.sqrt(np.square(presses.counts).mean(axis=(2, 3, 4)))
-        self._light = sizes[:, 0] < _LIGHTER * sizes.max(axis=1)
         self._single = np.flatnonzero(there == 1)
         self._batch = min(batch, len(presses))
         lacking = [taps for taps, rows in enumerate(self._rows, 1) if given[taps - 1] and not len(rows)]
@@ -76,10 +69,7 @@ class PosedBatches:
         rows = self._rows[taps - 1]
         if taps == 1 and len(self._single) and rng.random() < _SINGLE:
             rows = self._single
-        light = rows[self._light[rows]]
-        begun = int(rng.binomial(self._batch, _BEGUN)) if taps > 1 and len(light) else 0
-        drawn = [(light, begun), (rows, self._batch - begun)]
-        picked = self._presses.pick(np.concatenate([rng.choice(*one, replace=len(one[0]) < one[1]) for one in drawn]))
+        picked = self._presses.pick(rng.choice(rows, self._batch, replace=len(rows) < self._batch))
         picked = _some_of(rng, picked, taps)
         readings, certainty = read_by_many(rng, picked, self._nuisances)
         batch = Batch(
@@ -89,8 +79,7 @@ class PosedBatches:
             traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
             poses=torch.from_numpy(stated_poses(rng, picked.poses)),
         )
-        batch = batch.mirrored(torch.from_numpy(rng.random(len(picked)) < 0.5))
-        return batch.turned(torch.from_numpy(rng.integers(0, 4, len(picked))))
+        return batch.mirrored(torch.from_numpy(rng.random(len(picked)) < 0.5))
 
 
 def stated_poses(

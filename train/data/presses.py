@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from firmware_bridge.recording.npz_reader import read_npz
 from train.data.array_file import MOST_FACTS_BYTES, Axes, arrays_sha256, check_axes, write_arrays
 from train.errors import DatasetError
-from train.surfaces.poses import ANGLE_STEP_DEG
 
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
@@ -21,8 +20,6 @@ VERSION: Final = 3
 _NO_POSES: Final = 2
 """Version without poses, which is still loaded: its taps were turned at one place."""
 _MOST_BYTES: Final = 1 << 33
-_OFF: Final = np.array([1e-2, 1e-2, ANGLE_STEP_DEG])
-"""Difference from the paper's schedule below which a tap follows it, in [mm] and [deg]; some sets have errors."""
 _AXES: Final[Axes] = {
     "family": ("U", "n"),
     "pad": ("int64", "n"),
@@ -42,8 +39,6 @@ _AXES: Final[Axes] = {
 @dataclass(frozen=True, slots=True)
 class PressSet:
     """n sequences of K presses, newest first, each at one moment, with the newest one's truth.
-
-    Several may have the same presses, each with another one as the newest (`World.each_newest`).
 
     Attributes:
         family: (n,) names, see train.families.catalogue.
@@ -99,11 +94,8 @@ class PressSet:
         )
 
     def only_turned(self) -> "PressSet":
-        """Return the sequences of the paper's schedule: taps at one place, each turned by a step from the newer one."""
-        schedule = np.array([[0, 0, ANGLE_STEP_DEG * number] for number in range(self.taps)])
-        of_it = (np.abs(self.poses - schedule) < _OFF).all(axis=2)
-        absent = ~self.counts.any(axis=(2, 3, 4))
-        return self.pick(np.flatnonzero((of_it | absent).all(axis=1)))
+        """Return the sequences whose taps are all at one place, as the paper's schedule turns the pad."""
+        return self.pick(np.flatnonzero(~self.poses[..., :2].any(axis=(1, 2))))
 
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""

@@ -16,7 +16,7 @@ from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
 from train.surfaces.named_surfaces import surface_mesh
 from train.surfaces.poses import MAX_TAPS
-from train.surfaces.tap_schedules import SCHEDULES, relative
+from train.surfaces.tap_schedules import SCHEDULES
 
 INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
@@ -44,8 +44,6 @@ class World:
         per_pad: sequences of one pad.
         families: relative frequency of each family.
         spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
-        each_newest: every tap of a sequence is the newest one of a row of its own, with its truth; the others follow in
-            cyclic order, up to twice the schedule's reach away. Where the newest tap has only begun, it alone is.
         seed: of all draws.
     """
 
@@ -56,7 +54,6 @@ class World:
     per_pad: int = 24
     families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))
     spread: float = 1.0
-    each_newest: bool = False
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -97,8 +94,6 @@ class World:
             "inputs": list(INPUTS),
             "version": VERSION,
         }
-        if not self.each_newest:  # sets without it keep the hashes by which reports and contracts name them
-            del facts["each_newest"]
         meshes = {name: mesh_sha256(name) for name in self.families if name.startswith("mesh:")}
         return facts | ({"meshes": meshes} if meshes else {})
 
@@ -117,7 +112,7 @@ def solve_pad(world: World, number: int) -> PressSet:
     family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
     schedule = SCHEDULES[world.schedule]
     tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
-    made = press_shapes(rng, gripped, family, tapped, number, world.begun, each_newest=world.each_newest)
+    made = press_shapes(rng, gripped, family, tapped, number, world.begun)
     return made.pick((made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2)))
 
 
@@ -128,13 +123,10 @@ def press_shapes(
     tapped: list[Tapped],
     number: int,
     begun: float = 0.0,
-    *,
-    each_newest: bool = False,
 ) -> PressSet:
     """Press shapes onto pad `number` with drawn depths, drags and friction; light presses are kept.
 
-    In a share `begun` of the sequences the newest tap is not as deep yet as the earlier ones were at their ends. With
-    `each_newest` every tap of the others is the newest one of a row of its own.
+    In a share `begun` of the sequences the newest tap is not as deep yet as the earlier ones were at their ends.
     """
     n, taps = len(tapped), len(tapped[0].heights_mm)
     depths_mm = np.repeat(rng.uniform(*INDENTATION_MM, n)[:, None], taps, axis=1)
@@ -155,24 +147,18 @@ def press_shapes(
         rng.uniform(*_FRICTION, n * taps),
         [one.cover for one in tapped for _ in range(taps)],
     )
-    # Each row's sequence, its newest tap there, and all its taps.
-    sequence, newest = np.arange(n), np.zeros(n, dtype=np.int64)
-    if each_newest:
-        sequence, newest = np.nonzero(~only_begun[:, None] | (np.arange(taps) == 0))
-    order = (newest[:, None] + np.arange(taps)) % taps
-    poses = np.array([one.poses for one in tapped])[sequence[:, None], order]
-    truth = sequence * taps + newest
+    newest = slice(0, None, taps)
     return PressSet(
-        family=family[sequence],
-        pad=np.full(len(sequence), number, dtype=np.int64),
-        constants=np.tile(constants(gripped.pad), (len(sequence), 1)),
-        counts=done.counts.reshape(n, taps, *done.counts.shape[1:])[sequence[:, None], order],
-        angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32)[sequence[:, None], order],
-        poses=relative(poses[:, :1], poses) if each_newest else poses.astype(np.float32),
-        patterns=done.patterns[truth].astype(np.float16),
-        touching=done.touching[truth],
-        traction_kpa=done.traction_kpa[truth].astype(np.float16),
-        force_n=done.force_n[truth],
-        twist_nmm=done.twist_nmm[truth],
-        indentation_mm=done.indentation_mm[truth],
+        family=family,
+        pad=np.full(n, number, dtype=np.int64),
+        constants=np.tile(constants(gripped.pad), (n, 1)),
+        counts=done.counts.reshape(n, taps, *done.counts.shape[1:]),
+        angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32),
+        poses=np.array([one.poses for one in tapped], dtype=np.float32),
+        patterns=done.patterns[newest].astype(np.float16),
+        touching=done.touching[newest],
+        traction_kpa=done.traction_kpa[newest].astype(np.float16),
+        force_n=done.force_n[newest],
+        twist_nmm=done.twist_nmm[newest],
+        indentation_mm=done.indentation_mm[newest],
     )

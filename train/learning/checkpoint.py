@@ -177,9 +177,7 @@ def batches_of(
         raise DatasetError(f"patterns at x{scale} asked for, presses have them at x{SCALE}: take 'train.generate'")
     if posed:
         return PosedBatches(data, recipe.given, recipe.batch, seed)
-    if len(recipe.given) > 1:
-        data = data.with_taps(len(recipe.given)).only_turned()
-    return PressBatches(data, recipe.given, recipe.batch, seed)
+    return PressBatches(data.only_turned() if len(recipe.given) > 1 else data, recipe.given, recipe.batch, seed)
 
 
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:

@@ -16,7 +16,6 @@ from train.data.presses import PressSet
 from train.learning.contact_check import limit_of
 from train.learning.small_classifier import fit_classifier
 from train.physics.sensor_noise import Nuisances
-from train.surfaces.tap_schedules import relative
 
 _ROUNDS: Final = 3
 """Readings of each sequence, each by another sensor, and half of them of mirror images."""
@@ -79,6 +78,15 @@ def features(pairs: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[
         if rows
         else np.empty((0, pair_width(int(np.prod(pairs.shape[2:])), poses=True)), np.float32)
     )
+
+
+def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return poses (n, 3) of earlier taps in newer ones' axes, both in the axes of a third; see `PadPose.seen_from`."""
+    turn = np.radians(newest[:, 2])
+    x, y = (earlier[:, :2] - newest[:, :2]).T
+    turned = (earlier[:, 2] - newest[:, 2] + 180) % 360 - 180
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.stack([cosine * x + sine * y, cosine * y - sine * x, turned], axis=1).astype(np.float32)
 
 
 def _strong(

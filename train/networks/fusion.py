@@ -103,15 +103,14 @@ class FusionNet(CompactNet):
     def take_over(self, start: CompactNet) -> None:
         """Copy a network of one tap, or another one of this kind; what encodes earlier taps starts as its entrance.
 
-        From more symmetries to fewer, the function stays the same, without its correction of intervals.
-
         Raises:
             ValueError: another width, or another number of inputs for the pad.
         """
         if isinstance(start, FusionNet):
-            super().take_over(start)
-            for name in ("own_share", "log_reach"):
-                getattr(self, name).data.copy_(getattr(start, name))
+            try:
+                self.load_state_dict(start.state_dict())
+            except RuntimeError as error:
+                raise ValueError(str(error).splitlines()[-1].strip()) from error
             return
         super().take_over(start)
         weight = torch.zeros_like(self.enter_earlier.weight)

@@ -82,15 +82,6 @@ SCHEDULES: Final[Mapping[str, Schedule]] = {
 """Schedules by name."""
 
 
-def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return poses (..., 3) of earlier taps in newer ones' axes, both in those of a third; see `PadPose.seen_from`."""
-    turn = np.radians(newest[..., 2])
-    x_mm, y_mm = np.moveaxis(earlier[..., :2] - newest[..., :2], -1, 0)
-    turned_deg = (earlier[..., 2] - newest[..., 2] + 180) % 360 - 180
-    cosine, sine = np.cos(turn), np.sin(turn)
-    return np.stack([cosine * x_mm + sine * y_mm, cosine * y_mm - sine * x_mm, turned_deg], axis=-1).astype(np.float32)
-
-
 def _within(rng: np.random.Generator, taps: int, reach_mm: float, turn_deg: float) -> NDArray[np.float64]:
     away_mm, way = reach_mm * np.sqrt(rng.random(taps)), rng.uniform(0, 2 * np.pi, taps)
     poses = np.stack([away_mm * np.cos(way), away_mm * np.sin(way), rng.uniform(-turn_deg, turn_deg, taps)], axis=1)

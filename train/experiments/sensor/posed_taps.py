@@ -32,8 +32,8 @@ from train.surfaces.poses import MAX_TAPS
 
 MODEL: Final = "mtsr7-int8"
 SCHEDULES: Final = ("half-pitch", "near", "turns", "slide")
-PEER_ON: Final = World(count=25_000, taps=4, each_newest=True, begun=0.4, seed=8)
-"""Settings of data/each4.npz in the Makefile, of which the peer is fitted."""
+PEER_ON: Final = World(count=40_000, taps=4, seed=3)
+"""Settings of data/taps4.npz in the Makefile, of which the peer is fitted."""
 _COUNT: Final = 420
 _SEED: Final = 2_000_003
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
@@ -47,7 +47,7 @@ _WINDOW: Final = 4
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses, and its peer, and write the report `posed-taps`."""
     model = ModelSession(bench.use(bench.models / f"{MODEL}.onnx"))
-    fitted_on = bench.presses("each4", PEER_ON, quick_taps=4)
+    fitted_on = bench.presses("taps4", PEER_ON, quick_taps=4)
     peer = kalman_fusion.fit(fitted_on)
     linear = {name: fit_linear_taps(fitted_on, name) for name in linear_taps.SCHEDULES}
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
