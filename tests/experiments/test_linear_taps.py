@@ -7,7 +7,7 @@ import pytest
 from press_samples import make_press_set
 
 from train.errors import DatasetError
-from train.experiments.support.linear_taps import fit_linear_taps
+from train.experiments.support.linear_taps import _follow, fit_linear_taps
 from train.learning.posed_tap_check import relative
 from train.surfaces.tap_schedules import SCHEDULES
 
@@ -51,7 +51,9 @@ def test_only_sequences_of_the_schedule_are_fitted(squares):
 def test_each_tap_of_a_square_may_be_the_newest(squares):
     poses = squares.poses[:, [2, 0, 1, 3]]
     seen = np.stack([relative(poses[:, 0], poses[:, tap]) for tap in range(4)], axis=1)
-    fit_linear_taps(replace(squares, poses=seen), "half-pitch")
+    assert _follow(seen, "half-pitch").all() and not _follow(seen, "turns").any()
+    seen[:, 2, 1] += 0.5
+    assert not _follow(seen, "half-pitch").any()
 
 
 def test_turned_taps_keep_their_order_whatever_their_poses_are_off(squares):
