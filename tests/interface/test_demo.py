@@ -1,6 +1,7 @@
 import dataclasses
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import cli_samples
 import numpy as np
@@ -277,15 +278,17 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     assert "taps 'glyph:1' 4 times, where it is proposed" in done.stderr and "4 of 4 taps scored" in done.stderr
     results = [one for one in cli_samples.records(done.stdout) if one["state"] != "event"]
     assert {one["source"] for one in results} == {"emulated"}
-    places, proposed, contact = [], [], False
-    for one in results:
-        if one["contact"] and not contact:
-            places.append((one["pose"]["x_mm"], one["pose"]["y_mm"]))
-        if contact and one["contact"] is False and one["next_tap"] is not None:
-            proposed.append((one["next_tap"]["target"]["x_mm"], one["next_tap"]["target"]["y_mm"]))
-        contact = one["contact"]
-    assert places[0] == (0, 0) and len(set(places[:4])) == 4
-    np.testing.assert_allclose(places[1:4], proposed[:3], atol=0.01)
+    places: list[tuple[float, float]] = []
+    proposed: dict[tuple[float, float], tuple[float, float]] = {}
+    for one in results:  # by place, not by the edges of contact: of a pause, a busy machine may lose every scan
+        if one["contact"] and (place := (one["pose"]["x_mm"], one["pose"]["y_mm"])) not in places[-1:]:
+            places.append(place)
+        if places and one["contact"] is False and one["next_tap"] is not None:
+            proposed.setdefault(places[-1], (one["next_tap"]["target"]["x_mm"], one["next_tap"]["target"]["y_mm"]))
+    assert places[0] == (0, 0) and len(set(places[:4])) == 4, (places[:6], proposed)
+    made = {before: place for before, place in pairwise(places[:4]) if before in proposed}
+    assert len(made) >= 2, (places[:6], proposed)
+    np.testing.assert_allclose(list(made.values()), [proposed[before] for before in made], atol=0.01)
     row = r"^ +\d +(-?[\d.]+) +(-?[\d.]+) +0 +(\d) "
     table = [tuple(map(float, one)) for one in re.findall(row, done.stderr, re.MULTILINE)]
     np.testing.assert_allclose(table, [(x, y, n) for n, (x, y) in enumerate(places[:4], 1)], atol=0.051)
