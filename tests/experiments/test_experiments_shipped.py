@@ -172,6 +172,19 @@ def test_the_oracle_of_several_taps_finds_them_again_though_their_poses_are_off(
     assert off[1] < 0.2 * off[0]
 
 
+def test_the_oracle_of_several_taps_keeps_the_more_probable_of_two_optima():
+    shifts = SCHEDULES["half-pitch"](np.random.default_rng(0), 2)
+    taps = KnownTaps(oracle.KnownSurface("small triangle", NOMINAL), shifts)
+    place = np.array([0.5, 0.0, 10.0])
+    truth, far = taps.mean(place), taps.mean(place) + np.pad([4.0, 0, 120], (0, len(taps.spread) - 3))
+    press = taps.press(truth[None])
+    for starts in ((truth, far), (far, truth)):
+        found = taps.fit(press.counts.reshape(2, -1), place, 0, starts)
+        np.testing.assert_allclose(found, press.patterns[0], atol=1e-6)
+    assert len(taps.first(1, truth)) == len(oracle.PRIOR_SD)
+    assert taps.first(2, truth) == pytest.approx(truth)
+
+
 def test_what_is_common_to_all_taxels_of_an_axis_covaries():
     covariance = oracle.error_covariance(np.zeros(48), Nuisances())
     assert covariance[32, 40] > 1500 and covariance[0, 40] == 0 and covariance[0, 8] < covariance[32, 40]

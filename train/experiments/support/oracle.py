@@ -44,7 +44,7 @@ PRIOR_MEAN: Final = np.array([0, 0, 0, 0, 0, 0.27, 0, 0, 0, np.log(0.6)])
 """Prior mean in the same order; the mean of the place is set to the nominal place of the surface."""
 DEPTH: Final = 5
 LEAST_DEPTH_MM: Final = 0.1
-_SHORTER: Final = (1.0, 0.5, 0.2)
+_SHORTER: Final = (1.0, 0.5, 0.2, 0.05)
 _MODEL_SHARE: Final = 0.03
 """Share of a reading that no press explains, from hysteresis and cross-talk."""
 
@@ -90,8 +90,21 @@ class KnownSurface:
             start: mean of the prior, where the search starts.
             steps: Gauss-Newton steps.
         """
-        here = most_probable(lambda tried: self.press(tried).counts, reading, start, PRIOR_SD, NUDGE, steps)
-        return self.press(here[None]).patterns[0]
+        found = most_probable(lambda tried: self.press(tried).counts, reading, start, PRIOR_SD, NUDGE, steps)
+        return self.press(found.numbers[None]).patterns[0]
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """End of one search for the most probable press.
+
+    Attributes:
+        numbers: (p,) that define it.
+        cost: minus twice the logarithm of their probability, but for a constant: the least of several optima is best.
+    """
+
+    numbers: NDArray[np.float64]
+    cost: float
 
 
 def most_probable(
@@ -101,31 +114,41 @@ def most_probable(
     spread: NDArray[np.floating],
     nudge: NDArray[np.floating],
     steps: int,
-) -> NDArray[np.float64]:
+    start: NDArray[np.floating] | None = None,
+) -> Optimum:
     """Return the most probable numbers (p,) behind the readings of one or several taps, by Gauss-Newton.
 
     Args:
         counts_of: function from numbers (n, p) to counts of n times all taps, 48 each.
         reading: (48 taps,) zeroed counts, divided by the gains.
-        mean: (p,) of the prior, where the search starts.
+        mean: (p,) of the prior.
         spread: (p,) standard deviations of the prior.
         nudge: (p,) changes by which slopes are found.
         steps: Gauss-Newton steps.
+        start: (p,) where the search starts; None for the mean.
     """
-    here = np.asarray(mean, dtype=np.float64)
+    here = np.asarray(mean if start is None else start, dtype=np.float64)
     for _ in range(steps):
         around = counts_of(here + np.concatenate([np.zeros((1, len(here))), np.diag(nudge)]))
         counts = around.reshape(len(nudge) + 1, -1).astype(np.float64)
         slope = (counts[1:] - counts[0]).T / nudge
-        weights = [np.linalg.inv(error_covariance(tap, Nuisances())) for tap in counts[0].reshape(-1, 48)]
-        weight = np.asarray(block_diag(*weights), dtype=np.float64)
+        weight = np.linalg.inv(_covariance(counts[0]))
         information = slope.T @ weight @ slope + np.diag(spread**-2.0)
         step = np.linalg.solve(information, slope.T @ weight @ (reading - counts[0]) - (here - mean) / spread**2)
         tried = here + np.concatenate([[0.0], _SHORTER])[:, None] * step
         off = reading - counts_of(tried).reshape(len(tried), -1)
         cost = np.einsum("ni,ij,nj->n", off, weight, off) + np.square((tried - mean) / spread).sum(axis=1)
         here = tried[int(cost.argmin())]
-    return here
+    counts = counts_of(here[None]).reshape(-1).astype(np.float64)
+    covariance, off = _covariance(counts), reading - counts
+    unexplained = off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance).logabsdet
+    return Optimum(here, float(unexplained + np.square((here - mean) / spread).sum()))
+
+
+def _covariance(counts: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the covariance of the errors of all taps' readings (48 taps,)."""
+    taps = [error_covariance(tap, Nuisances()) for tap in counts.reshape(-1, 48)]
+    return np.asarray(block_diag(*taps), dtype=np.float64)
 
 
 def error_covariance(reading: NDArray[np.floating], nuisances: Nuisances) -> NDArray[np.float64]:
