@@ -124,6 +124,26 @@ def test_limits_of_taps_in_miniature(models, tmp_path, capsys):
     assert plain["one tap dB"] != both["one tap dB"] and int(both["one tap us"]) > int(plain["one tap us"])
 
 
+def test_the_papers_schedule_in_miniature(tmp_path, capsys):
+    """By the bundled models: those of several taps are given what their number says, next to one tap of the default."""
+    main(["paper-schedule", "--quick", *(f"--{place}={tmp_path / place}" for place in ("reports", "data"))])
+    report = tmp_path / "reports" / "paper-schedule"
+    assert capsys.readouterr().out.endswith(f"{report}.md\n")
+    with report.with_suffix(".csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["set"] for row in rows} == {"frozen set", "more sequences"}
+    for name in ("frozen set", "more sequences"):
+        one, *several = (row for row in rows if row["set"] == name)
+        assert (one["model"], one["taps"], one["over one tap"]) == ("stsr-int8", "1", "")
+        assert [(row["model"], row["taps"]) for row in several] == [
+            ("mtsr4-int8", "4"),
+            (MODEL, "4"),
+            (MODEL, "7"),
+        ]
+        assert len({row["PSNR dB"] for row in (one, *several)}) == 4, "each sees something else"
+        assert all(row["over one tap"] and row["over one tap, by figure"] and row["run time us"] for row in several)
+
+
 def test_poses_are_off_by_just_so_much():
     true = np.zeros((50, 4, 3), dtype=np.float32)
     poses = _off(true, (2.0, 5.0), (0.2, 1.0))
