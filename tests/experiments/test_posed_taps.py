@@ -138,9 +138,12 @@ def test_the_papers_schedule_in_miniature(tmp_path, capsys):
         assert [(row["model"], row["taps"]) for row in several] == [
             ("mtsr4-int8", "4"),
             (MODEL, "4"),
+            ("mean of both", "4"),
             (MODEL, "7"),
+            ("mean of both", "7"),
         ]
-        assert len({row["PSNR dB"] for row in (one, *several)}) == 4, "each sees something else"
+        assert len({row["PSNR dB"] for row in (one, *several)}) == 6, "each sees something else"
+        assert all(int(mean["run time us"]) > int(one["run time us"]) for mean in (several[2], several[4]))
         assert all(row["over one tap"] and row["over one tap, by figure"] and row["run time us"] for row in several)
 
 
