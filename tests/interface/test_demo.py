@@ -264,6 +264,22 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     assert max(used[0, 3]) > 1 and used[1, 0] == {1}
 
 
+def tapped(results):
+    """Return the place of each tap, and by its number the taps its pattern is made of and the proposal after it."""
+    places, used, proposed = [], {}, {}
+    for one in results:
+        if one["contact"]:
+            place = tuple(one["pose"][axis] for axis in ("x_mm", "y_mm", "turn_deg"))
+            if place not in places[-1:]:
+                places.append(place)
+            if one["state"] == "contact":
+                used[len(places) - 1] = one["taps_used"]
+        elif places and one["contact"] is False and one["next_tap"] is not None:
+            target = one["next_tap"]["target"]
+            proposed.setdefault(len(places) - 1, tuple(target[axis] for axis in ("x_mm", "y_mm", "turn_deg")))
+    return places, used, proposed
+
+
 def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_path):
     """The whole program with a model that takes poses: each proposal of its records is where the next tap is made."""
     path = tmp_path / "posed.onnx"
@@ -275,23 +291,21 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
     done = cli_samples.run("demo", "--model", str(path), "--sink", "jsonl:-")
     assert done.returncode == 0, done.stderr
-    assert "taps 'glyph:1' 4 times, where it is proposed" in done.stderr and "4 of 4 taps scored" in done.stderr
+    assert "taps 'glyph:1' 4 times, where it is proposed" in done.stderr
     results = [one for one in cli_samples.records(done.stdout) if one["state"] != "event"]
     assert {one["source"] for one in results} == {"emulated"}
-    places: list[tuple[float, float]] = []
-    proposed: dict[tuple[float, float], tuple[float, float]] = {}
-    for one in results:  # by place, not by the edges of contact: of a pause, a busy machine may lose every scan
-        if one["contact"] and (place := (one["pose"]["x_mm"], one["pose"]["y_mm"])) not in places[-1:]:
-            places.append(place)
-        if places and one["contact"] is False and one["next_tap"] is not None:
-            proposed.setdefault(places[-1], (one["next_tap"]["target"]["x_mm"], one["next_tap"]["target"]["y_mm"]))
-    assert places[0] == (0, 0) and len(set(places[:4])) == 4, (places[:6], proposed)
-    made = {before: place for before, place in pairwise(places[:4]) if before in proposed}
-    assert len(made) >= 2, (places[:6], proposed)
-    np.testing.assert_allclose(list(made.values()), [proposed[before] for before in made], atol=0.01)
-    row = r"^ +\d +(-?[\d.]+) +(-?[\d.]+) +0 +(\d) "
+    # A busy machine may drop all patterns of a tap, which has no proposal then, or forget taps after a silence.
+    places, used, proposed = tapped(results)
+    assert places[0] == (0, 0, 0), done.stderr
+    made = {before: after for before, after in pairwise(range(4)) if before in proposed}
+    assert len(made) >= 2 and made.keys() == used.keys() & {0, 1, 2}, (places, used, proposed, done.stderr)
+    for before, after in made.items():  # the robot has places 2.35 mm apart, and takes the nearest one
+        assert places[after][:2] == pytest.approx(proposed[before][:2], abs=0.5)
+    row = r"^ +\d +(-?[\d.]+) +(-?[\d.]+) +(-?\d+) +(\d) "
     table = [tuple(map(float, one)) for one in re.findall(row, done.stderr, re.MULTILINE)]
-    np.testing.assert_allclose(table, [(x, y, n) for n, (x, y) in enumerate(places[:4], 1)], atol=0.051)
+    scored = [(*places[tap], used[tap]) for tap in sorted(used) if tap < 4]
+    np.testing.assert_allclose(table, scored, atol=0.051, err_msg=done.stderr)
+    assert f"{len(scored)} of 4 taps scored" in done.stderr
     assert len({one["pose"]["x_mm"] for one in results[-250:]}) > 100 and "map of a letter of 50 mm" in done.stderr
 
 
