@@ -1,7 +1,8 @@
 """Graphs in 8-bit integers: unsigned activations, signed weights with a scale for each channel, float in and out.
 
 Ranges are percentiles over training taps. For a network that takes poses they are widened to what windows beyond any
-touch give: its layers exchange values between taps, which such windows take far out of every range.
+touch give: its layers exchange values between taps, which such windows take far out of every range. Those of the newest
+tap's own layers are widened a little only, since coarser steps there cost most (docs/log.md).
 """
 
 import contextlib
@@ -26,7 +27,7 @@ from edge.inference.onnx_session import LOG_FATAL_ONLY
 from edge.inference.pose_input import scheduled_rows
 from export.errors import ExportError
 from export.graphs.joined import branches
-from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, takes_poses
+from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, newest_values, takes_poses
 from export.quantisation.rounding import MOST_VALUE
 from firmware_bridge.pad_geometry import AXES
 from train.data.batch import Batch
@@ -42,6 +43,8 @@ _PERCENTILE: Final = 99.999
 
 With the whole range the bundled models lose .03 to .07 dB more, because a few large values make all steps coarser.
 """
+_WIDEST: Final = np.float32(1.3)
+"""Factor by which windows beyond any touch may widen the ranges of the newest tap's own layers."""
 _CALIBRATED_ON: Final = 512
 _FEWEST: Final = 32
 _SET_FORCE_N: Final = (0.3, 8.0)
@@ -110,8 +113,11 @@ def quantised(
     far = replace(seen, window=windows, pad=pads, poses=poses.expand(len(beyond), -1, -1).contiguous())
     whole = _quantised(model, nodes, _Inputs(_inputs(model, far), batch), CalibrationMethod.MinMax)
     ranges = rounded_ranges(_quantised(model, nodes, touches))
-    for name, (low, high) in rounded_ranges(whole).items():
-        ranges[name] = (min(low, ranges[name][0]), max(high, ranges[name][1]))
+    bounded = newest_values(model)
+    for name, (far_low, far_high) in rounded_ranges(whole).items():
+        low, high = ranges[name]
+        lowest, highest = (_WIDEST * low, _WIDEST * high) if name in bounded else (far_low, far_high)
+        ranges[name] = (min(low, max(far_low, lowest)), max(high, min(far_high, highest)))
     return _quantised(model, nodes, _Inputs(_inputs(model, far), batch), CalibrationMethod.MinMax, ranges)
 
 
