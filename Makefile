@@ -30,9 +30,11 @@ wheels: $(VENV)/.dev  ## two wheels in dist/: the runtime, with completion and m
 	$(BIN)/python release/wheels.py
 
 TAPS := data/gripped.npz data/gripped4.npz data/taps4.npz data/taps7.npz data/more4.npz data/more7.npz
+NAMED := data/named4.npz data/nominal4.npz data/named7.npz data/taps4.npz data/taps7.npz
 
-models: $(VENV)/.dev $(TAPS) data/validation.npz  ## retrain and re-export the bundled models: some four hours on two cores
+models: $(VENV)/.dev $(TAPS) $(NAMED) data/validation.npz  ## retrain and re-export the bundled models: some five hours on two cores
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(NAMED) --validation data/validation.npz --network fusion-mtsr7 --name mtsr7 --start-from mtsr7-wide --keep 0.15 --steps 21000 --learning-rate 1.5e-3 --bf16 --seed 7
 	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
 	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
@@ -75,6 +77,15 @@ data/more4.npz: $(VENV)/.dev  ## as many again
 
 data/more7.npz: $(VENV)/.dev
 	$(BIN)/python -m train.data.make_presses $@ --count 10000 --taps 7 --seed 6
+
+data/named4.npz: $(VENV)/.dev  ## the paper's figures, four taps each
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 20000 --taps 4 --seed 41
+
+data/named7.npz: $(VENV)/.dev  ## the same, seven taps each
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 2500 --taps 7 --seed 42
+
+data/nominal4.npz: $(VENV)/.dev  ## the same as the paper has it: one pad, turned by 5 degrees from tap to tap
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 5000 --taps 4 --schedule turns --spread 0 --seed 43
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001

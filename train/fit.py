@@ -45,7 +45,7 @@ BUNDLED: Final = (
     Training(
         "mtsr2", "compact-mtsr2", Recipe(steps=1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
     ),
-    Training("mtsr7", "fusion-mtsr7", Recipe(steps=56_000, given=GIVEN[7]), start="stsr", options=_KNOWN),
+    Training("mtsr7-wide", "fusion-mtsr7", Recipe(steps=56_000, given=GIVEN[7]), start="stsr", options=_KNOWN),
 )
 
 
@@ -140,6 +140,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
         options.start_from,
         seed=options.seed,
         options=_KNOWN if compact and isinstance(data, PressSet) else {},
+        keep=options.keep,
     )
 
 
@@ -162,6 +163,9 @@ def _parser() -> argparse.ArgumentParser:
         "--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)"
     )
     one.add_argument("--start-from", metavar="NAME", help="checkpoint in the same folder to start from")
+    one.add_argument(
+        "--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)"
+    )
     one.add_argument("--scale", type=int, default=10, help="pattern pixels per taxel pitch")
     one.add_argument("--steps", type=int, default=9000)
     one.add_argument("--minutes", type=float, help="end after this time, if the steps take longer")

@@ -47,16 +47,9 @@ def frozen():
 
 
 @cache
-def one_in(step):
-    """Return fewer of its frames: a tenth is enough to break a bound."""
-    names = ("newest", "tap", "indentation_mm", "force_n")
-    return replace(frozen(), **{name: getattr(frozen(), name)[::step] for name in names})
-
-
-@cache
 def rows(name):
     """Compare on the whole set what is rounded; float32 is the same on each window, and is compared on a third."""
-    judged = frozen() if name in IN_INTEGERS else one_in(3)
+    judged = frozen() if name in IN_INTEGERS else frozen().thinned(3)
     return list(verify(find_model(name), judged, on_pass=lambda: passes.update([name])))
 
 
@@ -177,7 +170,7 @@ def test_each_pass_over_the_windows_is_told_for_a_bar_even_where_there_is_one_mo
 def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeypatch, capsys):
     path = save(spoiled("stsr", 1.01), tmp_path / "stsr.onnx")
     monkeypatch.setattr(verify_module, "network_of", lambda _: network_of(graph_of("stsr")[0]))
-    monkeypatch.setattr(verify_module, "load_frozen_set", lambda path: one_in(10))
+    monkeypatch.setattr(verify_module, "load_frozen_set", lambda path: frozen().thinned(10))
     with pytest.raises(SystemExit, match=r"verify: \d+ of \d+ comparisons break a bound"):
         main([str(path)])
     printed = capsys.readouterr().out
@@ -186,7 +179,7 @@ def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeyp
 
 def test_integers_that_cost_too_much_break_the_bound(tmp_path, monkeypatch):
     monkeypatch.setattr(verify_module, "MOST_LOSS_DB", -1.0)
-    broken = [row for row in verify(find_model("stsr-small-int8"), one_in(10)) if row.broken]
+    broken = [row for row in verify(find_model("stsr-small-int8"), frozen().thinned(10)) if row.broken]
     assert len(broken) == len(LEVELS) and all("dB lost, more than -1.0" in row.broken for row in broken)
 
 
@@ -197,7 +190,9 @@ def test_a_deviation_that_is_not_above_zero_breaks_the_bound(monkeypatch):
             return [pattern, deviation * 0, traction]
 
     monkeypatch.setattr(verify_module, "GraphRun", Sure)
-    assert any(row.broken == "a deviation is not above zero" for row in verify(find_model("stsr-int8"), one_in(10)))
+    assert any(
+        row.broken == "a deviation is not above zero" for row in verify(find_model("stsr-int8"), frozen().thinned(10))
+    )
 
 
 def test_integers_that_say_something_else_break_the_bound(monkeypatch):
@@ -208,7 +203,7 @@ def test_integers_that_say_something_else_break_the_bound(monkeypatch):
 
     monkeypatch.setattr(verify_module, "GraphRun", Other)
     monkeypatch.setattr(verify_module, "MOST_LOSS_DB", 100)
-    assert any("pattern differs by" in row.broken for row in verify(find_model("stsr-int8"), one_in(10)))
+    assert any("pattern differs by" in row.broken for row in verify(find_model("stsr-int8"), frozen().thinned(10)))
 
 
 def test_a_network_of_another_training_is_refused(tmp_path):

@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from train.learning.checkpoint import Training, best_contact_level, fit_network,
 from train.learning.interval_calibration import interval_coverage
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
+from train.networks.registry import grown
 from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
 
@@ -135,6 +137,22 @@ def test_what_is_no_checkpoint_is_refused_by_name(folder, tmp_path, damage, caps
     assert "it ran" not in capsys.readouterr().out
 
 
+def test_a_share_of_the_weights_it_starts_from_is_kept(folder, data, validation, tmp_path):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    further = replace(TRAINING, name="further", start="small", recipe=replace(TRAINING.recipe, steps=5))
+    plain = fit_network(further, data, validation, tmp_path)
+    fully = torch.load(tmp_path / "further.pt", weights_only=True)
+    report = fit_network(replace(further, keep=0.25), data, validation, tmp_path)
+    first = grown(load_network(tmp_path / "small.pt")[0], further.network, 10, **SMALL).state_dict()
+    mixed = torch.load(tmp_path / "further.pt", weights_only=True)
+    for name, weight in mixed.items():
+        if name != "deviation_scale":  # calibrated afterwards
+            torch.testing.assert_close(weight, 0.25 * first[name] + 0.75 * fully[name])
+    assert not torch.equal(mixed["leave.0.weight_free"], fully["leave.0.weight_free"])
+    assert report["validation_psnr_db"] != plain["validation_psnr_db"]
+    assert report["training_sha256"] != plain["training_sha256"] == replace(further, keep=0.0).sha256(data.sha256())
+
+
 def test_the_contact_level_is_the_one_that_overlaps_best():
     rows, cols = np.mgrid[:40, :40] - 19.5
     cone = np.maximum(1 - np.hypot(rows, cols) / 15, 0)[None].astype(np.float32)
@@ -152,7 +170,7 @@ def test_bundled_networks_start_from_nothing_or_one_before_and_take_what_is_know
     for training in BUNDLED:
         assert training.start in before and training.options == {"known": KNOWN}
         before.append(training.name)
-    assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2", "mtsr7"]
+    assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2", "mtsr7-wide"]
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):
@@ -170,6 +188,8 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
         (["--network", "compact-mtsr4"], "4 taps asked for"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
         (["--network", "compact-stsr", "--scale", "7"], "scale is 7"),
+        (["--network", "compact-stsr", "--start-from", "absent", "--keep", "1"], "keep is 1"),
+        (["--network", "compact-stsr", "--keep", "0.2"], "no weights to start from"),
     ],
 )
 def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, told):

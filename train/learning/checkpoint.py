@@ -1,5 +1,6 @@
 """Training of one network from its data to its checkpoint: NAME.pt (weights) with NAME.json (settings, figures)."""
 
+import copy
 import hashlib
 import json
 from collections.abc import Callable, Mapping
@@ -56,6 +57,8 @@ class Training:
         draw: settings by which windows are drawn.
         seed: of weights and draws.
         options: further arguments of the network's class.
+        keep: share of the weights it starts from in the final ones, from 0 to 1: what the training forgets of other
+            contacts comes back. Source: Wortsman et al. 2022 (WiSE-FT), Eq. 1.
     """
 
     name: str
@@ -66,12 +69,21 @@ class Training:
     draw: Draw = field(default_factory=Draw)
     seed: int = 1
     options: dict[str, Any] = field(default_factory=dict)
+    keep: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.keep < 1:
+            raise ValueError(f"keep is {self.keep}, expected a share from 0 to below 1")
+        if self.keep and self.start is None:
+            raise ValueError(f"keep is {self.keep}, but there are no weights to start from: give --start-from")
 
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""
         config = asdict(self)
         if self.draw.figure_share is None:
             del config["draw"]["figure_share"]  # keeps the hash of networks that were trained before the option existed
+        if not self.keep:
+            del config["keep"]  # as well
         return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
 
 
@@ -100,6 +112,7 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
             return report
     torch.manual_seed(training.seed)
     net = _first_weights(training, folder)
+    first = copy.deepcopy(net.state_dict()) if training.keep else {}
     rank, world = rank_and_world()
     device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
@@ -116,6 +129,10 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
         validate=lambda net: {"validation PSNR dB": _psnr(net, validation)},
     )
     net.cpu()
+    if training.keep:
+        net.load_state_dict(
+            {name: weight.lerp(first[name], training.keep) for name, weight in net.state_dict().items()}
+        )
     report = {
         "name": training.name,
         "network": training.network,
