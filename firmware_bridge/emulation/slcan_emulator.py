@@ -15,11 +15,16 @@ from typing import Final, Self
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.pty_port import PseudoPort
-from firmware_bridge.emulation.xela_controller import FRAME_S, Played, SlcanAdapter, bus_timeline, controllers_of
+from firmware_bridge.emulation.xela_controller import CR, FRAME_S, Played, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
 
 _STOP_POLL_S: Final = 0.05
 _DRAIN_POLL_S: Final = 0.01
+_EMPTY_LOOKS: Final = 3
+"""Looks in turn that must find no unread byte: while a client empties its buffer, the kernel still holds more."""
+_STOOD_STILL_S: Final = 0.2
+"""Lateness in [s] at which the emulator itself was stopped: it goes on where it was, since no controller sends in one
+burst what it has missed. One that waits for its client may be late all the time."""
 
 
 class Emulator:
@@ -99,6 +104,9 @@ class Emulator:
         self._on_scan = on_scan
         self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
         self._waits = waits
+        self._still_s = 0.0
+        self._writing = False
+        self._answers = b""
         self._line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
         self._stop = threading.Event()
         self._through = threading.Event()
@@ -133,8 +141,11 @@ class Emulator:
                     return
             start_s = time.monotonic()
             for handed_on_s, frames in groupby(self._timeline, key=self._handed_on_s):
-                if not self._obey_until(start_s + handed_on_s):
+                due_s = start_s + self._still_s + handed_on_s
+                if not self._obey_until(due_s):
                     return
+                late_s = time.monotonic() - due_s
+                self._still_s += late_s if late_s > _STOOD_STILL_S and not self._waits else 0.0
                 self._hand_on(frames)
             self._drain()
         finally:
@@ -159,16 +170,12 @@ class Emulator:
         lines: list[bytes] = []
         ended: list[int] = []
         for time_s, frame in frames:
-            lines.append(self.adapter.encode(frame, time_s))
+            lines.append(self.adapter.encode(frame, time_s + self._still_s))
             if frame.can_id in self._last_frames:
                 ended.append(self._last_frames[frame.can_id])
         now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
         data = b"".join(lines)
-        room = self._line.write(data)
-        while self._waits and room < len(data) and self._obey_until(time.monotonic() + _DRAIN_POLL_S):
-            if not self.adapter.channel_open:
-                break
-            room += self._line.write(data[room:])
+        room = self._write_patiently(data) if self._waits else self._line.write(data)
         for line in lines:
             room -= len(line)
             self.sent_frames += room >= 0
@@ -187,11 +194,31 @@ class Emulator:
                 return True
         return False
 
+    def _write_patiently(self, data: bytes) -> int:
+        """Send frames as the client makes room for them, with answers between them; return the number of bytes."""
+        sent, self._writing = 0, True
+        while sent < len(data):
+            amid_frame = data[:sent][-1:] not in (b"", CR)
+            if self._answers and not amid_frame:
+                self._answers = self._answers[self._line.write(self._answers) :]
+            if amid_frame or not self._answers:
+                sent += self._line.write(data[sent:])
+            going_on = sent == len(data) or self._obey_until(time.monotonic() + _DRAIN_POLL_S)
+            if not going_on or not self.adapter.channel_open:
+                break
+        self._writing = False
+        return sent
+
     def _obey(self, received: bytes) -> None:
-        self._line.write(self.adapter.feed(received))
+        self._answers += self.adapter.feed(received)
+        if not self._writing:
+            written = self._line.write(self._answers)
+            self._answers = self._answers[written:] if self._waits else b""
 
     def _drain(self, deadline_s: float = math.inf) -> None:
         """Let the client fetch the bytes under way, which hanging up would discard."""
-        while self.adapter.channel_open and self._line.unread_bytes() and time.monotonic() < deadline_s:
+        looks = 0
+        while self.adapter.channel_open and looks < _EMPTY_LOOKS and time.monotonic() < deadline_s:
+            looks = 0 if self._line.unread_bytes() else looks + 1
             if not self._obey_until(time.monotonic() + _DRAIN_POLL_S):
                 return

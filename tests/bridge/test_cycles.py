@@ -1,5 +1,7 @@
 """Cycles of scans: none mixes two, whatever is lost, and a sensor's place is recovered; readings name their cycle."""
 
+import time
+
 import pytest
 from bridge_samples import read_until_lost
 from cycle_samples import (
@@ -156,3 +158,16 @@ def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_
     assert all(len(numbers) == 1 for numbers in of_cycles)
     assert counters["resynchronised"] >= (16 - first_frame) % 16
     assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > 40
+
+
+def test_a_fault_that_is_due_while_the_emulator_stands_still_comes_after_it():
+    """A busy machine may stop any program: what was to be played then, faults too, is played when it goes on."""
+
+    def stand_still(what, stretch):
+        if (what, stretch.name) == ("begin", "vanished"):
+            time.sleep(0.5)
+
+    faults = Injector(parse_stretches("vanished@.1+.01,dead=4.5@.2+.2"), Truth(), tell=stand_still)
+    with FaultyEmulator([numbered(60)], faults=faults) as emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+    assert 19 <= faults.truth.fates["dead"] <= 21 and len(scans) > 55

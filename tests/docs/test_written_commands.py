@@ -59,6 +59,7 @@ PARSED = {
     r"python tests/system/fault_emulator\.py .*--loop.*": "plays until ended; test_fault_bench runs it",
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
+    r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_hot_path",
     r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
 }
@@ -81,7 +82,6 @@ LEFT_OUT = {
     r"tensorboard .*": "serves until it is ended, and is not ours",
     r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_demo takes one",
     r"mkdocs build .*": "test_site builds the site",
-    r"python tests/system/hot_path\.py": "is run with main; .ci/run and test_hot_path run it",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }
 

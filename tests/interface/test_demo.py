@@ -1,6 +1,7 @@
 import dataclasses
 import re
 from dataclasses import replace
+from itertools import pairwise, takewhile
 
 import cli_samples
 import numpy as np
@@ -263,20 +264,45 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     assert max(used[0, 3]) > 1 and used[1, 0] == {1}
 
 
-def tapped(results):
-    """Return the place of each tap, and by its number the taps its pattern is made of and the proposal after it."""
-    places, used, proposed = [], {}, {}
+@dataclasses.dataclass
+class Tap:
+    """Tap of the demo's figure as its records show it.
+
+    Attributes:
+        place: x, y in [mm] and turn in [deg].
+        breaks: how often, before its end, scans had stopped, or taxels had fallen silent or come back.
+        used: number of taps that each of its patterns is made of.
+        proposed: x, y in [mm] of the proposal after it; None without one.
+    """
+
+    place: tuple[float, ...]
+    breaks: int = 0
+    used: list[int] = dataclasses.field(default_factory=list)
+    proposed: tuple[float, ...] | None = None
+
+
+STOPPED_NS = 500_000_000
+SCENES_TURN_DEG = -20
+"""Turn of the first tap after those of the figure."""
+
+
+def taps_of(results):
+    """Return the taps of the demo's figure; of a pause between two, a busy machine may lose every scan."""
+    taps: list[Tap] = []
+    breaks, last = 0, results[0]
     for one in results:
-        if one["contact"]:
+        breaks += one["dead"] != last["dead"] or one["time_ns"] - last["time_ns"] > STOPPED_NS
+        last = one
+        if one["contact"] and one["pose"] is not None:
             place = tuple(one["pose"][axis] for axis in ("x_mm", "y_mm", "turn_deg"))
-            if place not in places[-1:]:
-                places.append(place)
+            if not taps or place != taps[-1].place:
+                taps.append(Tap(place))
+            taps[-1].breaks = breaks
             if one["state"] == "contact":
-                used[len(places) - 1] = one["taps_used"]
-        elif places and one["contact"] is False and one["next_tap"] is not None:
-            target = one["next_tap"]["target"]
-            proposed.setdefault(len(places) - 1, tuple(target[axis] for axis in ("x_mm", "y_mm", "turn_deg")))
-    return places, used, proposed
+                taps[-1].used.append(one["taps_used"])
+        elif taps and one["contact"] is False and one["next_tap"] is not None:
+            taps[-1].proposed = tuple(one["next_tap"]["target"][axis] for axis in ("x_mm", "y_mm"))
+    return [*takewhile(lambda tap: tap.place[2] > SCENES_TURN_DEG, taps)]
 
 
 def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_path):
@@ -293,19 +319,31 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     assert "taps 'glyph:1' 4 times, where it is proposed" in done.stderr
     results = [one for one in cli_samples.records(done.stdout) if one["state"] != "event"]
     assert {one["source"] for one in results} == {"emulated"}
-    # A busy machine may drop all patterns of a tap, which has no proposal then, propose too late, or forget taps after
-    # a silence. Robots that take no proposal tap at (0, 0) alone; the places of this one are 2.35 mm apart.
-    places, used, proposed = tapped(results)
-    assert places[0] == (0, 0, 0), done.stderr
-    followed = [
-        np.hypot(*np.subtract(places[tap + 1][:2], target[:2])) < 0.5 for tap, target in proposed.items() if tap < 3
-    ]
-    assert any(followed), (places[:6], used, proposed, done.stderr)
+    taps = taps_of(results)
+    # Where the machine stops program or robot for half a second, scans are lost and taps forgotten, as with a real
+    # sensor; and a tap whose patterns were all dropped has no proposal. All else is as on an idle machine.
+    compared = 0
+    for before, after in pairwise(taps):
+        if after.breaks > before.breaks:
+            continue
+        assert bool(before.used) == (before.proposed is not None), (taps, done.stderr)
+        if before.used and after.used:
+            compared += 1
+            # The robot has places half a pitch apart, not turned, and takes the nearest one.
+            off_mm = 0.01 if before.place[2] == 0 else 0.5
+            assert after.place[:2] == pytest.approx(before.proposed, abs=off_mm), (taps, done.stderr)
+            assert after.used[-1] == before.used[-1] + 1, (taps, done.stderr)
+    undisturbed = taps[-1].breaks == 0 and all(tap.used for tap in taps)
+    assert compared == 3 or (compared and not undisturbed), (taps, done.stderr)
     row = r"^ +\d +(-?[\d.]+) +(-?[\d.]+) +(-?\d+) +(\d) "
     table = [tuple(map(float, one)) for one in re.findall(row, done.stderr, re.MULTILINE)]
-    scored = [(*places[tap], used[tap]) for tap in sorted(used) if tap < 4]
-    np.testing.assert_allclose(table, scored, atol=0.051, err_msg=done.stderr)
-    assert f"{len(scored)} of 4 taps scored" in done.stderr
+    assert f"{len(table)} of 4 taps scored" in done.stderr, done.stderr
+    if undisturbed:
+        assert taps[0].place == (0, 0, 0) and len({tap.place for tap in taps}) == 4, taps
+        np.testing.assert_allclose(table, [(*tap.place, n) for n, tap in enumerate(taps, 1)], atol=0.051)
+    for *place, used in table:
+        (tap,) = [one for one in taps if one.place == pytest.approx(place, abs=0.051)]
+        assert used in tap.used
     assert len({one["pose"]["x_mm"] for one in results[-250:]}) > 100 and "map of a letter of 50 mm" in done.stderr
 
 

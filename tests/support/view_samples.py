@@ -186,10 +186,12 @@ def frame(viewer, kind=None, sensor=None):
 
 
 def wait_for(condition):
+    """Return the condition's value as soon as it is true."""
     end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
+    while not (value := condition()):
         assert time.monotonic() < end_s, "it did not come"
         time.sleep(0.005)
+    return value
 
 
 @pytest.fixture

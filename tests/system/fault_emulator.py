@@ -58,7 +58,7 @@ class FaultyEmulator(Emulator):
                 elif not (self._line.plugged and self.adapter.hears_the_bus):
                     truth.lose(sent._replace(fate="unheard"), now_ns)
                 else:
-                    pieces += faults.corrupt(self.adapter.encode(sent.frame, sent.time_s), sent)
+                    pieces += faults.corrupt(self.adapter.encode(sent.frame, sent.time_s + self._still_s), sent)
         truth.settle(self._line.unread_bytes(), now_ns - COUNTED_LATE_NS)
         self._send(pieces, now_ns)
         if faults.resets > self._resets:

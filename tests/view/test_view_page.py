@@ -182,11 +182,9 @@ class TestHeld:
         part(page, "field").focus()
         page.keyboard.press("ArrowLeft")
         page.keyboard.press("Shift+ArrowDown")
-        playwright.expect(part(page, "readout")).to_contain_text(", y 2.6")  # shown with the next frame
-        text = part(page, "readout").inner_text()
-        x, y, value, doubt = re.fullmatch(
-            r"x (\S+), y (\S+)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm", text
-        ).groups()
+        live_text = re.compile(r"x (\S+), y (2\.6)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm")
+        # Shown with the next frame, which says "not live" or "no pattern" where this machine made the program pause.
+        x, y, value, doubt = wait_for(lambda: live_text.fullmatch(part(page, "readout").inner_text())).groups()
         assert (x.replace("\u2212", "-"), y) == ("-0.2", "2.6")  # pixel 19, 25 of 40, .47 mm wide
         assert abs(float(value) - held.pattern[25, 19]) < 0.02 and float(doubt) > 0
         playwright.expect(page.locator("#live")).to_contain_text("mm")
