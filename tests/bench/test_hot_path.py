@@ -15,7 +15,7 @@ def test_a_way_that_takes_longer_than_the_one_before_is_red(tmp_path, monkeypatc
     begin = "        scans: list[Scan] = []\n"
     assert text.count(begin) == 1
     changed.write_text(text.replace(begin, f"{begin}        sum(range(40_000))\n"))
-    ratio, took_us = compare(tmp_path, ROOT, blocks=4)["at rest"]
+    ratio, took_us = compare(tmp_path, ROOT, pairs=2)["at rest"]
     assert slower(ratio) and took_us > 0
     monkeypatch.setattr(hot_path, "tree_of", lambda commit, folder: ROOT)
     monkeypatch.setattr(hot_path, "compare", lambda tree, before: {"at rest": (ratio, took_us)})

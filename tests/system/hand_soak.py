@@ -51,11 +51,13 @@ class Accounts:
         broken: what does not fit, in plain words.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, sensors: int) -> None:
+        """Begin with nothing counted; each sensor may hold one scan open, before its first record as well."""
         self.records: Counter[str] = Counter()
         self.broken: list[str] = []
         self._last: dict[str, int] = {}
         self._unwritten = 0
+        self._most_open = _TAXELS * sensors
 
     def follow(self, lines: Sequence[Line]) -> None:
         """Take records in their order; each counts what was left out before it."""
@@ -83,7 +85,7 @@ class Accounts:
         held = ("duplicates", "abandoned", "unconfirmed", "resynchronised")
         fates = _TAXELS * counters["scans"] - counters["missing_taxels"] + sum(counters[name] for name in held)
         open_readings = counters["readings"] - fates
-        if not 0 <= open_readings <= _TAXELS * len(self.records):
+        if not 0 <= open_readings <= self._most_open:
             self.broken.append(f"{open_readings} readings are of no scan and of no counter")
 
 
@@ -107,7 +109,7 @@ def soak(minutes: float, sensors: int, seed: int) -> tuple[Soak, Accounts, dict[
     window_s = min(WINDOW_S, 20 * minutes)
     count = max(3, round(60 * minutes / WINDOW_S))
     faults = f"mixed@1+{CALM_S + window_s * count:g}"
-    accounts = Accounts()
+    accounts = Accounts(sensors)
     with (
         tempfile.TemporaryDirectory() as name,
         edge_sr(Path(name), play, emulate=partial(_disturbed, Path(name), faults, seed)) as program,

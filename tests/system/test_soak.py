@@ -81,7 +81,7 @@ def counted(scan, **counters):
     ],
 )
 def test_an_account_that_does_not_fit_is_seen(lines, what):
-    accounts = hand_soak.Accounts()
+    accounts = hand_soak.Accounts(sensors=1)
     accounts.follow(lines)
     assert (what is None and accounts.broken == []) or what in accounts.broken[0]
 
@@ -99,3 +99,10 @@ def test_a_leak_and_a_drift_are_seen_by_what_they_are():
     assert leaking.memory_half == pytest.approx(0.0, abs=1e-6)
     drifting = evaluated([replace(window, quiet_us=1000.0 * 1.1**n) for n, window in enumerate(STILL)])
     assert drifting.latency_ratio == pytest.approx(1.1**8)
+
+
+def test_open_scans_of_sensors_without_a_record_yet_are_no_fault():
+    """On a slow machine the first record comes while all sensors are read already."""
+    accounts = hand_soak.Accounts(sensors=2)
+    accounts.follow([counted(0, readings=16 + 20, frames=16 + 20)])
+    assert accounts.broken == []
