@@ -24,7 +24,8 @@ _EMPTY_LOOKS: Final = 3
 """Looks in turn that must find no unread byte: while a client empties its buffer, the kernel still holds more."""
 _STOOD_STILL_S: Final = 0.2
 """Lateness in [s] at which the emulator itself was stopped: it goes on where it was, since no controller sends in one
-burst what it has missed. One that waits for its client may be late all the time."""
+burst what it has missed. It ends the scans under way first: none stops amid a scan either. One that waits for its
+client may be late all the time."""
 
 
 class Emulator:
@@ -100,7 +101,7 @@ class Emulator:
         self._timeline = bus_timeline(
             bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, first_frame=first_frame, played=played
         )
-        self._latency_s = latency_s
+        self._latency_s, self._frame_s = latency_s, frame_s
         self._on_scan = on_scan
         self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
         self._waits = waits
@@ -139,13 +140,17 @@ class Emulator:
             while not self.adapter.channel_open:
                 if not self._obey_until(time.monotonic() + _STOP_POLL_S):
                     return
-            start_s = time.monotonic()
-            for handed_on_s, frames in groupby(self._timeline, key=self._handed_on_s):
+            start_s, newest_s = time.monotonic(), -math.inf
+            for handed_on_s, group in groupby(self._timeline, key=self._handed_on_s):
                 due_s = start_s + self._still_s + handed_on_s
                 if not self._obey_until(due_s):
                     return
                 late_s = time.monotonic() - due_s
-                self._still_s += late_s if late_s > _STOOD_STILL_S and not self._waits else 0.0
+                frames = list(group)  # now, since a scan is asked for while the one before is sent
+                between_scans = frames[0][0] - newest_s > 1.5 * self._frame_s
+                if late_s > _STOOD_STILL_S and between_scans and not self._waits:
+                    self._still_s += late_s
+                newest_s = frames[-1][0]
                 self._hand_on(frames)
             self._drain()
         finally:

@@ -224,6 +224,29 @@ def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):
     assert apart_ns.min() > 40_000_000 and apart_ns.max() > 1_000_000_000, "its stamps have the stop as well"
 
 
+def test_a_stop_amid_a_scan_tears_none():
+    """Only the machine can stop an emulator there; a controller sends its scans whole."""
+    with (
+        Emulator([make_recording(40), make_recording(40, seed=1)], seed=3) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        encode = emulator.adapter.encode
+        numbers = iter(range(40 * 32))
+
+        def encode_slowly(frame, time_s):
+            if next(numbers) in (20, 325, 648):
+                time.sleep(0.5)
+            return encode(frame, time_s)
+
+        emulator.adapter.encode = encode_slowly
+        scans = read_until_lost(link)
+    assert (stacked(scans, "4") == make_counts(40)).all() and (stacked(scans, "6") == make_counts(40, seed=1)).all()
+    assert emulator.lost_frames == 0 and all(scan.fresh.all() for scan in scans)
+    for sensor in "46":
+        apart_ns = np.diff([scan.device_ns for scan in scans if scan.sensor == sensor])
+        assert (apart_ns > 300_000_000).sum() == 3 and apart_ns.min() > 7_000_000
+
+
 def test_the_command_ends_with_who_started_it(tmp_path):
     path = write_recording(tmp_path / "a.csv", make_counts(8))
     with start(path, "--rate-hz", 100, "--loop", "--until-stdin-closes") as process:
