@@ -78,14 +78,16 @@ def run(
     share_one_heap()
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
-    with stop_on_signals() as stop, user_commands() as commands:
+    with stop_on_signals() as stop, user_commands() as commands, contextlib.closing(source):
         loops = options.source == [DEMO_LOOP]
         demo = loops or options.source == ["demo"]
         posed = mapping is None and (source.states_poses or bool(options.poses))  # a map fuses taps itself
         name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
-        if options.budget_us is None:
-            model = None if stop.is_set() else load_model(name, stop=stop)
-        else:
+        model = None
+        if options.budget_us is None and not stop.is_set():
+            source.begin()  # its links open while the model loads, but not while models are timed
+            model = load_model(name, stop=stop)
+        elif options.budget_us is not None:
             model = choose_model(
                 name,
                 options.budget_us,

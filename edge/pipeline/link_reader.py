@@ -79,7 +79,7 @@ class LinkReader:
         self._alone = links[0] if len(links) == 1 else None
         for link in links if self._alone is None else ():
             self._place(link)
-        self.reading, self._thread = _started("scan-reader", self._read)
+        self.reading, self._thread = started("scan-reader", self._read)
         threads = [self._thread, *(thread for _, thread in self._apart.values())]
         self.thread_ids = tuple(thread.native_id for thread in threads if thread.native_id is not None)
 
@@ -140,7 +140,7 @@ class LinkReader:
                 self._poll.modify(wait.descriptor, select.POLLIN if wait.listens else 0)
             shared.due_s = time.monotonic() + wait.longest_s
         elif not link.ended:
-            reading, thread = _started("link-reader", lambda: self._follow(link))
+            reading, thread = started("link-reader", lambda: self._follow(link))
             self._apart[reading] = link, thread
             reading.add_done_callback(lambda _: self._wake())
 
@@ -181,7 +181,7 @@ class LinkReader:
             self._waking.send(b"!")
 
 
-def _started(name: str, read: Callable[[], None]) -> tuple[Future[None], threading.Thread]:
+def started(name: str, read: Callable[[], None]) -> tuple[Future[None], threading.Thread]:
     """Return the end of a function that a new thread runs, and the thread.
 
     It is a daemon, unlike one of an executor, for which a program that forgets to close its source would wait for ever.

@@ -4,12 +4,13 @@ import atexit
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from contextlib import ExitStack
 from queue import Empty, SimpleQueue
 from typing import Final, Self
 
 from edge.errors import UsageError
-from edge.pipeline.link_reader import LinkReader
+from edge.pipeline.link_reader import LinkReader, started
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, Pace, SourceKind, one_origin
@@ -25,10 +26,10 @@ CAPACITY_SCANS: Final = 1024
 class Source:
     """Source that opens links, reads them and closes them; scans not taken in time are discarded, oldest first.
 
-    Reading begins when it is opened: scans that come while a model loads wait here. Scans of one link stay in their
-    order; a link that is slow or away holds up no other, and one that is lost for good ends the source. A patient link
-    is read by the thread that takes, a scan at a time, so that nothing is discarded or overtaken. A source is opened
-    once.
+    Reading begins when its links are open: scans that come while a model loads wait here. Scans of one link stay in
+    their order; a link that is slow or away holds up no other, and one that is lost for good ends the source. A patient
+    link is read by the thread that takes, a scan at a time, so that nothing is discarded or overtaken. A source is
+    opened once.
 
     Attributes:
         name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all their names.
@@ -72,6 +73,7 @@ class Source:
         self._links = links
         self._last_ns = 0
         self._opened = self._closed = False
+        self._opening: Future[None] | None = None
         self._waiting: list[Scan | Notice | TimedPose] = []
         self._lock = threading.Lock()
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
@@ -93,6 +95,14 @@ class Source:
     def __exit__(self, *exc_info: object) -> None:
         self.close()
 
+    def begin(self) -> None:
+        """Begin to open the links and to read, in a thread, for a caller that prepares something else meanwhile.
+
+        `open` waits for it and raises its error. `close` also ends what was begun and never opened.
+        """
+        if self._opening is None:
+            self._opening, _ = started("source-opening", self._open_links)
+
     def open(self) -> Self:
         """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
 
@@ -101,24 +111,21 @@ class Source:
             SensorFileError: the sensor file is of an emulated sensor, and this is a device.
             BridgeError: a link cannot be opened.
         """
-        if self._opened:
-            raise UsageError(f"source {self.name} was opened before: make another, with open_source")
-        with ExitStack() as opening:
-            for link in self._links:
-                opening.enter_context(link)
-            refuse_emulated(self.sensor_file, _one_kind(self._links), self._force)  # some know their kind only now
-            if not self.patient:
-                self._reader = LinkReader(self._links, self._put, self._end)
-                self.thread_ids = self._reader.thread_ids
-                opening.callback(self._reader.close)
-            self._open = opening.pop_all()
+        if self._opened or self._closed:
+            state = "opened" if self._opened else "closed"
+            raise UsageError(f"source {self.name} was {state} before: make another, with open_source")
+        if self._opening is None:
+            self._open_links()
+        else:
+            self._opening.result()
         self._opened = True
-        atexit.register(self.close)
         return self
 
     def close(self) -> None:
         """End its streams, all reading and all threads, and close the links; closing twice does nothing."""
         self._closed = True
+        if self._opening is not None:
+            wait([self._opening])
         atexit.unregister(self.close)
         self._open.close()
 
@@ -215,6 +222,18 @@ class Source:
         finally:
             with self._lock:
                 self._sleepers.remove(wake)
+
+    def _open_links(self) -> None:
+        with ExitStack() as opening:
+            for link in self._links:
+                opening.enter_context(link)
+            refuse_emulated(self.sensor_file, _one_kind(self._links), self._force)  # some know their kind only now
+            if not self.patient:
+                self._reader = LinkReader(self._links, self._put, self._end)
+                self.thread_ids = self._reader.thread_ids
+                opening.callback(self._reader.close)
+            self._open = opening.pop_all()
+        atexit.register(self.close)
 
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")

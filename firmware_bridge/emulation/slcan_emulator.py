@@ -137,9 +137,11 @@ class Emulator:
 
     def _serve(self) -> None:
         try:
-            while not self.adapter.channel_open:
-                if not self._obey_until(time.monotonic() + _STOP_POLL_S):
+            while not self.adapter.channel_open:  # then at once, without waiting until the time is over
+                if self._stop.is_set():
                     return
+                if received := self._line.listen(_STOP_POLL_S):
+                    self._obey(received)
             start_s, newest_s = time.monotonic(), -math.inf
             for handed_on_s, group in groupby(self._timeline, key=self._handed_on_s):
                 due_s = start_s + self._still_s + handed_on_s

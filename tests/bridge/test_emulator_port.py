@@ -15,6 +15,7 @@ import pytest
 import serial
 from bridge_samples import make_counts, make_recording, read_until_lost, stacked, write_recording
 
+from firmware_bridge.emulation import slcan_emulator
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.slcan_main import main
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
@@ -46,6 +47,13 @@ def test_silence_before_bitrate_and_open():
         port.write(b"O\r")
         assert port.read(23).startswith(b"\rt0048")
     assert emulator.adapter.refused == 1
+
+
+def test_frames_begin_when_the_channel_opens(monkeypatch):
+    """They do not begin at the next look of the emulator whether it is to stop."""
+    monkeypatch.setattr(slcan_emulator, "_STOP_POLL_S", 30.0)
+    with Emulator([make_recording(5)]) as emulator, SlcanSerialLink(emulator.port) as link:
+        assert len(read_until_lost(link, timeout_s=20)) == 5
 
 
 def test_close_stops_the_stream():

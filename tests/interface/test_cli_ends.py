@@ -10,11 +10,15 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
 
 import pytest
 from cli_samples import TIMEOUT_S, base_options, files, records, run, start, wait_for
 from edge_samples import ROOT
 
+from edge.cli import main as cli
+from edge.cli import run_command
+from edge.errors import ModelError
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
 
@@ -71,6 +75,28 @@ class TestEnds:
         *summary, last = errors.splitlines()
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
+
+    def test_a_model_that_cannot_be_used_leaves_the_channel_closed(self, emulator, monkeypatch, capsys):
+        """The link opens while the model loads."""
+        opened = threading.Event()
+
+        def load(name, stop):
+            assert opened.wait(TIMEOUT_S)
+            raise ModelError(f"{name} cannot be used")
+
+        obey = emulator.adapter.feed
+
+        def feed(data):
+            answer = obey(data)
+            if emulator.adapter.channel_open:
+                opened.set()
+            return answer
+
+        monkeypatch.setattr(run_command, "load_model", load)
+        monkeypatch.setattr(emulator.adapter, "feed", feed)
+        assert cli.main(["--model", "broken", "--source", f"slcan:{emulator.port}"]) == 4
+        assert capsys.readouterr().err == "edge-sr: broken cannot be used\n"
+        wait_for(lambda: not emulator.adapter.channel_open)
 
     def test_the_cable_back_under_another_name_goes_on_and_records_tell_of_it(self, files, tmp_path):
         """A link named by its adapter, as udev does, that leads to a new port each time."""
