@@ -6,8 +6,7 @@ Both trees run in turn, block by block, each in a process of its own that reads 
 a contact in which every scan gets a pattern. Blocks are measured by the time that the processor spent on the process,
 so that waiting for other work of the machine does not count. Both processes share one core, since a neighbour on the
 other one would slow the one that runs there, and the least block of a process counts, since a neighbour only adds to
-it. A process also has a speed of its own, by where its memory lies, so pairs of them are begun several times, the
-other one first each time.
+it. A process also has a speed of its own, by where its memory lies, so several pairs of them are measured.
 
 The exit code is 1 if the way takes over a tenth longer than at COMMIT, by default the commit before; a commit that
 cannot be run, since the interface has changed or the clone is shallow, is reported and ends with 0.
@@ -90,37 +89,19 @@ def compare(tree: Path, before: Path, pairs: int = PAIRS) -> dict[str, tuple[Rat
         ChildError: one of them cannot be run.
     """
     cores = sorted(os.sched_getaffinity(0))
-    least_us = [
-        least_of_pair((before, tree), first=pair % 2, core=cores[pair // 2 % len(cores)]) for pair in range(pairs)
-    ]
+    least_us: dict[str, list[list[float]]] = {part: [] for part in PARTS}
+    for pair in range(pairs):
+        with ExitStack() as closing:
+            children = [Child(folder, cores[pair % len(cores)]) for folder in (before, tree)]
+            for child in children:
+                closing.callback(child.close)
+            for part in PARTS:
+                took_us = [[child.block_us(part) for child in children] for _ in range(WARM_BLOCKS + BLOCKS)]
+                least_us[part].append([min(blocks) for blocks in zip(*took_us[WARM_BLOCKS:], strict=True)])
     found: dict[str, tuple[Ratio, float]] = {}
     for part in PARTS:
-        under, over = zip(*(pair[part] for pair in least_us), strict=True)
+        under, over = zip(*least_us[part], strict=True)
         found[part] = ratio_of(over, under, paired=True), sorted(over)[pairs // 2]
-    return found
-
-
-def least_of_pair(trees: tuple[Path, Path], *, first: int, core: int) -> dict[str, tuple[float, float]]:
-    """Return the least processor time of a scan of both trees in [us], by part, with one process for each on a core.
-
-    Args:
-        trees: the folders.
-        first: 0 or 1, the tree whose blocks come first.
-        core: core that both share.
-
-    Raises:
-        ChildError: one of them cannot be run.
-    """
-    with ExitStack() as closing:
-        children = [Child(tree, core) for tree in trees]
-        for child in children:
-            closing.callback(child.close)
-        turns = children if first == 0 else children[::-1]
-        found: dict[str, tuple[float, float]] = {}
-        for part in PARTS:
-            took_us = [[child.block_us(part) for child in turns] for _ in range(WARM_BLOCKS + BLOCKS)][WARM_BLOCKS:]
-            least = [min(blocks) for blocks in zip(*took_us, strict=True)]
-            found[part] = (least[first], least[1 - first])
     return found
 
 
