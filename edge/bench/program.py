@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,8 +46,8 @@ PROGRAM_SOURCES: Final = (
     "firmware_bridge/scans/scan_assembler.py",
 )
 """Sources of a report on the whole program: they import most of what a run executes."""
-Emulate = Callable[..., AbstractContextManager[str]]
-"""Function from the arguments of an emulator to its port, within a with statement."""
+Emulate = Callable[..., AbstractContextManager[list[str]]]
+"""Function from the arguments of emulators and the number of buses to their ports, within a with statement."""
 _SCANS: Final = 500
 _ROOT: Final = Path(__file__).parents[2]
 _MAPS: Final = b',"pattern":'
@@ -121,7 +121,7 @@ class Line:
 class Program:
     """Process that reads emulated sensors, and its records where it writes any."""
 
-    def __init__(self, process: subprocess.Popen[bytes], spawned_ns: int, stamps: Mapping[str, Path]) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], spawned_ns: int, stamps: Path) -> None:
         self.spawned_ns = spawned_ns
         self._process = process
         self._stamps = stamps
@@ -193,11 +193,31 @@ class Program:
     def stamps_ns(self) -> dict[str, list[int]]:
         """Return the time of the last byte of each scan, by sensor, once the emulator has ended, in [ns]."""
         times: dict[str, list[int]] = defaultdict(list)
-        for prefix, stamps in self._stamps.items():
-            for line in stamps.read_text().splitlines():
-                controller, time_ns = line.split()
-                times[prefix + controller].append(int(time_ns))
+        for line in self._stamps.read_text().splitlines():
+            sensor, time_ns = line.split()
+            times[sensor].append(int(time_ns))
         return times
+
+
+@contextmanager
+def emulating(*arguments: str, buses: int = 1, program: Sequence[str] = EMULATOR) -> Iterator[list[str]]:
+    """Run emulators with these arguments in a process of their own, and yield the port of each bus.
+
+    Raises:
+        BenchError: the emulators did not start.
+    """
+    command = [sys.executable, *program, "--until-stdin-closes", "--buses", str(buses), *arguments]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
+    ) as emulator:
+        try:
+            ports = [emulator.stdout.readline().decode().strip() if emulator.stdout else "" for _ in range(buses)]
+            if not all(ports):
+                raise BenchError("the emulator did not start")
+            yield ports
+        finally:
+            if emulator.stdin:
+                emulator.stdin.close()
 
 
 @contextmanager
@@ -217,7 +237,7 @@ def edge_sr(
     *options: str,
     sink: str = "jsonl:-",
     cores: Collection[int] = (),
-    emulate: Emulate | None = None,
+    emulate: Emulate = emulating,
 ) -> Iterator[Program]:
     """Run `edge-sr` with stored baselines; its files lie in `folder`.
 
@@ -227,7 +247,7 @@ def edge_sr(
         options: further ones of edge-sr.
         sink: of the records.
         cores: the only ones that it may use; any without.
-        emulate: runs the emulator of a bus instead of `emulating`.
+        emulate: runs the emulators.
     """
     with _emulators(folder, play, emulate) as (ports, stamps):
         command = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json"), "--sink", sink]
@@ -238,49 +258,21 @@ def edge_sr(
 
 
 @contextmanager
-def _emulators(folder: Path, play: Play, emulate: Emulate | None = None) -> Iterator[tuple[list[str], dict[str, Path]]]:
-    """Run an emulator for each bus; yields the ports, and by bus the files with the times of its scans."""
+def _emulators(folder: Path, play: Play, emulate: Emulate) -> Iterator[tuple[list[str], Path]]:
+    """Run the emulators of all buses; yields the ports, and the file with the times of all scans."""
     names = [name for bus in range(play.buses) for name in play.names(bus)]
     rest = _rest_counts().astype(np.float32)
     save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in names])
-    ports: list[str] = []
-    stamps: dict[str, Path] = {}
-    with ExitStack() as closing:
-        for bus in range(play.buses):
-            stamps[play.prefix(bus)] = file = folder / f"stamps{bus}.txt"
-            numbers = range(bus, play.sensors, play.buses)
-            played = [
-                _recording(folder, play, number, name) for number, name in zip(numbers, CONTROLLERS, strict=False)
-            ]
-            options = ["--loop", "--rate-hz", str(play.rate_hz), "--frame-us", str(play.frame_us)]
-            options += ["--stamps", str(file), "--seed", str(bus), *(["--waits"] if play.waits else [])]
-            ports.append(closing.enter_context((emulate or emulating)(*options, *map(str, played))))
+    stamps = folder / "stamps.txt"
+    played = [_recording(folder, play, number, CONTROLLERS[number // play.buses]) for number in range(play.sensors)]
+    options = ["--loop", "--rate-hz", str(play.rate_hz), "--frame-us", str(play.frame_us), "--stamps", str(stamps)]
+    options += ["--waits"] if play.waits else []
+    with emulate(*options, *map(str, played), buses=play.buses) as ports:
         yield ports, stamps
 
 
 @contextmanager
-def emulating(*arguments: str, program: Sequence[str] = EMULATOR) -> Iterator[str]:
-    """Run an emulator with these arguments in a process of its own, and yield its port.
-
-    Raises:
-        BenchError: the emulator did not start.
-    """
-    command = [sys.executable, *program, "--until-stdin-closes", *arguments]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment(), start_new_session=True
-    ) as emulator:
-        try:
-            port = emulator.stdout.readline().decode().strip() if emulator.stdout else ""
-            if not port:
-                raise BenchError("the emulator did not start")
-            yield port
-        finally:
-            if emulator.stdin:
-                emulator.stdin.close()
-
-
-@contextmanager
-def _process(arguments: Sequence[str], stamps: Mapping[str, Path], cores: Collection[int] = ()) -> Iterator[Program]:
+def _process(arguments: Sequence[str], stamps: Path, cores: Collection[int] = ()) -> Iterator[Program]:
     with uncollected(), _held_to(cores) as held:  # or a pause of our own collector would count as the program's
         spawned_ns = time.monotonic_ns()
         with subprocess.Popen(

@@ -8,6 +8,7 @@ import select
 import struct
 import termios
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -93,13 +94,13 @@ class PseudoPort:
             os.close(self._far_fd)
             os.close(self._client_fd)
 
-    def listen(self, timeout_s: float) -> bytes:
-        """Return the bytes that the client has written; waits at most `timeout_s` for them."""
-        if not self.plugged:
-            time.sleep(timeout_s)
-            return b""
-        readable, _, _ = select.select([self._far_fd], [], [], timeout_s)
-        return self._through_line(os.read(self._far_fd, 4096)) if readable else b""
+    def fileno(self) -> int:
+        """Return the descriptor of this end."""
+        return self._far_fd
+
+    def received(self) -> bytes:
+        """Return the bytes that the client has written, of which there are some."""
+        return self._through_line(os.read(self._far_fd, 4096))
 
     def write(self, data: bytes) -> int:
         """Send the bytes that find room and return their number; an adapter cannot keep the rest."""
@@ -131,3 +132,9 @@ class PseudoPort:
         if self._ignores_line_speed or speed_baud == LINE_SPEED_BAUD:
             return data
         return self._garble.randbytes(math.ceil(len(data) * min(1.0, (speed_baud or 0) / LINE_SPEED_BAUD)))
+
+
+def listen(ports: Iterable[PseudoPort], timeout_s: float) -> dict[PseudoPort, bytes]:
+    """Return the bytes that clients have written, by port; waits at most `timeout_s` [s] for the first."""
+    readable, _, _ = select.select([port for port in ports if port.plugged], [], [], timeout_s)
+    return {port: port.received() for port in readable}

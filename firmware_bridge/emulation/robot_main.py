@@ -118,6 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _emulator(
     recordings: Sequence[Recording], usual: Mapping[str, Any], options: Namespace, closing: ExitStack
 ) -> Emulator:
+    if options.buses > 1:
+        raise ValueError(f"--buses is {options.buses}: a robot has one pad here")
     robot = Robot(recordings[0], _options(recordings[0].path))
     with suppress(OSError):
         os.set_blocking(sys.stdout.fileno(), False)

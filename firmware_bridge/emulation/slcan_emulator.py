@@ -7,18 +7,18 @@ that the client does not fetch in time are lost. `slcan_main` is its command lin
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.emulator_thread import EmulatorThread
 from firmware_bridge.emulation.pty_port import PseudoPort
 from firmware_bridge.emulation.xela_controller import CR, FRAME_S, Played, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
 
-_STOP_POLL_S: Final = 0.05
 _DRAIN_POLL_S: Final = 0.01
 _EMPTY_LOOKS: Final = 3
 """Looks in turn that must find no unread byte: while a client empties its buffer, the kernel still holds more."""
@@ -35,6 +35,7 @@ class Emulator:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
         hear: takes what is written to the emulator's stdin.
+        line: this end of the pseudo-terminal.
         sent_frames: number of frames that went out whole.
         lost_frames: number of frames without room, because the client did not read.
     """
@@ -108,59 +109,57 @@ class Emulator:
         self._still_s = 0.0
         self._writing = False
         self._answers = b""
-        self._line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
-        self._stop = threading.Event()
+        self.line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
         self._through = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="emulator", daemon=True)
+        self._alone = EmulatorThread([self])
 
     def __enter__(self) -> Self:
-        self._line.plug()
-        self.port = self._line.path
-        self._thread.start()
+        self._alone.__enter__()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
         self.hang_up()
 
+    def plug(self) -> None:
+        """Put the cable in, as the thread that plays the emulator does."""
+        self.line.plug()
+        self.port = self.line.path
+
     def hang_up(self) -> None:
         """Pull the cable out."""
-        self._stop.set()
-        self._thread.join()
+        self._alone.__exit__()
 
     def tell(self, line: bytes) -> None:
         """Send an unsolicited line, such as `adapter.state_line(...)`."""
-        self._line.write(line)
+        self.line.write(line)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until it has hung up; return False on time-out."""
         return self._through.wait(timeout_s)
 
-    def _serve(self) -> None:
+    def course(self) -> Generator[float, None, None]:
+        """Play; yield the monotonic time, in [s], at which to go on, or earlier when the client has written."""
         try:
-            while not self.adapter.channel_open:  # then at once, without waiting until the time is over
-                if self._stop.is_set():
-                    return
-                if received := self._line.listen(_STOP_POLL_S):
-                    self._obey(received)
+            while not self.adapter.channel_open:
+                yield math.inf
             start_s, newest_s = time.monotonic(), -math.inf
             for handed_on_s, group in groupby(self._timeline, key=self._handed_on_s):
                 due_s = start_s + self._still_s + handed_on_s
-                if not self._obey_until(due_s):
-                    return
+                yield from self._wait_until(due_s)
                 late_s = time.monotonic() - due_s
                 frames = list(group)  # now, since a scan is asked for while the one before is sent
                 between_scans = frames[0][0] - newest_s > 1.5 * self._frame_s
                 if late_s > _STOOD_STILL_S and between_scans and not self._waits:
                     self._still_s += late_s
                 newest_s = frames[-1][0]
-                self._hand_on(frames)
-            self._drain()
+                yield from self._hand_on(frames)
+            yield from self._drain()
         finally:
             self._unplug()
             self._through.set()
 
     def _unplug(self) -> None:
-        self._line.unplug()
+        self.line.unplug()
 
     def _handed_on_s(self, timed: tuple[float, CanFrame]) -> float:
         latency_s = self._latency_at(timed[0])
@@ -171,7 +170,7 @@ class Emulator:
     def _latency_at(self, time_s: float) -> float:
         return self._latency_s
 
-    def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
+    def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> Iterator[float]:
         if not self.adapter.hears_the_bus:
             return
         lines: list[bytes] = []
@@ -182,7 +181,7 @@ class Emulator:
                 ended.append(self._last_frames[frame.can_id])
         now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
         data = b"".join(lines)
-        room = self._write_patiently(data) if self._waits else self._line.write(data)
+        room = (yield from self._write_patiently(data)) if self._waits else self.line.write(data)
         for line in lines:
             room -= len(line)
             self.sent_frames += room >= 0
@@ -190,42 +189,38 @@ class Emulator:
         for controller in ended:
             self._on_scan(controller, now_ns)
 
-    def _obey_until(self, deadline_s: float) -> bool:
-        """Serve commands until a time on the monotonic clock; return False after a request to stop."""
-        while not self._stop.is_set():
-            left_s = deadline_s - time.monotonic()
-            received = self._line.listen(min(max(left_s, 0.0), _STOP_POLL_S))
-            if received:
-                self._obey(received)
-            elif left_s <= 0:
-                return True
-        return False
+    def _wait_until(self, time_s: float) -> Iterator[float]:
+        """Wait for a time on the monotonic clock; the client is heard once at least."""
+        yield time_s
+        while time.monotonic() < time_s:
+            yield time_s
 
-    def _write_patiently(self, data: bytes) -> int:
+    def _write_patiently(self, data: bytes) -> Generator[float, None, int]:
         """Send frames as the client makes room for them, with answers between them; return the number of bytes."""
         sent, self._writing = 0, True
         while sent < len(data):
             amid_frame = data[:sent][-1:] not in (b"", CR)
             if self._answers and not amid_frame:
-                self._answers = self._answers[self._line.write(self._answers) :]
+                self._answers = self._answers[self.line.write(self._answers) :]
             if amid_frame or not self._answers:
-                sent += self._line.write(data[sent:])
-            going_on = sent == len(data) or self._obey_until(time.monotonic() + _DRAIN_POLL_S)
-            if not going_on or not self.adapter.channel_open:
+                sent += self.line.write(data[sent:])
+            if sent < len(data):
+                yield from self._wait_until(time.monotonic() + _DRAIN_POLL_S)
+            if not self.adapter.channel_open:
                 break
         self._writing = False
         return sent
 
-    def _obey(self, received: bytes) -> None:
+    def obey(self, received: bytes) -> None:
+        """Process what the client has written, and answer."""
         self._answers += self.adapter.feed(received)
         if not self._writing:
-            written = self._line.write(self._answers)
+            written = self.line.write(self._answers)
             self._answers = self._answers[written:] if self._waits else b""
 
-    def _drain(self, deadline_s: float = math.inf) -> None:
+    def _drain(self, deadline_s: float = math.inf) -> Iterator[float]:
         """Let the client fetch the bytes under way, which hanging up would discard."""
         looks = 0
         while self.adapter.channel_open and looks < _EMPTY_LOOKS and time.monotonic() < deadline_s:
-            looks = 0 if self._line.unread_bytes() else looks + 1
-            if not self._obey_until(time.monotonic() + _DRAIN_POLL_S):
-                return
+            looks = 0 if self.line.unread_bytes() else looks + 1
+            yield from self._wait_until(time.monotonic() + _DRAIN_POLL_S)

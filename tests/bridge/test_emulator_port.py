@@ -8,6 +8,8 @@ import subprocess
 import sys
 import termios
 import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ import pytest
 import serial
 from bridge_samples import make_counts, make_recording, read_until_lost, stacked, write_recording
 
-from firmware_bridge.emulation import slcan_emulator
+from firmware_bridge.emulation import emulator_thread, robot_main
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.slcan_main import main
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
@@ -51,7 +53,7 @@ def test_silence_before_bitrate_and_open():
 
 def test_frames_begin_when_the_channel_opens(monkeypatch):
     """They do not begin at the next look of the emulator whether it is to stop."""
-    monkeypatch.setattr(slcan_emulator, "_STOP_POLL_S", 30.0)
+    monkeypatch.setattr(emulator_thread, "_STOP_POLL_S", 30.0)
     with Emulator([make_recording(5)]) as emulator, SlcanSerialLink(emulator.port) as link:
         assert len(read_until_lost(link, timeout_s=20)) == 5
 
@@ -214,6 +216,37 @@ def test_the_command_plays_and_ends(tmp_path):
         assert {scan.sensor for scan in scans} == {"3", "5"} and len(scans) == 16
         assert link.counters()["replies"] == 0
         assert process.wait(10) == 0
+
+
+def test_one_command_plays_several_buses_each_to_its_own_end(tmp_path):
+    paths = [write_recording(tmp_path / f"{n}.csv", make_counts(scans, seed=n)) for n, scans in enumerate((8, 20, 8))]
+    options = ("--buses", 2, "--rate-hz", 100, "--link", tmp_path / "skin", "--stamps", tmp_path / "stamps")
+    with start(*paths, *options) as process, contextlib.ExitStack() as opening, ThreadPoolExecutor() as pool:
+        ports = [process.stdout.readline().strip() for _ in range(2)]
+        links = [opening.enter_context(SlcanSerialLink(port)) for port in ports]
+        first, second = pool.map(read_until_lost, links)
+        assert process.wait(10) == 0
+    assert ports == [f"{tmp_path}/skin0", f"{tmp_path}/skin1"]
+    assert [len(scans) for scans in (first, second)] == [16, 20]
+    assert (stacked(first, "4") == make_counts(8)).all() and (stacked(first, "6") == make_counts(8, seed=2)).all()
+    assert (stacked(second, "4") == make_counts(20, seed=1)).all()
+    stamps = Counter(line.split()[0] for line in (tmp_path / "stamps").read_text().splitlines())
+    assert stamps == {"bus0/4": 8, "bus0/6": 8, "bus1/4": 20}
+
+
+@pytest.mark.parametrize("buses", [0, 3])
+def test_more_buses_than_recordings_are_refused(tmp_path, capsys, buses):
+    path = write_recording(tmp_path / "a.csv", make_counts(8))
+    with pytest.raises(SystemExit, match="2"):
+        main([str(path), str(path), "--buses", str(buses)])
+    assert f"--buses is {buses}, expected 1 to the number of recordings, 2" in capsys.readouterr().err
+
+
+def test_the_robot_of_the_demo_has_one_bus(tmp_path, capsys):
+    path = write_recording(tmp_path / "a.csv", make_counts(8))
+    with pytest.raises(SystemExit, match="2"):
+        robot_main.main([str(path), str(path), "--rate-hz", "100", "--buses", "2"])
+    assert "--buses is 2: a robot has one pad here" in capsys.readouterr().err
 
 
 def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):

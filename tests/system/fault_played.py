@@ -52,5 +52,5 @@ def playing_emulator(folder: Path, faults: str, seed: int) -> Iterator[str]:
     options = ["--loop", "--rate-hz", "100", "--link", str(link), "--truth", str(truth), "--seed", str(seed)]
     options += ["--faults", faults] if faults else []
     emulator = str(Path(__file__).with_name("fault_emulator.py"))
-    with emulating(*options, *files, program=[emulator]) as port:
+    with emulating(*options, *files, program=[emulator]) as (port,):
         yield port

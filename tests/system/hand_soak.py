@@ -90,13 +90,11 @@ class Accounts:
 
 
 @contextmanager
-def _disturbed(folder: Path, faults: str, seed: int, *arguments: str) -> Iterator[str]:
-    """Run an emulator with faults, at a name that stays the same when its cable is pulled."""
-    link = folder / f"adapter{len(list(folder.glob('adapter*')))}"
-    link.with_suffix(".made").touch()
-    options = ["--faults", faults, "--link", str(link)]
-    with emulating(*options, *arguments, program=[_INJECTOR]) as port:
-        yield port
+def _disturbed(folder: Path, faults: str, seed: int, *arguments: str, buses: int) -> Iterator[list[str]]:
+    """Run emulators with faults, at names that stay the same when their cables are pulled."""
+    options = ["--faults", faults, "--seed", str(seed), "--link", str(folder / "adapter")]
+    with emulating(*options, *arguments, buses=buses, program=[_INJECTOR]) as ports:
+        yield ports
 
 
 def soak(minutes: float, sensors: int, seed: int) -> tuple[Soak, Accounts, dict[str, int]]:

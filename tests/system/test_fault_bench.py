@@ -180,6 +180,9 @@ def test_the_emulator_refuses_faults_that_cannot_be(tmp_path, capsys):
         emulate(["--faults", "loss@1+1", str(recording)])
     assert "expected one of: lost" in capsys.readouterr().err
     with pytest.raises(SystemExit):
+        emulate(["--truth", str(tmp_path), "--buses", "2", str(recording), str(recording)])
+    assert "--truth is of one bus, and --buses is 2" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
         emulate(["--truth", "/proc/x", str(recording)])
     assert "/proc/x: cannot be written: No such file" in capsys.readouterr().err
 
