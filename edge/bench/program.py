@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,15 +133,22 @@ class Program:
         Raises:
             BenchError: the program ended.
         """
+        return parsed(self.heads(seconds, most))
+
+    def heads(self, seconds: float, most: int | None = None) -> list[tuple[int, bytes]]:
+        """Return the same with their times in [ns] and not parsed, which would take the program's processor away.
+
+        Raises:
+            BenchError: the program ended.
+        """
         got: list[tuple[int, bytes]] = []
         for time_ns, line in self._read(seconds):
-            # Parsing waits until the end: it would take the program's processor time away. An event has no maps.
-            head, maps, _ = line.partition(_MAPS)
+            head, maps, _ = line.partition(_MAPS)  # an event has no maps
             if maps:
                 got.append((time_ns, head + b"}"))
                 if len(got) == most:
                     break
-        return [Line(time_ns, json.loads(head)) for time_ns, head in got]
+        return got
 
     def skip(self, seconds: float) -> None:
         """Read the records of so long and forget them: a pause to parse them would fill the pipe.
@@ -197,6 +204,11 @@ class Program:
             sensor, time_ns = line.split()
             times[sensor].append(int(time_ns))
         return times
+
+
+def parsed(heads: Iterable[tuple[int, bytes]]) -> list[Line]:
+    """Return records of `Program.heads`."""
+    return [Line(time_ns, json.loads(head)) for time_ns, head in heads]
 
 
 @contextmanager

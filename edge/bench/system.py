@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from edge.bench.processes import STARTS, busy_core, usable_cores
-from edge.bench.program import Line, Play, Program, edge_sr, plain_loop
+from edge.bench.program import Line, Play, Program, edge_sr, parsed, plain_loop
 from edge.bench.timing import Times, summary
 
 SETTLE_S: Final = 2.0
@@ -175,9 +175,9 @@ def _measured(
     with edge_sr(folder, play, *options, cores=cores) as program:
         program.lines(60.0, most=1)
         program.skip(SETTLE_S)
-        usage, lines = _Usage(program), program.lines(seconds)
+        usage, heads = _Usage(program), program.heads(seconds)
         since = usage.since()
-    return _recorded(name, lines, since, program.stamps_ns())
+    return _recorded(name, parsed(heads), since, program.stamps_ns())
 
 
 def start_up() -> StartUp:

@@ -19,6 +19,8 @@ from firmware_bridge.emulation.pty_port import PseudoPort
 from firmware_bridge.emulation.xela_controller import CR, FRAME_S, Played, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
 
+_ROOM_POLL_S: Final = 0.001
+"""Time until another look for room, in [s]: at 5000 scans a second a reader empties the terminal in 2 ms."""
 _DRAIN_POLL_S: Final = 0.01
 _EMPTY_LOOKS: Final = 3
 """Looks in turn that must find no unread byte: while a client empties its buffer, the kernel still holds more."""
@@ -205,7 +207,7 @@ class Emulator:
             if amid_frame or not self._answers:
                 sent += self.line.write(data[sent:])
             if sent < len(data):
-                yield from self._wait_until(time.monotonic() + _DRAIN_POLL_S)
+                yield from self._wait_until(time.monotonic() + _ROOM_POLL_S)
             if not self.adapter.channel_open:
                 break
         self._writing = False
