@@ -285,7 +285,8 @@ def test_a_stop_amid_a_scan_tears_none():
     assert emulator.lost_frames == 0 and all(scan.fresh.all() for scan in scans)
     for sensor in "46":
         apart_ns = np.diff([scan.device_ns for scan in scans if scan.sensor == sensor])
-        assert (apart_ns > 300_000_000).sum() == 3 and apart_ns.min() > 7_000_000
+        assert (apart_ns > 300_000_000).sum() >= 3, "a gap of each stop; the machine may have stopped it as well"
+        assert apart_ns.min() > 7_000_000
 
 
 def test_the_command_ends_with_who_started_it(tmp_path):

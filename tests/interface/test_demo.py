@@ -344,7 +344,8 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     for *place, used in table:
         (tap,) = [one for one in taps if one.place == pytest.approx(place, abs=0.051)]
         assert used in tap.used
-    assert len({one["pose"]["x_mm"] for one in results[-250:]}) > 100 and "map of a letter of 50 mm" in done.stderr
+    sliding = [one["pose"] for one in results[-250:] if one["pose"]]  # where the machine stands still poses are lost
+    assert len({pose["x_mm"] for pose in sliding}) > 100 and "map of a letter of 50 mm" in done.stderr
 
 
 @pytest.mark.parametrize(
