@@ -137,6 +137,7 @@ __all__ = [
     "demo_recording",
     "devices",
     "examine",
+    "find_model",
     "infer",
     "layout_c",
     "load_baselines",

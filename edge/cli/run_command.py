@@ -29,6 +29,7 @@ from edge.api import (
     Statistics,
     UsageError,
     choose_model,
+    find_model,
     load_baselines,
     load_model,
     open_poses,
@@ -85,8 +86,9 @@ def run(
         name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
         model = None
         if options.budget_us is None and not stop.is_set():
+            path = find_model(name)  # first, or a name with a slip would wait for links that are slow to open
             source.begin()  # its links open while the model loads, but not while models are timed
-            model = load_model(name, stop=stop)
+            model = load_model(path, stop=stop)
         elif options.budget_us is not None:
             model = choose_model(
                 name,

@@ -76,7 +76,14 @@ class TestEnds:
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
 
-    def test_a_model_that_cannot_be_used_leaves_the_channel_closed(self, emulator, monkeypatch, capsys):
+    def test_a_model_that_does_not_exist_ends_before_the_link_is_opened(self, emulator, monkeypatch, capsys):
+        """A link that is slow to open would hold up the message."""
+        received = []
+        monkeypatch.setattr(emulator.adapter, "feed", lambda data: received.append(data) or b"")
+        assert cli.main(["--model", "nothere", "--source", f"slcan:{emulator.port}"]) == 4
+        assert capsys.readouterr().err.startswith("edge-sr: no model 'nothere'") and received == []
+
+    def test_a_model_that_cannot_be_used_leaves_the_channel_closed(self, emulator, files, monkeypatch, capsys):
         """The link opens while the model loads."""
         opened = threading.Event()
 
@@ -94,8 +101,9 @@ class TestEnds:
 
         monkeypatch.setattr(run_command, "load_model", load)
         monkeypatch.setattr(emulator.adapter, "feed", feed)
-        assert cli.main(["--model", "broken", "--source", f"slcan:{emulator.port}"]) == 4
-        assert capsys.readouterr().err == "edge-sr: broken cannot be used\n"
+        path = files / "tiny.onnx"
+        assert cli.main(["--model", str(path), "--source", f"slcan:{emulator.port}"]) == 4
+        assert capsys.readouterr().err == f"edge-sr: {path} cannot be used\n"
         wait_for(lambda: not emulator.adapter.channel_open)
 
     def test_the_cable_back_under_another_name_goes_on_and_records_tell_of_it(self, files, tmp_path):
