@@ -1,7 +1,7 @@
 """One thread that plays emulators: each hands on its frames when they are due, and obeys its client meanwhile.
 
-Several share one, since a thread or process for each wakes up a thousand times a second, and takes the processor from
-what reads them.
+Several share one: where each has a thread or a process of its own, each wakes up a thousand times a second, and takes
+the processor from the program that reads them.
 """
 
 import threading

@@ -119,11 +119,11 @@ def _emulator(
     recordings: Sequence[Recording], usual: Mapping[str, Any], options: Namespace, closing: ExitStack
 ) -> Emulator:
     if options.buses > 1:
-        raise ValueError(f"--buses is {options.buses}: a robot has one pad here")
+        raise ValueError(f"--buses is {options.buses}: the robot has one pad, so leave it out")
     robot = Robot(recordings[0], _options(recordings[0].path))
     with suppress(OSError):
         os.set_blocking(sys.stdout.fileno(), False)
-    return Emulator(recordings, **{**usual, "on_scan": robot.state, "played": robot.played, "hear": robot.take})
+    return Emulator(recordings, **{**usual, "on_scan": robot.state, "played": robot.played, "take_input": robot.take})
 
 
 def _options(path: Path) -> dict[str, NDArray[Any]]:

@@ -36,7 +36,7 @@ class Emulator:
     Attributes:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
-        hear: takes what is written to the emulator's stdin.
+        take_input: takes what is written to the emulator's stdin.
         line: this end of the pseudo-terminal.
         sent_frames: number of frames that went out whole.
         lost_frames: number of frames without room, because the client did not read.
@@ -62,7 +62,7 @@ class Emulator:
         link: Path | None = None,
         waits: bool = False,
         played: Played = attrgetter("counts"),
-        hear: Callable[[bytes], object] = lambda told: None,
+        take_input: Callable[[bytes], object] = lambda text: None,
     ) -> None:
         """Prepare to play; nothing is opened yet.
 
@@ -84,7 +84,7 @@ class Emulator:
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
             waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
             played: scans that are played of a track; each is asked for while the one before is sent.
-            hear: takes what is written to the emulator's stdin.
+            take_input: takes what is written to the emulator's stdin.
 
         Raises:
             ValueError: an option is out of range.
@@ -98,7 +98,7 @@ class Emulator:
         bus = controllers_of(recordings, controllers, rate_hz)
         self.port = ""
         self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
-        self.hear = hear
+        self.take_input = take_input
         self.sent_frames = 0
         self.lost_frames = 0
         self._timeline = bus_timeline(
@@ -123,7 +123,7 @@ class Emulator:
         self.hang_up()
 
     def plug(self) -> None:
-        """Put the cable in, as the thread that plays the emulator does."""
+        """Put the cable in; `EmulatorThread` does so when it begins."""
         self.line.plug()
         self.port = self.line.path
 
@@ -192,7 +192,7 @@ class Emulator:
             self._on_scan(controller, now_ns)
 
     def _wait_until(self, time_s: float) -> Iterator[float]:
-        """Wait for a time on the monotonic clock; the client is heard once at least."""
+        """Wait for a time on the monotonic clock, but let the client write once at least."""
         yield time_s
         while time.monotonic() < time_s:
             yield time_s

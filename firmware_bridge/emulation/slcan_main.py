@@ -134,10 +134,10 @@ def _play(emulators: Sequence[Emulator], *, until_stdin_closes: bool) -> None:
         while not all(emulator.wait(_STOP_POLL_S) for emulator in emulators):
             if not until_stdin_closes or not select.select([0], [], [], 0)[0]:
                 continue
-            if not (told := os.read(0, 4096)):
+            if not (text := os.read(0, 4096)):
                 break
             for emulator in emulators:
-                emulator.hear(told)
+                emulator.take_input(text)
 
 
 if __name__ == "__main__":

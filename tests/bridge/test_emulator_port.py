@@ -246,7 +246,7 @@ def test_the_robot_of_the_demo_has_one_bus(tmp_path, capsys):
     path = write_recording(tmp_path / "a.csv", make_counts(8))
     with pytest.raises(SystemExit, match="2"):
         robot_main.main([str(path), str(path), "--rate-hz", "100", "--buses", "2"])
-    assert "--buses is 2: a robot has one pad here" in capsys.readouterr().err
+    assert "--buses is 2: the robot has one pad, so leave it out" in capsys.readouterr().err
 
 
 def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):
