@@ -27,23 +27,22 @@ def bundled_models() -> list[Path]:
 
 
 def find_model(name: str | Path) -> Path:
-    """Return the file of a model: a path that exists, else a bundled name with or without .onnx.
+    """Return the file of a model: a path, or a bundled name, with or without .onnx.
+
+    A name without its precision is the best file there is: that in float32, or where an installation lacks it, such as
+    the wheel, that in 8-bit integers.
 
     Raises:
-        ModelError: it is neither; the message lists the bundled ones.
+        ModelError: there is none; the message lists the bundled ones.
     """
     path = Path(name)
     if path.is_file():
         return path
-    for model in bundled_models():
-        if str(name) in (model.name, model.stem):
-            return model
-    int8 = f"{path.name.removesuffix('.onnx')}{INT8_SUFFIX}"
-    if int8 in {model.stem for model in bundled_models()}:
-        raise ModelError(
-            f"model '{name}' is in float32, which this installation lacks: take {int8}, "
-            "or install the wheel tactile-edge-sr-train as well, which has all models"
-        )
+    stem = path.name.removesuffix(".onnx")
+    folder = path.parent if path.parent.name else BUNDLE_DIR
+    for file in (folder / f"{stem}.onnx", folder / f"{stem}{INT8_SUFFIX}.onnx"):
+        if stem and file.is_file():
+            return file
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")
 

@@ -19,6 +19,15 @@ def test_bundled_models_are_found_with_and_without_ending(models):
     assert [path.stem for path in bundle.bundled_models()] == ["mtsr4", "stsr"]
 
 
+@pytest.mark.parametrize("name", ["mtsr4", "mtsr4.onnx", "{models}/mtsr4.onnx", "{models}/mtsr4"])
+def test_a_name_without_precision_is_the_best_file_there_is(models, name):
+    write_model(models / "mtsr4-int8.onnx")
+    asked = name.format(models=models)
+    assert bundle.find_model(asked) == models / "mtsr4.onnx"
+    (models / "mtsr4.onnx").unlink()
+    assert bundle.find_model(asked) == models / "mtsr4-int8.onnx"
+
+
 def test_a_file_wins_over_a_bundled_name(models, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mtsr4").write_text("mine")
