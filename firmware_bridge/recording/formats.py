@@ -1,11 +1,7 @@
 """Recordings of scans, read from disk: CSV rows, or files of the sinks npz: and mcap:."""
 
-import csv
-import itertools
 import math
-import re
-from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
@@ -14,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
-from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
-from firmware_bridge.recording.csv_poses import CsvPoses
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
+from firmware_bridge.recording.csv_reader import load_csv
 from firmware_bridge.recording.npz_poses import NPZ_POSES, npz_poses
 from firmware_bridge.recording.npz_reader import read_npz
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, MOST_SENSORS, Recording, Track, origin_of
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, MOST_SENSORS, Recording, Track, is_rate, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 
@@ -32,28 +28,8 @@ _NPZ_ORIGINS: Final = ("origin", "source")
 """Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""
 _NPZ_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
 
-MOST_CSV_BYTES: Final = 1 << 30
-"""Most bytes of a CSV: some eight hours of one sensor at 100 Hz."""
-LONGEST_CSV_LINE_BYTES: Final = 1 << 14
-"""Most bytes of a line: fifty times a row of counts."""
 MOST_NPZ_BYTES: Final = 1 << 31
 """Most bytes of the arrays that are read: a day of one sensor at 100 Hz."""
-RATES_HZ: Final = (1e-3, 1e5)
-"""Lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0."""
-
-
-def csv_header(taxel_count: int) -> tuple[str, ...]:
-    """Return the columns of so many taxels."""
-    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
-
-
-CSV_HEADER: Final = csv_header(USPA44.taxel_count)
-_CSV_PADS: Final = {len(AXES) * pad.taxel_count: pad for pad in PADS}
-"""Pads by the number of columns of a CSV, which does not name its pad."""
-_META_NAME: Final = "meta_data.csv"
-_META_RATE: Final = "frequency_hz"
-_A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
-_WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -63,7 +39,7 @@ def load_recording(path: str | Path) -> Recording:
         RecordingError: the file cannot be read, or is not a recording.
     """
     path = Path(path)
-    readers = {".csv": _load_csv, ".npz": _load_npz, ".mcap": _load_mcap}
+    readers = {".csv": load_csv, ".npz": _load_npz, ".mcap": _load_mcap}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
@@ -74,117 +50,6 @@ def load_recording(path: str | Path) -> Recording:
     if recording.origin != "emulated":
         return recording
     return replace(recording, notes=(*recording.notes, f"{path} was recorded from an emulated sensor"))
-
-
-def _load_csv(path: Path) -> Recording:
-    rows = _csv_rows(path)
-    header = next(rows, None)
-    if header is None:
-        _refuse(path, 1, "an empty file", "a header and rows of counts")
-    poses = CsvPoses([name.strip() for name in header])
-    counts_end = len(header) - poses.columns
-    pad = _pad_of_header(path, header[:counts_end])
-    values = array("i")  # a list of rows would take ten times the memory of the file
-    for line, row in enumerate(rows, 2):
-        if len(row) != len(header):
-            _refuse(path, line, f"{len(row)} columns", f"{len(header)}")
-        values.extend(_count(path, line, cell.strip()) for cell in row[:counts_end])
-        wrong = poses.add(line - 2, row[counts_end:])
-        if wrong is not None:
-            _refuse(path, line, f"'{wrong[:20]}'", "a number in each column of a pose, or none in all of them")
-    if not values:
-        _refuse(path, 2, "the end of the file", "a row of counts")
-    taxels = np.frombuffer(values, dtype=np.int32).reshape(-1, pad.rows, pad.cols, len(AXES))
-    counts = np.ascontiguousarray(taxels.transpose(0, 3, 1, 2))
-    rate_hz = _meta_rate_hz(path.with_name(_META_NAME))
-    try:
-        return Recording(path, (Track(path.stem, counts, time_ns=None),), rate_hz, poses=poses.poses())
-    except ValueError as error:
-        raise RecordingError(f"{path}: its poses: {error}") from error
-
-
-def _csv_rows(path: Path) -> Iterator[list[str]]:
-    """Yield the rows, each from one line."""
-    read_bytes = 0
-    with path.open("rb") as file:
-        for number in itertools.count(1):
-            line = file.readline(LONGEST_CSV_LINE_BYTES + 1)
-            read_bytes += len(line)
-            if not line:
-                return
-            if len(line) > LONGEST_CSV_LINE_BYTES:
-                _refuse(path, number, f"a line longer than {LONGEST_CSV_LINE_BYTES} bytes", "a row of counts")
-            if read_bytes > MOST_CSV_BYTES:
-                _refuse(path, number, f"a file larger than {MOST_CSV_BYTES:,} bytes", "a smaller one: cut it in parts")
-            yield _csv_row(path, number, line)
-
-
-def _csv_row(path: Path, number: int, line: bytes) -> list[str]:
-    try:
-        text = line.decode("utf-8-sig" if number == 1 else "utf-8")
-    except UnicodeDecodeError as error:
-        _refuse(path, number, f"byte {line[error.start]:#04x}", "UTF-8 text")
-    # A truncated number is still a number: only the line end shows that the last row is whole.
-    if not text.endswith("\n"):
-        _refuse(path, number, "a last line without its end", "a whole file: copy it again")
-    try:
-        return next(csv.reader([text], strict=True))
-    except csv.Error as error:
-        raise RecordingError(f"{path}, line {number}: not CSV: {error}") from error
-
-
-def _pad_of_header(path: Path, header: list[str]) -> SensorGeometry:
-    names = tuple(name.strip() for name in header)
-    pad = _CSV_PADS.get(len(names), USPA44)
-    expected = csv_header(pad.taxel_count)
-    if sorted(names) != sorted(expected):
-        text = f"{len(expected)}: {_header_text(expected)}"
-        _refuse(path, 1, f"{len(names)} columns: {', '.join(names[:4])[:60]}, ...", text)
-    if names != expected:
-        _refuse(
-            path,
-            1,
-            f"columns {', '.join(names[:4])}, ...",
-            f"x, y, z of each taxel side by side: {_header_text(expected)}",
-        )
-    return pad
-
-
-def _header_text(header: tuple[str, ...]) -> str:
-    return f"{', '.join(header[:4])}, ..., {header[-1]}"
-
-
-def _count(path: Path, line: int, cell: str) -> int:
-    # Not float(): it takes nan, 1e4 and 1_0 as well.
-    whole = int(cell.partition(".")[0]) if _WHOLE_NUMBER.fullmatch(cell) else None
-    if whole is None or whole > HIGHEST_COUNT:
-        _refuse(path, line, f"'{cell[:20]}'", f"a whole number 0..{HIGHEST_COUNT}")
-    return whole
-
-
-def _meta_rate_hz(path: Path) -> float | None:
-    if not path.is_file():
-        return None
-    rows = list(itertools.islice(_csv_rows(path), 2))
-    if not rows or _META_RATE not in rows[0]:
-        return None
-    column = rows[0].index(_META_RATE)
-    cell = rows[1][column] if len(rows) > 1 and len(rows[1]) > column else ""
-    try:
-        rate_hz = float(cell)
-    except ValueError:
-        rate_hz = 0.0
-    if not _is_rate(rate_hz):
-        _refuse(path, 2, f"{_META_RATE} '{cell[:20]}'", _A_RATE)
-    return rate_hz
-
-
-def _is_rate(rate_hz: float) -> bool:
-    return RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
-
-
-def _refuse(path: Path, line: int, got: str, expected: str) -> NoReturn:
-    raise RecordingError(f"{path}, line {line}: {got}, expected {expected}")
 
 
 def _load_npz(path: Path) -> Recording:
@@ -318,8 +183,8 @@ def _npz_origin(path: Path, arrays: Mapping[str, NDArray[Any]], scans: int) -> L
 def _npz_rate_hz(path: Path, rate: NDArray[Any] | None) -> float | None:
     if rate is None:
         return None
-    if rate.shape or rate.dtype.kind not in "iuf" or not _is_rate(float(rate)):
-        _refuse_array(path, "rate_hz", str(rate)[:40], _A_RATE)
+    if rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate)):
+        _refuse_array(path, "rate_hz", str(rate)[:40], A_RATE)
     return float(rate)
 
 
