@@ -236,7 +236,7 @@ def _by_axis(values: NDArray[Any], geometry: SensorGeometry) -> NDArray[Any]:
 def _vendor(newtons: "array[float]", geometry: SensorGeometry) -> tuple[VendorReading | None, ...]:
     """Return the vendor's newtons of each scan, None where one of them is missing or out of range."""
     scans = _by_axis(np.frombuffer(newtons, np.float32), geometry)
-    right = (np.abs(scans) <= HIGHEST_NEWTONS).all(axis=(1, 2, 3))
+    right = (np.abs(scans).reshape(len(scans), -1) <= HIGHEST_NEWTONS).all(axis=1).tolist()
     return tuple(VendorReading(one) if sound else None for one, sound in zip(scans, right, strict=True))
 
 

@@ -1,7 +1,8 @@
 """Recordings of scans, read from disk: CSV rows, or files of the sinks npz: and mcap:."""
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
 from firmware_bridge.recording.csv_reader import load_csv
+from firmware_bridge.recording.mounting_text import read_mounting
 from firmware_bridge.recording.npz_poses import NPZ_POSES, npz_poses
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, MOST_SENSORS, Recording, Track, is_rate, origin_of
@@ -19,6 +21,7 @@ from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_na
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 
 if TYPE_CHECKING:
+    from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
 NPZ_FORMAT: Final = "tactile-recording"
@@ -74,6 +77,7 @@ def _load_npz(path: Path) -> Recording:
         path,
         tuple(tracks),
         _npz_rate_hz(path, arrays.get("rate_hz")),
+        mountings=_npz_mountings(path, arrays.get("mountings"), tracks),
         origin=_npz_origin(path, arrays, len(counts)),
         poses=npz_poses(path, arrays),
     )
@@ -126,7 +130,7 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
 
 def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz"), MOST_NPZ_BYTES)
+        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz", "mountings"), MOST_NPZ_BYTES)
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
     for name in _NPZ_REQUIRED:
@@ -143,6 +147,18 @@ def _npz_sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:
         if not is_sensor_name(name):
             _refuse_array(path, "sensor", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
     return names
+
+
+def _npz_mountings(path: Path, text: NDArray[Any] | None, tracks: Sequence[Track]) -> "dict[str, Mounting]":
+    if text is None:
+        return {}
+    try:
+        texts = json.loads(str(text))
+        return {
+            one.sensor: read_mounting(texts[one.sensor], one.counts[0, 0].size) for one in tracks if one.sensor in texts
+        }
+    except (ValueError, TypeError, RecursionError) as error:
+        _refuse_array(path, "mountings", " ".join(str(error).split())[:120], "JSON as the npz sink writes it")
 
 
 def _npz_times(path: Path, sensor: str, times: NDArray[np.integer]) -> NDArray[np.int64]:
