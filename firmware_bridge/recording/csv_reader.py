@@ -131,7 +131,7 @@ class _Scans:
         rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
         rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
         if rates_hz:
-            by = "which tell no rate" if rate_hz is None else f"which tell {rate_hz:.4g} scans/s"
+            by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
             notes.append(f"{path}: {_listed(columns.times.values())} left out as times, {by}")
         if columns.left_out:
             notes.append(
@@ -236,7 +236,7 @@ def _by_axis(values: NDArray[Any], geometry: SensorGeometry) -> NDArray[Any]:
 def _vendor(newtons: "array[float]", geometry: SensorGeometry) -> tuple[VendorReading | None, ...]:
     """Return the vendor's newtons of each scan, None where one of them is missing or out of range."""
     scans = _by_axis(np.frombuffer(newtons, np.float32), geometry)
-    right = (np.abs(scans).reshape(len(scans), -1) <= HIGHEST_NEWTONS).all(axis=1).tolist()
+    right = np.abs(scans).reshape(len(scans), -1).max(axis=1) <= HIGHEST_NEWTONS
     return tuple(VendorReading(one) if sound else None for one, sound in zip(scans, right, strict=True))
 
 

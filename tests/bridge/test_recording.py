@@ -215,7 +215,7 @@ def test_the_rate_of_a_csv_comes_from_its_times(tmp_path, name, times, rate_hz):
     assert len(recording.tracks[0].counts) == len(times)
     assert (recording.rate_hz is None) if rate_hz is None else recording.rate_hz == pytest.approx(rate_hz, rel=0.05)
     (note,) = recording.notes
-    assert f"{name!r} is left out as times, which tell" in note
+    assert f"{name!r} is left out as times, which give" in note
 
 
 def test_other_columns_of_a_csv_are_named_and_left_out(tmp_path):
