@@ -36,16 +36,16 @@ MOST_NPZ_BYTES: Final = 1 << 31
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format.
+    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format, and a folder is a rosbag2.
 
     Raises:
         RecordingError: the file cannot be read, or is not a recording.
     """
     path = Path(path)
     readers = {".csv": load_csv, ".npz": _load_npz, ".mcap": _load_mcap}
-    reader = readers.get(path.suffix.lower())
+    reader = _load_mcap if path.is_dir() else readers.get(path.suffix.lower())
     if reader is None:
-        raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
+        raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap, or is a folder of a rosbag2")
     try:
         recording = reader(path)
     except OSError as error:

@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -56,6 +57,8 @@ MOST_KEPT_BYTES: Final = 1 << 31
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
 _POSE_BYTES: Final = 64
+MOST_BAG_BYTES: Final = 1 << 20
+"""Most bytes of a bag's metadata.yaml."""
 MOST_SHOWN_TOPICS: Final = 10
 LONGEST_SHOWN: Final = 60
 _MESSAGE: Final = struct.Struct("<HIQQ")
@@ -79,29 +82,49 @@ class _Lane:
 
 
 def load_mcap(path: Path) -> Recording:
-    """Read an MCAP file; one without an end up to its last whole record, which `notes` then report.
+    """Read an MCAP file, or those of a rosbag2 folder in order; one without an end up to its last whole record.
 
     Raises:
         RecordingError: it is no MCAP file, or holds no scans that edge-sr recorded.
         OSError: the file cannot be read.
     """
     reading = _Reading(path)
-    with path.open("rb") as file:
-        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise RecordingError(f"{path}: not an MCAP file: it does not begin as one")
-        try:
-            for opcode, data in records(file):
-                reading.take(opcode, data)
-        except CutOffError as end:
-            reading.broken_off(str(end))
-        except DamageError as damage:
-            reading.damaged(str(damage), os.fstat(file.fileno()).st_size - file.tell())
+    for one in _bag_files(path, reading) if path.is_dir() else [path]:
+        with one.open("rb") as file:
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise RecordingError(f"{one}: not an MCAP file: it does not begin as one")
+            reading.begin(one)
+            try:
+                for opcode, data in records(file):
+                    reading.take(opcode, data)
+            except CutOffError as end:
+                reading.broken_off(str(end))
+            except DamageError as damage:
+                reading.damaged(str(damage), os.fstat(file.fileno()).st_size - file.tell())
     return reading.recording()
+
+
+def _bag_files(folder: Path, reading: "_Reading") -> list[Path]:
+    """Return the MCAP files of a folder, in the order of its metadata.yaml, else by the numbers in their names."""
+    there = sorted(folder.glob("*.mcap"), key=lambda path: [int(one) for one in re.findall("[0-9]+", path.stem)])
+    if not there:
+        names = ", ".join(ascii(path.name) for path in sorted(folder.iterdir())[:MOST_SHOWN_TOPICS])
+        remedy = "name a file, or convert a bag of another storage with `ros2 bag convert` to mcap"
+        raise RecordingError(f"{folder}: a folder with {names or 'nothing in it'}, expected .mcap files: {remedy}")
+    about = folder / "metadata.yaml"
+    if not about.is_file():
+        return there
+    text = read_bounded(about, MOST_BAG_BYTES).decode(errors="replace")
+    named = [folder / name for name in re.findall(r"^\s*- [\"']?([^/\"'\n]+\.mcap)[\"']?\s*$", text, re.MULTILINE)]
+    order = [path for path in dict.fromkeys(named) if path in there]
+    if missing := [path.name for path in named if path not in there]:
+        reading.note(f"{folder}: its metadata.yaml names {', '.join(map(ascii, missing))[:100]}, which is not there")
+    return order or there
 
 
 class _Reading:
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._whole = self._path = path
         self._schemas: dict[int, MessageType | None] = {}
         self._topics: dict[int, _Topic] = {}
         self._lanes: dict[str, _Lane] = {}
@@ -118,6 +141,15 @@ class _Reading:
         self._poses = PoseRows()
         self._notes: list[str] = []
         self._origin: Literal["device", "emulated"] | None = None
+
+    def begin(self, path: Path) -> None:
+        """Go on with a file: its numbers of schemas and channels are its own."""
+        self._path = path
+        self._schemas, self._topics = {}, {}
+
+    def note(self, text: str) -> None:
+        """Add a remark for the user."""
+        self._notes.append(text)
 
     def take(self, opcode: int, data: memoryview) -> None:
         """Process one record, from a chunk or between chunks."""
@@ -298,7 +330,7 @@ class _Reading:
             )
         baselines = {name: one for name, one in self._baselines.items() if name in self._lanes}
         return Recording(
-            self._path,
+            self._whole,
             tracks,
             None,
             baselines,

@@ -104,3 +104,58 @@ def test_two_mountings_of_one_sensor_are_refused(turned, tmp_path):
     straight = record_into(tmp_path / "straight.mcap", make_results([make_scan()]), mountings={"4": Mounting()})
     with pytest.raises(RecordingError, match="two mountings of sensor '4'"):
         load_recording(messages_alone(turned, tmp_path / "both.mcap", more=straight))
+
+
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: mcap
+  relative_file_paths:
+    - bag_2.mcap
+    - bag_10.mcap
+  message_count: 120
+"""
+
+
+@pytest.fixture
+def bag(turned, tmp_path):
+    """A folder with the recording in two files, as `ros2 bag record` splits it, and `ros2 bag convert` copies it."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    half_ns = OFFSET_NS + 31 * PERIOD_NS
+    messages_alone(turned, folder / "bag_2.mcap", end_ns=half_ns)
+    messages_alone(turned, folder / "bag_10.mcap", start_ns=half_ns)
+    return folder
+
+
+@pytest.mark.parametrize("metadata", [METADATA, None, "relative_file_paths: []\n", "\0"])
+def test_the_files_of_a_bag_are_played_in_their_order(turned, bag, metadata):
+    if metadata is not None:
+        (bag / "metadata.yaml").write_text(metadata)
+    assert patterns(bag) == patterns(turned)
+    assert load_recording(bag).notes == ()
+
+
+def test_a_bag_goes_by_its_metadata_and_names_a_file_that_is_not_there(bag, tmp_path):
+    (bag / "bag_2.mcap").rename(bag / "z.mcap")
+    (bag / "metadata.yaml").write_text(METADATA.replace("- bag_2.mcap", "- 'z.mcap'\n    - bag_3.mcap"))
+    recording = load_recording(bag)
+    assert len(recording.tracks[0].counts) == 60
+    assert recording.notes == (f"{bag}: its metadata.yaml names 'bag_3.mcap', which is not there",)
+
+
+def test_a_file_of_a_bag_that_breaks_off_costs_its_end(bag):
+    data = (bag / "bag_10.mcap").read_bytes()
+    (bag / "bag_10.mcap").write_bytes(data[: len(data) // 5])
+    recording = load_recording(bag)
+    assert 30 <= len(recording.tracks[0].counts) < 60 and "bag_10.mcap breaks off" in recording.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [((), "nothing in it"), (("a_0.db3", "metadata.yaml"), "'a_0.db3', .*ros2 bag convert")]
+)
+def test_a_folder_without_mcap_files_is_refused_with_what_is_in_it(tmp_path, names, words):
+    (tmp_path / "bag").mkdir()
+    for name in names:
+        (tmp_path / "bag" / name).touch()
+    with pytest.raises(RecordingError, match=rf"bag: a folder with {words}"):
+        load_recording(tmp_path / "bag")

@@ -255,7 +255,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(RecordingError, match=r"gone\.npz: cannot be read: No such file"):
         load_recording(tmp_path / "gone.npz")
     (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(RecordingError, match="directory"):
+    with pytest.raises(RecordingError, match=r"folder\.csv: a folder with nothing in it, expected \.mcap files"):
         load_recording(tmp_path / "folder.csv")
     with pytest.raises(RecordingError, match=r"ends in \.csv, \.npz or \.mcap"):
         load_recording(write_csv(tmp_path, HEADER + row(0), "finger.txt"))

@@ -72,9 +72,14 @@ def same_scan(got: Scan, scan: Scan, moved_ns: int = 0) -> bool:
 
 
 def messages_alone(
-    path: Path, to: Path, topics: str | None = None, start_ns: int = 0, more: Path | None = None
+    path: Path,
+    to: Path,
+    topics: str | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    more: Path | None = None,
 ) -> Path:
-    """Copy messages of these topics (all by default) from a time on, as tools do: without metadata and attachments.
+    """Copy messages of these topics and times (all by default), as tools do: without metadata and attachments.
 
     Those of `more`, another recording, follow.
     """
@@ -84,7 +89,9 @@ def messages_alone(
         for one in filter(None, (path, more)):
             channels: dict[int, int] = {}
             with one.open("rb") as source:
-                for schema, channel, message in make_reader(source).iter_messages(topics, starting_at=start_ns or None):
+                for schema, channel, message in make_reader(source).iter_messages(
+                    topics, starting_at=start_ns, ending_before=end_ns
+                ):
                     if channel.id not in channels:
                         kind = writer.register_schema(schema.name, schema.encoding, schema.data)
                         channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
