@@ -18,7 +18,7 @@ _MESSAGES: Final = {
     "duplicate_keys": "their keys are not unique: another server answers at this address",
     "welcomes": "the server only greets: is a sensor plugged in, and in its xServ.ini?",
 }
-"""What the messages of a server are, by the counter of those that gave no reading."""
+"""Reasons why messages of a server gave no reading, by their counters."""
 
 
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:

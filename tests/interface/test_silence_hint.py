@@ -81,7 +81,7 @@ def test_what_is_wrong_is_read_from_what_came(speaks, words):
     ("counters", "words"),
     [
         (
-        ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
+            ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
             "30 messages came from the server, .* name no sensor",
         ),
         ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
