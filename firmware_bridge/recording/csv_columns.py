@@ -48,7 +48,7 @@ class CsvColumns:
         newtons: dict[tuple[int, str], int] = {}
         self.times: dict[int, str] = {}
         others: dict[int, str] = {}
-        names = [name.strip() for name in names]
+        names = ["".join(char if char.isprintable() else "?" for char in name.strip()) for name in names]
         for column, name in enumerate(names):
             matched = _TAXEL.fullmatch(name.lower())
             if matched is not None:

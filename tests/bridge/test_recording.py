@@ -110,6 +110,13 @@ def test_csv_that_is_none(tmp_path, text, line, words):
         load_recording(write_csv(tmp_path, text))
 
 
+def test_nothing_of_a_header_reaches_a_terminal_as_a_command(tmp_path):
+    with pytest.raises(RecordingError) as refused:
+        load_recording(write_csv(tmp_path, "\x1b]0;mine\x07,\x9b2J\n"))
+    recording = load_recording(write_csv(tmp_path, with_columns("\x1b[2J,t\x1b", ["1,0", "2,10"])))
+    assert all(text.isprintable() for text in (str(refused.value), *recording.notes)) and len(recording.notes) == 2
+
+
 def test_csv_without_a_row(tmp_path):
     with pytest.raises(RecordingError, match=r"finger\.csv, .*expected a row of counts"):
         load_recording(write_csv(tmp_path, HEADER))

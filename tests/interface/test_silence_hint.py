@@ -81,8 +81,8 @@ def test_what_is_wrong_is_read_from_what_came(speaks, words):
     ("counters", "words"),
     [
         (
-            ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
-            "30 messages came from the server, .* name no sensor",
+            {"messages": 30, "without_readings": 29, "welcomes": 1},
+            "30 messages came from the server, and no reading in them: they name no sensor",
         ),
         ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
         ({"messages": 9, "bad_json": 9, "received_bytes": 99}, "they are no JSON: another server"),
