@@ -196,7 +196,7 @@ def gather(path: Path) -> int:
             for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION), ("mountings", texts)):
                 with archive.open(f"{name}.npy", "w") as entry:
                     npy.write_array(entry, np.asarray(value))
-            for name in row.names or ():
+            for name in sorted(row.names or (), key=lambda name: name != "origin"):  # first: what loses its end has it
                 column = rows[name]
                 header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:

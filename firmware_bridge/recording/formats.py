@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
@@ -31,6 +31,7 @@ _NPZ_ORIGINS: Final = ("origin", "source")
 """Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""
 _NPZ_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
 
+_CUT_OFF: Final = "{} is damaged: its end is missing, and only its whole arrays are read; copy it again"
 MOST_NPZ_BYTES: Final = 1 << 31
 """Most bytes of the arrays that are read: a day of one sensor at 100 Hz."""
 
@@ -56,7 +57,13 @@ def load_recording(path: str | Path) -> Recording:
 
 
 def _load_npz(path: Path) -> Recording:
-    arrays = _npz_arrays(path)
+    notes: list[str] = []
+    names = (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz", "mountings")
+    arrays = _npz_arrays(path, names, lambda: notes.append(_CUT_OFF.format(path)))
+    for name in _NPZ_REQUIRED:
+        if name not in arrays:
+            lost = f"; {notes[0]}" if notes else ""
+            raise RecordingError(f"{path}, array '{name}': missing, expected what the npz sink writes{lost}")
     form, version = arrays["format"], arrays["version"]
     if str(form) != NPZ_FORMAT:
         _refuse_array(path, "format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
@@ -78,8 +85,9 @@ def _load_npz(path: Path) -> Recording:
         tuple(tracks),
         _npz_rate_hz(path, arrays.get("rate_hz")),
         mountings=_npz_mountings(path, arrays.get("mountings"), tracks),
+        notes=tuple(notes),
         origin=_npz_origin(path, arrays, len(counts)),
-        poses=npz_poses(path, arrays),
+        poses=None if notes and NPZ_POSES[1] not in arrays else npz_poses(path, arrays),
     )
 
 
@@ -101,10 +109,7 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
     )
 
     path = recording.path
-    try:
-        arrays = read_npz(path, ("sensor", *_NPZ_BASELINE), MOST_NPZ_BYTES)
-    except NpzError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    arrays = _npz_arrays(path, ("sensor", *_NPZ_BASELINE))
     if not all(name in arrays for name in _NPZ_BASELINE):
         return {}
     ids, counts, ages_s = (arrays[name] for name in _NPZ_BASELINE)
@@ -128,15 +133,13 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
     return baselines
 
 
-def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _npz_arrays(
+    path: Path, names: Sequence[str], damaged: Callable[[], object] = lambda: None
+) -> dict[str, NDArray[Any]]:
     try:
-        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz", "mountings"), MOST_NPZ_BYTES)
+        return read_npz(path, names, MOST_NPZ_BYTES, damaged)
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
-    for name in _NPZ_REQUIRED:
-        if name not in arrays:
-            raise RecordingError(f"{path}, array '{name}': missing, expected what the npz sink writes")
-    return arrays
 
 
 def _npz_sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:

@@ -328,9 +328,23 @@ def test_npz_with_objects_is_not_unpickled(tmp_path):
         load_recording(write_npz(tmp_path, sensor=np.array(["4", 6, None, {}], dtype=object)))
 
 
+def test_npz_that_lost_its_end_is_read_as_far_as_its_arrays_are_whole(tmp_path):
+    whole = write_npz(tmp_path, zpattern=np.arange(5000)).read_bytes()
+    expected = load_recording(write_csv(tmp_path, whole, "finger.npz"))
+    assert expected.notes == ()
+    for damaged in (whole[:-1], whole[:-100], whole[: len(whole) // 2], whole + bytes(100_000)):
+        recording = load_recording(write_csv(tmp_path, damaged, "finger.npz"))
+        (note,) = recording.notes
+        assert "finger.npz is damaged: its end is missing" in note
+        for track, other in zip(recording.tracks, expected.tracks, strict=True):
+            assert (track.counts == other.counts).all() and (track.time_ns == other.time_ns).all()
+    with pytest.raises(RecordingError, match=r"array 'counts': missing, .*; .*its end is missing"):
+        load_recording(write_csv(tmp_path, whole[: whole.index(b"counts.npy") + 300], "finger.npz"))
+
+
 def test_npz_that_is_cut_or_something_else(tmp_path):
     whole = write_npz(tmp_path).read_bytes()
-    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+    for size in (0, 10, len(whole) // 4):
         with pytest.raises(RecordingError, match="finger"):
             load_recording(write_csv(tmp_path, whole[:size], "finger.npz"))
     damaged = whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:]
