@@ -39,6 +39,7 @@ from train.data.dataset import Sequences, join, load_sequences
 from train.data.generation_config import FORCE_N, Generation, one_thread, random_figures, solve_chunk
 from train.data.workers import quiet_workers
 from train.errors import DatasetError, TrainError
+from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.named_surfaces import PLATES, SURFACES, surface_mesh
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
@@ -73,7 +74,7 @@ def generate(
     if jobs == 0:
         raise DatasetError("jobs is 0, expected 1 or more, or -1 for one on each core")
     for name in config.surfaces:
-        if name.startswith("mesh:"):  # checked before any work, because meshes fail most often
+        if name.startswith(MESH):  # checked before any work, because meshes fail most often
             surface_mesh(name)
     folder = path.with_name(path.name + ".parts")
     missing = _missing_chunks(config, folder, progress)
@@ -141,6 +142,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started_s = time.monotonic()
     try:
         config = _config(options)
+        for name in config.surfaces:
+            if name.startswith(MESH):
+                sys.stdout.write(f"{size_of(name)}\n")
+        sys.stdout.flush()  # before the simulation, which takes long
         total = config.sequences * config.taps
         with quiet_workers(options.jobs) if options.jobs and config.chunks > 1 else nullcontext():
             made = generate(config, options.out, options.jobs)
@@ -164,7 +169,7 @@ def _config(options: argparse.Namespace) -> Generation:
         for name in named:
             surface_mesh(name)
     figures = random_figures(options.glyphs, options.polygons, options.seed)
-    meshes = tuple(f"mesh:{path.resolve()}" for path in options.mesh)
+    meshes = tuple(mesh_name(path, options.unit_mm) for path in options.mesh)
     return Generation(
         surfaces=(*named, *figures, *meshes),
         poses=options.poses,
@@ -186,6 +191,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--polygons", type=int, default=0, help="random polygons to add (0)")
     parser.add_argument(
         "--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add"
+    )
+    parser.add_argument(
+        "--unit-mm", type=float, default=1.0, help="unit of the meshes in mm: 25.4 for inches, 1000 for metres (1)"
     )
     parser.add_argument("--poses", choices=("random", "paper"), default="random", help="choice of the poses (random)")
     parser.add_argument(

@@ -38,8 +38,8 @@ from edge.api import (
     pump,
 )
 from edge.cli.run_options import runtime_options
-from edge.cli.silence_hint import silence_hint
 from edge.cli.user_commands import user_commands
+from edge.pipeline.silence_hint import silence_hint
 from edge.sinks.event_printer import MessageSink
 from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals

@@ -133,7 +133,7 @@ def replay_parser() -> argparse.ArgumentParser:
     )
     recording = parser.add_argument_group("recording")
     add = recording.add_argument
-    file_help = "recording, .mcap, .npz or .csv; of several sensors a file each, also as FILE,FILE"
+    file_help = "recording, .mcap, .npz, .csv or a rosbag2 folder; of several sensors a file each, also as FILE,FILE"
     add("file", metavar="FILE", nargs="+", help=file_help)
     zeroing = recording.add_mutually_exclusive_group()
     baseline_help = "readings of the free pad, from edge-sr baseline, instead of the recorded ones"

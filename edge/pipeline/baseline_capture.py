@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 from edge.pipeline.scan_reader import Source
+from edge.pipeline.silence_hint import silence_hint
 from edge.terminal.progress_bar import Progress
 from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
@@ -56,8 +57,8 @@ def take_baselines(
             if any(isinstance(one, Scan) for one in taken):
                 received_s = now_s
             elif now_s - received_s > GIVEN_UP_S:
-                silence = f"no scan from {source.name} for {GIVEN_UP_S:.0f} s"
-                raise DeviceError(f"{silence}: is the sensor powered? edge-sr doctor shows what is wrong")
+                hint = silence_hint((), source.counters)
+                raise DeviceError(f"no scan from {source.name} for {GIVEN_UP_S:.0f} s: {hint}")
             for one in taken:
                 if not isinstance(one, Scan):
                     if isinstance(one, Notice) and one.kind in ("lost", "silent"):

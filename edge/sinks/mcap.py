@@ -32,16 +32,27 @@ from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.mounting_text import mounting_text
 from firmware_bridge.recording.pose_messages import POSE, encode_pose
-from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
+from firmware_bridge.recording.scan_messages import (
+    SENSOR,
+    baseline_type,
+    encode_baseline,
+    encode_scan,
+    encode_sensor,
+    scan_type,
+)
 from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.zeroing.baseline import Baseline
 
 EVENTS_TOPIC: Final = "/events"
 POSES_TOPIC: Final = "/poses"
 FRAMES_TOPIC: Final = "/tf_static"
+REPEAT_NS: Final = NS_PER_S
+"""Time from which on a sensor's facts and baseline are repeated, in [ns]: a part of a file has them, too."""
 _PROFILE: Final = "ros2"
 
 
@@ -86,6 +97,14 @@ class McapSink(Sink):
         self._channels: dict[tuple[str, str], int] = {}
         self._baselines: dict[str, Baseline | None] = {}
         self._geometry, self._frames = geometry, dict(frames or {})
+        self._facts = {
+            GEOMETRY_METADATA: {key: json.dumps(one) for key, one in asdict(geometry).items()},
+            "units": {name: unit.name for name, unit in UNITS.items()},
+        }
+        self._mountings = {
+            name: {"sensor": name, "mounting": mounting_text(one)} for name, one in (mountings or {}).items()
+        }
+        self._repeat_ns: dict[str, int] = {}
         self._scan, self._baseline = scan_type(geometry.taxel_count), baseline_type(geometry.taxel_count)
         self._origin = origin
         self._source_told = False
@@ -96,14 +115,9 @@ class McapSink(Sink):
             self._file = McapFile(path, _PROFILE, f"tactile-edge-sr {_version()}", clock_s)
             try:
                 self._file.add_metadata("contract", {key: json.dumps(one) for key, one in asdict(contract).items()})
-                self._file.add_metadata(
-                    GEOMETRY_METADATA, {key: json.dumps(one) for key, one in asdict(geometry).items()}
-                )
-                for name, mounting in (mountings or {}).items():
-                    fields = asdict(mounting)
-                    del fields["taxel_count"]  # the geometry holds it
-                    text = json.dumps(fields)
-                    self._file.add_metadata(MOUNTING_METADATA, {"sensor": name, "mounting": text})
+                self._file.add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
+                for fields in self._mountings.values():
+                    self._file.add_metadata(MOUNTING_METADATA, fields)
             except OSError:
                 self._file.abandon()
                 raise
@@ -124,7 +138,7 @@ class McapSink(Sink):
         return self._file.size_bytes
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Add the messages of one scan; a new baseline comes first."""
+        """Add the messages of one scan; what it means, and a new baseline, come first."""
         if not self._has_room():
             return
         scan = result.scan
@@ -132,10 +146,18 @@ class McapSink(Sink):
         on_bus_unix_ns = scan.on_bus_ns + self._offset_ns
         fields = record(result, counters)
         try:
+            kind = {"kind": self._origin or result.source}
             if not self._source_told:
-                self._file.add_metadata(SOURCE_METADATA, {"kind": self._origin or result.source})
+                self._file.add_metadata(SOURCE_METADATA, kind)
                 self._source_told = True
-            if result.baseline is not None and self._baselines.get(sensor) is not result.baseline:
+            repeat = unix_ns >= self._repeat_ns.get(sensor, 0)
+            if repeat:
+                self._repeat_ns[sensor] = unix_ns + REPEAT_NS
+                facts = self._facts | {SOURCE_METADATA: kind}
+                if sensor in self._mountings:
+                    facts[MOUNTING_METADATA] = self._mountings[sensor]
+                self._add(sensor, "sensor", SENSOR, unix_ns, encode_sensor(sensor, frame, json.dumps(facts), unix_ns))
+            if result.baseline is not None and (repeat or self._baselines.get(sensor) is not result.baseline):
                 data = encode_baseline(result.baseline, frame, result.baseline_age_s, unix_ns)
                 self._add(sensor, "baseline", self._baseline, unix_ns, data)
                 self._baselines[sensor] = result.baseline

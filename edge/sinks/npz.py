@@ -33,8 +33,11 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.recording.mounting_text import mounting_text
+from firmware_bridge.scans.mounting import Mounting
 
 LAYOUT: Final = "layout.json"
+MOUNTINGS: Final = "mountings.json"
 ROWS: Final = "rows"
 CHUNK_SCANS: Final = 256
 
@@ -54,6 +57,7 @@ class NpzSink(Sink):
         deviations: bool = False,
         traction_shape: tuple[int, ...] | None = None,
         poses_shape: tuple[int, ...] | None = None,
+        mountings: Mapping[str, Mounting] | None = None,
         origin: SourceKind | None = None,
     ) -> None:
         """Start the parts.
@@ -65,6 +69,7 @@ class NpzSink(Sink):
             deviations: patterns come with deviations.
             traction_shape: (3, h, w), where patterns come with tractions.
             poses_shape: (taps, 5) of the most taps, where patterns are made from taps with poses.
+            mountings: of the sensors, by name.
             origin: kind of source that the scans come from, where results are of a recording; else that of the results.
 
         Raises:
@@ -104,6 +109,8 @@ class NpzSink(Sink):
         try:
             parts.mkdir()
             (parts / LAYOUT).write_text(json.dumps(self._layout))
+            texts = {name: mounting_text(one) for name, one in (mountings or {}).items()}
+            (parts / MOUNTINGS).write_text(json.dumps(texts))
             self._rows = (parts / ROWS).open("wb", buffering=0)
         except FileExistsError as error:
             raise SinkError(
@@ -184,10 +191,12 @@ def gather(path: Path) -> int:
             zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
             Progress(path.name, scans * row.itemsize, "B") as bar,
         ):
-            for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION)):
+            mountings = parts / MOUNTINGS  # earlier releases left parts without it
+            texts = mountings.read_text() if mountings.exists() else "{}"
+            for name, value in (("format", NPZ_FORMAT), ("version", NPZ_VERSION), ("mountings", texts)):
                 with archive.open(f"{name}.npy", "w") as entry:
                     npy.write_array(entry, np.asarray(value))
-            for name in row.names or ():
+            for name in sorted(row.names or (), key=lambda name: name != "origin"):  # first: what loses its end has it
                 column = rows[name]
                 header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:

@@ -114,6 +114,7 @@ def open_sink(
             deviations=contract.interval_factor is not None,
             traction_shape=contract.traction_shape,
             poses_shape=(contract.taps, POSE_WIDTH) if contract.takes_poses else None,
+            mountings=mountings,
             origin=origin,
         )
     if form == "mcap":

@@ -3,6 +3,10 @@
 A browser runs pages of strangers, which can reach a server on loopback, too. Three things keep them out: the name that
 the browser was asked to reach (a stranger's name may resolve to this machine), the origin of the page that opens a
 socket, and, where other machines can reach the server, a token.
+
+A proxy may ask under its own name for this server, so that the origin of our page differs from the name. Such a page
+has the key that was sent in it, which pages of other origins cannot read, and a name that no stranger can have: a
+number, or this machine's without a domain. A page under another name needs the token, which no stranger knows.
 """
 
 import hmac
@@ -10,7 +14,7 @@ import ipaddress
 import re
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Final, NamedTuple
 from urllib.parse import parse_qs
@@ -20,7 +24,10 @@ from edge.errors import UsageError
 PAGE: Final = "/"
 SOCKET: Final = "/ws"
 SHORTEST_TOKEN: Final = 12
-REMEDY: Final = "open the address that edge-sr printed when it started, or name this one with --view-host"
+REMEDY: Final = (
+    "open the address that edge-sr printed when it started, or name this one with --view-host; a proxy must send the "
+    "host and port of edge-sr as Host"
+)
 _HOST: Final = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w.-]+))(?::[0-9]*)?")
 _TOKEN: Final = re.compile(rf"[A-Za-z0-9_-]{{{SHORTEST_TOKEN},200}}")
 
@@ -40,11 +47,13 @@ class Access:
         host: name or address that the server listens at.
         name: of this machine, with or without a domain.
         token: or None where it is not needed.
+        key: sent within the page, and given by the page when it opens the socket.
     """
 
     host: str
     name: str
     token: str | None
+    key: str = field(default_factory=lambda: secrets.token_urlsafe(16))
 
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
         """Return the refusal of a request; None if it is granted.
@@ -57,14 +66,23 @@ class Access:
         called = ", ".join(hosts) or "nothing"
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
             return Refusal(HTTPStatus.FORBIDDEN, f"this server is not called {called}; {REMEDY}")
-        if any(origin != f"http://{hosts[0]}" for origin in origins):
-            return Refusal(HTTPStatus.FORBIDDEN, f"pages of {', '.join(origins)} may not send requests to this server")
         place, _, query = path.partition("?")
+        given = parse_qs(query)
+        # A browser sends no origin when a page asks why its socket was refused, so that the page names its own.
+        origins = [*origins, *given.get("origin", [])]
+        trusted = self.token is not None and _same(given.get("token", [""])[-1], self.token)
+        keyed = _same(given.get("key", [""])[-1], self.key)
+        for origin in origins:
+            through = place == SOCKET and (trusted or (keyed and self._is_no_strangers(origin)))
+            if origin != f"http://{hosts[0]}" and not through:
+                text = f"pages of {', '.join(origins)} may not send requests to this server"
+                if place == SOCKET:
+                    text += ": load this page again, or pass --view-token T and add ?token=T to its address"
+                return Refusal(HTTPStatus.FORBIDDEN, text)
         if place not in (PAGE, SOCKET):
             return Refusal(HTTPStatus.NOT_FOUND, f"there is only {PAGE}")
-        given = parse_qs(query).get("token", [""])
         # The page alone shows nothing, and removes the token from the address bar: it must open again without it.
-        if place == SOCKET and self.token is not None and not _same(given[-1], self.token):
+        if place == SOCKET and self.token is not None and not trusted:
             text = "the token is missing or wrong: open the address that edge-sr printed when it started"
             return Refusal(HTTPStatus.FORBIDDEN, text)
         return None
@@ -91,8 +109,20 @@ class Access:
         address = _address(name)
         if address is not None:
             return address.is_loopback or is_everything(self.host)
+        if self.token is not None and "." not in name:  # as a proxy calls its upstream; no stranger's name lacks a dot
+            return True
         # Any domain will do: a stranger may use this name too, but needs the token where other machines can reach us.
         return not is_loopback(self.host) and name.partition(".")[0] == self.name.lower().partition(".")[0]
+
+    def _is_no_strangers(self, origin: str) -> bool:
+        """Return True if no stranger can have the name in an origin, and let it point here."""
+        scheme, _, authority = origin.partition("://")
+        matched = _HOST.fullmatch(authority)
+        if scheme not in ("http", "https") or matched is None:
+            return False
+        name = (matched["address"] or matched["name"]).lower()
+        own = self.name.lower().partition(".")[0]
+        return _address(name) is not None or name in ("localhost", own, f"{own}.local")
 
 
 def grant(host: str, name: str, token: str | None) -> Access:

@@ -87,7 +87,7 @@ class Server:
         self._recording = recording
         self._recorded = recorded
         self._failed = failed
-        self._page = load_page()
+        self._page = load_page(access.key)
         self._socket = _listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 FOLDER: Final = Path(__file__).with_name("page")
 STYLE_LINK: Final = b'<link rel="stylesheet" href="page.css">'
 SCRIPT_LINK: Final = b'<script type="module" src="page.js"></script>'
+KEY: Final = b'<meta name="edge-sr-key" content="">'
 SCRIPTS: Final = (
     *("colour_map.js", "words.js", "link.js", "traces.js", "marks.js", "history.js", "contact_shape.js", "relief.js"),
     *("overlay.js", "explain.js", "numbers.js", "limits.js", "sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
@@ -22,12 +23,13 @@ class Page(NamedTuple):
     body: bytes
 
 
-def load_page() -> Page:
-    """Return the page, with its style and its script inside: nothing else is fetched."""
+def load_page(key: str = "") -> Page:
+    """Return the page, with its style, its script and its key inside: nothing else is fetched."""
     style, script = (FOLDER / "page.css").read_bytes(), page_script()
     body = (FOLDER / "page.html").read_bytes()
     body = body.replace(STYLE_LINK, b"<style>\n%s</style>" % style)
     body = body.replace(SCRIPT_LINK, b'<script type="module">%s</script>' % script)
+    body = body.replace(KEY, KEY.replace(b'""', b'"%s"' % key.encode()))
     headers = (
         ("Content-Type", "text/html; charset=utf-8"),
         ("Content-Length", str(len(body))),

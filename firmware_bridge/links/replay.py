@@ -186,7 +186,8 @@ class ReplayLink(Link):
         time_ns = self._start_ns + due_ns
         track = self._tracks[lane]
         if track.renewed is None:
-            scan = self._series[lane].close(track.counts[row].copy(), time_ns)
+            vendor = track.vendor[row] if track.vendor else None
+            scan = self._series[lane].close(track.counts[row].copy(), time_ns, vendor=vendor)
         else:
             scan = _recorded(track, track.renewed, row, time_ns)
         self._counts["scans"] += 1

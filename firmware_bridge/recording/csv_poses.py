@@ -1,4 +1,4 @@
-"""Poses in the columns of a CSV after those of the taxels: a pose of the pad at each row, or none."""
+"""Poses in the columns of a CSV: a pose of the pad at each row, or none."""
 
 import math
 from array import array
@@ -14,16 +14,10 @@ CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
 
 
 class CsvPoses:
-    """Poses of rows, as they are read.
+    """Poses of rows, as they are read."""
 
-    Attributes:
-        columns: number of columns of poses at the end of each row, 0, 2 or 3.
-    """
-
-    def __init__(self, names: Sequence[str]) -> None:
-        """Begin without a row; `names` are the names of all columns."""
-        ends = (count for count in (3, 2) if tuple(names[-count:]) == CSV_POSES[:count])
-        self.columns = next(ends, 0)
+    def __init__(self) -> None:
+        """Begin without a row."""
         self._rows = array("q")
         self._values = array("d")
 

@@ -1,11 +1,8 @@
 """Recordings of scans, read from disk: CSV rows, or files of the sinks npz: and mcap:."""
 
-import csv
-import itertools
+import json
 import math
-import re
-from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
@@ -14,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
-from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
-from firmware_bridge.recording.csv_poses import CsvPoses
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
+from firmware_bridge.recording.csv_reader import load_csv
+from firmware_bridge.recording.mounting_text import read_mounting
 from firmware_bridge.recording.npz_poses import NPZ_POSES, npz_poses
 from firmware_bridge.recording.npz_reader import read_npz
-from firmware_bridge.recording.tracks import HIGHEST_COUNT, MOST_SENSORS, Recording, Track, origin_of
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, MOST_SENSORS, Recording, Track, is_rate, origin_of
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
 
 if TYPE_CHECKING:
+    from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
 NPZ_FORMAT: Final = "tactile-recording"
@@ -32,41 +31,22 @@ _NPZ_ORIGINS: Final = ("origin", "source")
 """Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""
 _NPZ_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
 
-MOST_CSV_BYTES: Final = 1 << 30
-"""Most bytes of a CSV: some eight hours of one sensor at 100 Hz."""
-LONGEST_CSV_LINE_BYTES: Final = 1 << 14
-"""Most bytes of a line: fifty times a row of counts."""
+_CUT_OFF: Final = "{} is damaged: its end is missing, and only its whole arrays are read; copy it again"
 MOST_NPZ_BYTES: Final = 1 << 31
 """Most bytes of the arrays that are read: a day of one sensor at 100 Hz."""
-RATES_HZ: Final = (1e-3, 1e5)
-"""Lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0."""
-
-
-def csv_header(taxel_count: int) -> tuple[str, ...]:
-    """Return the columns of so many taxels."""
-    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
-
-
-CSV_HEADER: Final = csv_header(USPA44.taxel_count)
-_CSV_PADS: Final = {len(AXES) * pad.taxel_count: pad for pad in PADS}
-"""Pads by the number of columns of a CSV, which does not name its pad."""
-_META_NAME: Final = "meta_data.csv"
-_META_RATE: Final = "frequency_hz"
-_A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
-_WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format.
+    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format, and a folder is a rosbag2.
 
     Raises:
         RecordingError: the file cannot be read, or is not a recording.
     """
     path = Path(path)
-    readers = {".csv": _load_csv, ".npz": _load_npz, ".mcap": _load_mcap}
-    reader = readers.get(path.suffix.lower())
+    readers = {".csv": load_csv, ".npz": _load_npz, ".mcap": _load_mcap}
+    reader = _load_mcap if path.is_dir() else readers.get(path.suffix.lower())
     if reader is None:
-        raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
+        raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap, or is a folder of a rosbag2")
     try:
         recording = reader(path)
     except OSError as error:
@@ -76,119 +56,14 @@ def load_recording(path: str | Path) -> Recording:
     return replace(recording, notes=(*recording.notes, f"{path} was recorded from an emulated sensor"))
 
 
-def _load_csv(path: Path) -> Recording:
-    rows = _csv_rows(path)
-    header = next(rows, None)
-    if header is None:
-        _refuse(path, 1, "an empty file", "a header and rows of counts")
-    poses = CsvPoses([name.strip() for name in header])
-    counts_end = len(header) - poses.columns
-    pad = _pad_of_header(path, header[:counts_end])
-    values = array("i")  # a list of rows would take ten times the memory of the file
-    for line, row in enumerate(rows, 2):
-        if len(row) != len(header):
-            _refuse(path, line, f"{len(row)} columns", f"{len(header)}")
-        values.extend(_count(path, line, cell.strip()) for cell in row[:counts_end])
-        wrong = poses.add(line - 2, row[counts_end:])
-        if wrong is not None:
-            _refuse(path, line, f"'{wrong[:20]}'", "a number in each column of a pose, or none in all of them")
-    if not values:
-        _refuse(path, 2, "the end of the file", "a row of counts")
-    taxels = np.frombuffer(values, dtype=np.int32).reshape(-1, pad.rows, pad.cols, len(AXES))
-    counts = np.ascontiguousarray(taxels.transpose(0, 3, 1, 2))
-    rate_hz = _meta_rate_hz(path.with_name(_META_NAME))
-    try:
-        return Recording(path, (Track(path.stem, counts, time_ns=None),), rate_hz, poses=poses.poses())
-    except ValueError as error:
-        raise RecordingError(f"{path}: its poses: {error}") from error
-
-
-def _csv_rows(path: Path) -> Iterator[list[str]]:
-    """Yield the rows, each from one line."""
-    read_bytes = 0
-    with path.open("rb") as file:
-        for number in itertools.count(1):
-            line = file.readline(LONGEST_CSV_LINE_BYTES + 1)
-            read_bytes += len(line)
-            if not line:
-                return
-            if len(line) > LONGEST_CSV_LINE_BYTES:
-                _refuse(path, number, f"a line longer than {LONGEST_CSV_LINE_BYTES} bytes", "a row of counts")
-            if read_bytes > MOST_CSV_BYTES:
-                _refuse(path, number, f"a file larger than {MOST_CSV_BYTES:,} bytes", "a smaller one: cut it in parts")
-            yield _csv_row(path, number, line)
-
-
-def _csv_row(path: Path, number: int, line: bytes) -> list[str]:
-    try:
-        text = line.decode("utf-8-sig" if number == 1 else "utf-8")
-    except UnicodeDecodeError as error:
-        _refuse(path, number, f"byte {line[error.start]:#04x}", "UTF-8 text")
-    # A truncated number is still a number: only the line end shows that the last row is whole.
-    if not text.endswith("\n"):
-        _refuse(path, number, "a last line without its end", "a whole file: copy it again")
-    try:
-        return next(csv.reader([text], strict=True))
-    except csv.Error as error:
-        raise RecordingError(f"{path}, line {number}: not CSV: {error}") from error
-
-
-def _pad_of_header(path: Path, header: list[str]) -> SensorGeometry:
-    names = tuple(name.strip() for name in header)
-    pad = _CSV_PADS.get(len(names), USPA44)
-    expected = csv_header(pad.taxel_count)
-    if sorted(names) != sorted(expected):
-        text = f"{len(expected)}: {_header_text(expected)}"
-        _refuse(path, 1, f"{len(names)} columns: {', '.join(names[:4])[:60]}, ...", text)
-    if names != expected:
-        _refuse(
-            path,
-            1,
-            f"columns {', '.join(names[:4])}, ...",
-            f"x, y, z of each taxel side by side: {_header_text(expected)}",
-        )
-    return pad
-
-
-def _header_text(header: tuple[str, ...]) -> str:
-    return f"{', '.join(header[:4])}, ..., {header[-1]}"
-
-
-def _count(path: Path, line: int, cell: str) -> int:
-    # Not float(): it takes nan, 1e4 and 1_0 as well.
-    whole = int(cell.partition(".")[0]) if _WHOLE_NUMBER.fullmatch(cell) else None
-    if whole is None or whole > HIGHEST_COUNT:
-        _refuse(path, line, f"'{cell[:20]}'", f"a whole number 0..{HIGHEST_COUNT}")
-    return whole
-
-
-def _meta_rate_hz(path: Path) -> float | None:
-    if not path.is_file():
-        return None
-    rows = list(itertools.islice(_csv_rows(path), 2))
-    if not rows or _META_RATE not in rows[0]:
-        return None
-    column = rows[0].index(_META_RATE)
-    cell = rows[1][column] if len(rows) > 1 and len(rows[1]) > column else ""
-    try:
-        rate_hz = float(cell)
-    except ValueError:
-        rate_hz = 0.0
-    if not _is_rate(rate_hz):
-        _refuse(path, 2, f"{_META_RATE} '{cell[:20]}'", _A_RATE)
-    return rate_hz
-
-
-def _is_rate(rate_hz: float) -> bool:
-    return RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
-
-
-def _refuse(path: Path, line: int, got: str, expected: str) -> NoReturn:
-    raise RecordingError(f"{path}, line {line}: {got}, expected {expected}")
-
-
 def _load_npz(path: Path) -> Recording:
-    arrays = _npz_arrays(path)
+    notes: list[str] = []
+    names = (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz", "mountings")
+    arrays = _npz_arrays(path, names, lambda: notes.append(_CUT_OFF.format(path)))
+    for name in _NPZ_REQUIRED:
+        if name not in arrays:
+            lost = f"; {notes[0]}" if notes else ""
+            raise RecordingError(f"{path}, array '{name}': missing, expected what the npz sink writes{lost}")
     form, version = arrays["format"], arrays["version"]
     if str(form) != NPZ_FORMAT:
         _refuse_array(path, "format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
@@ -209,8 +84,10 @@ def _load_npz(path: Path) -> Recording:
         path,
         tuple(tracks),
         _npz_rate_hz(path, arrays.get("rate_hz")),
+        mountings=_npz_mountings(path, arrays.get("mountings"), tracks),
+        notes=tuple(notes),
         origin=_npz_origin(path, arrays, len(counts)),
-        poses=npz_poses(path, arrays),
+        poses=None if notes and NPZ_POSES[1] not in arrays else npz_poses(path, arrays),
     )
 
 
@@ -232,10 +109,7 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
     )
 
     path = recording.path
-    try:
-        arrays = read_npz(path, ("sensor", *_NPZ_BASELINE), MOST_NPZ_BYTES)
-    except NpzError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    arrays = _npz_arrays(path, ("sensor", *_NPZ_BASELINE))
     if not all(name in arrays for name in _NPZ_BASELINE):
         return {}
     ids, counts, ages_s = (arrays[name] for name in _NPZ_BASELINE)
@@ -259,15 +133,13 @@ def npz_baselines(recording: Recording) -> "dict[str, Baseline]":
     return baselines
 
 
-def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _npz_arrays(
+    path: Path, names: Sequence[str], damaged: Callable[[], object] = lambda: None
+) -> dict[str, NDArray[Any]]:
     try:
-        arrays = read_npz(path, (*_NPZ_REQUIRED, *_NPZ_ORIGINS, *NPZ_POSES, "rate_hz"), MOST_NPZ_BYTES)
+        return read_npz(path, names, MOST_NPZ_BYTES, damaged)
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
-    for name in _NPZ_REQUIRED:
-        if name not in arrays:
-            raise RecordingError(f"{path}, array '{name}': missing, expected what the npz sink writes")
-    return arrays
 
 
 def _npz_sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:
@@ -278,6 +150,18 @@ def _npz_sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:
         if not is_sensor_name(name):
             _refuse_array(path, "sensor", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
     return names
+
+
+def _npz_mountings(path: Path, text: NDArray[Any] | None, tracks: Sequence[Track]) -> "dict[str, Mounting]":
+    if text is None:
+        return {}
+    try:
+        texts = json.loads(str(text))
+        return {
+            one.sensor: read_mounting(texts[one.sensor], one.counts[0, 0].size) for one in tracks if one.sensor in texts
+        }
+    except (ValueError, TypeError, RecursionError) as error:
+        _refuse_array(path, "mountings", " ".join(str(error).split())[:120], "JSON as the npz sink writes it")
 
 
 def _npz_times(path: Path, sensor: str, times: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -318,8 +202,8 @@ def _npz_origin(path: Path, arrays: Mapping[str, NDArray[Any]], scans: int) -> L
 def _npz_rate_hz(path: Path, rate: NDArray[Any] | None) -> float | None:
     if rate is None:
         return None
-    if rate.shape or rate.dtype.kind not in "iuf" or not _is_rate(float(rate)):
-        _refuse_array(path, "rate_hz", str(rate)[:40], _A_RATE)
+    if rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate)):
+        _refuse_array(path, "rate_hz", str(rate)[:40], A_RATE)
     return float(rate)
 
 

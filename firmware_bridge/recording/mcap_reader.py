@@ -1,35 +1,43 @@
 """Recordings in MCAP files, as the sink mcap: writes them; also if the sink was killed while it wrote.
 
-A file is not trusted: records are read one by one, each up to a limit, and a chunk is unpacked up to its stated size.
 Only scans and baselines are kept; patterns are skipped, since they are computed again.
 """
 
 import json
 import os
+import re
 import struct
-import zlib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
+from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import CdrError, RecordingError
-from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
+from firmware_bridge.recording.mcap_records import BROKEN, CutOffError, DamageError, records, short
+from firmware_bridge.recording.mounting_text import read_mounting
 from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.pose_messages import POSE, decode_pose
-from firmware_bridge.recording.scan_messages import SCAN_NAME, baseline_type, decode_baseline, decode_scan, scan_type
+from firmware_bridge.recording.scan_messages import (
+    BASELINE_NAME,
+    SCAN_NAME,
+    SENSOR,
+    baseline_type,
+    decode_baseline,
+    decode_scan,
+    scan_type,
+)
 from firmware_bridge.recording.tracks import (
     GEOMETRY_METADATA,
     MOST_SENSORS,
@@ -41,33 +49,19 @@ from firmware_bridge.recording.tracks import (
 )
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import VendorReading, is_sensor_name
+from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
-MOST_RECORD_BYTES: Final = 1 << 25
-"""Most bytes of one record, and of a chunk when unpacked: writers make chunks of one to a few megabytes."""
-MOST_WINDOW_BYTES: Final = 1 << 25
-"""Largest window of zstd, in bytes."""
 MOST_KEPT_BYTES: Final = 1 << 31
 """Most bytes of the scans in memory: a day of one sensor at 100 Hz."""
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
 _POSE_BYTES: Final = 64
+MOST_BAG_BYTES: Final = 1 << 20
+"""Most bytes of a bag's metadata.yaml."""
 MOST_SHOWN_TOPICS: Final = 10
 LONGEST_SHOWN: Final = 60
-_RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
-_BROKEN: Final = (
-    *(struct.error, McapError, zstandard.ZstdError, ValueError, OverflowError, MemoryError),
-    *(EOFError, RuntimeError),  # of lz4
-)
-
-
-class _DamageError(Exception):
-    """A record cannot be read, so the rest of the file is not read either."""
-
-
-class _CutOffError(_DamageError):
-    """The file ends too early."""
 
 
 class _Topic(NamedTuple):
@@ -88,29 +82,49 @@ class _Lane:
 
 
 def load_mcap(path: Path) -> Recording:
-    """Read an MCAP file; one without an end up to its last whole record, which `notes` then report.
+    """Read an MCAP file, or those of a rosbag2 folder in order; one without an end up to its last whole record.
 
     Raises:
         RecordingError: it is no MCAP file, or holds no scans that edge-sr recorded.
         OSError: the file cannot be read.
     """
     reading = _Reading(path)
-    with path.open("rb") as file:
-        if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise RecordingError(f"{path}: not an MCAP file: it does not begin as one")
-        try:
-            for opcode, data in _records(file):
-                reading.take(opcode, data)
-        except _CutOffError as end:
-            reading.broken_off(str(end))
-        except _DamageError as damage:
-            reading.damaged(str(damage), os.fstat(file.fileno()).st_size - file.tell())
+    for one in _bag_files(path, reading) if path.is_dir() else [path]:
+        with one.open("rb") as file:
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise RecordingError(f"{one}: not an MCAP file: it does not begin as one")
+            reading.begin(one)
+            try:
+                for opcode, data in records(file):
+                    reading.take(opcode, data)
+            except CutOffError as end:
+                reading.broken_off(str(end))
+            except DamageError as damage:
+                reading.damaged(str(damage), os.fstat(file.fileno()).st_size - file.tell())
     return reading.recording()
+
+
+def _bag_files(folder: Path, reading: "_Reading") -> list[Path]:
+    """Return the MCAP files of a folder, in the order of its metadata.yaml, else by the numbers in their names."""
+    there = sorted(folder.glob("*.mcap"), key=lambda path: [int(one) for one in re.findall("[0-9]+", path.stem)])
+    if not there:
+        names = ", ".join(ascii(path.name) for path in sorted(folder.iterdir())[:MOST_SHOWN_TOPICS])
+        remedy = "name a file, or convert a bag of another storage with `ros2 bag convert` to mcap"
+        raise RecordingError(f"{folder}: a folder with {names or 'nothing in it'}, expected .mcap files: {remedy}")
+    about = folder / "metadata.yaml"
+    if not about.is_file():
+        return there
+    text = read_bounded(about, MOST_BAG_BYTES).decode(errors="replace")
+    named = [folder / name for name in re.findall(r"^\s*- [\"']?([^/\"'\n]+\.mcap)[\"']?\s*$", text, re.MULTILINE)]
+    order = [path for path in dict.fromkeys(named) if path in there]
+    if missing := [path.name for path in named if path not in there]:
+        reading.note(f"{folder}: its metadata.yaml names {', '.join(map(ascii, missing))[:100]}, which is not there")
+    return order or there
 
 
 class _Reading:
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._whole = self._path = path
         self._schemas: dict[int, MessageType | None] = {}
         self._topics: dict[int, _Topic] = {}
         self._lanes: dict[str, _Lane] = {}
@@ -118,11 +132,24 @@ class _Reading:
         self._latest: dict[str, Baseline] = {}
         self._mountings: dict[str, Mounting] = {}
         self._geometry = USPA44  # for files that name no geometry
+        self._named = False  # whether metadata or a message names it
+        self._sized = False  # whether a message's definition holds its number of taxels
+        self._facts: dict[str, str] = {}
+        self._described = False  # whether there are metadata of edge-sr
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._poses = PoseRows()
         self._notes: list[str] = []
         self._origin: Literal["device", "emulated"] | None = None
+
+    def begin(self, path: Path) -> None:
+        """Go on with a file: its numbers of schemas and channels are its own."""
+        self._path = path
+        self._schemas, self._topics = {}, {}
+
+    def note(self, text: str) -> None:
+        """Add a remark for the user."""
+        self._notes.append(text)
 
     def take(self, opcode: int, data: memoryview) -> None:
         """Process one record, from a chunk or between chunks."""
@@ -138,17 +165,22 @@ class _Reading:
                 kind = self._schemas.get(channel.schema_id) if channel.message_encoding == "cdr" else None
                 self._topics[channel.id] = _Topic(channel.topic[:LONGEST_SHOWN], kind)
             elif opcode == Opcode.METADATA:
+                self._described = True
                 self._take_metadata(Metadata.read(stream))
-        except _BROKEN as error:
+        except BROKEN as error:
             if isinstance(error, RecordingError):
                 raise
-            raise _DamageError(f"a record that cannot be read ({_short(error)})") from error
+            raise DamageError(f"a record that cannot be read ({short(error)})") from error
 
     def _take_schema(self, schema: Schema) -> None:
+        sized = re.search(rb"\[([0-9]{1,4})\] counts ", schema.data)
+        if schema.name in (SCAN_NAME, BASELINE_NAME) and sized is not None and not self._named:
+            self._geometry = _pad_with(int(sized[1]) // len(AXES))
         taxels = self._geometry.taxel_count
-        known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels), POSE)}.get(schema.name)
+        known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels), POSE, SENSOR)}.get(schema.name)
         if known is not None and (schema.encoding, schema.data) != ("ros2msg", known.definition.encode()):
             raise RecordingError(f"{self._path}: its {known.name} is of another release of edge-sr than this one")
+        self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
         self._schemas[schema.id] = known
 
     def _take_metadata(self, metadata: Metadata) -> None:
@@ -160,15 +192,13 @@ class _Reading:
             return
         sensor = metadata.metadata.get("sensor", "")
         try:
-            fields = json.loads(metadata.metadata["mounting"])
-            order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
-            if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
-                raise ValueError("not whole numbers")
-            mounting = Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), self._geometry.taxel_count)
-        except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
-            raise RecordingError(f"{self._path}: no mounting of sensor {sensor[:20]!r}: {_short(error)}") from error
-        if not is_sensor_name(sensor) or len(self._mountings) >= MOST_SENSORS:
+            mounting = read_mounting(metadata.metadata.get("mounting", ""), self._geometry.taxel_count)
+        except ValueError as error:
+            raise RecordingError(f"{self._path}: no mounting of sensor {sensor[:20]!r}: {short(error)}") from error
+        if not is_sensor_name(sensor) or len(self._mountings) > MOST_SENSORS:
             raise RecordingError(f"{self._path}: a mounting of sensor {sensor[:20]!r}, expected those of its sensors")
+        if self._mountings.get(sensor, mounting) != mounting:
+            raise RecordingError(f"{self._path}: two mountings of sensor {sensor!r}, expected one: cut it in parts")
         self._mountings[sensor] = mounting
 
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
@@ -177,25 +207,44 @@ class _Reading:
             sizes = (geometry.rows, geometry.cols)
             if not all(type(size) is int and size > 0 for size in sizes) or not is_sensor_name(geometry.name):
                 raise ValueError("no grid of taxels")
-            if self._schemas and geometry.taxel_count != self._geometry.taxel_count:
-                raise ValueError("it stands after the first message's definition")
+            if self._sized and geometry.taxel_count != self._geometry.taxel_count:
+                raise ValueError(f"{geometry.taxel_count} taxels, and {self._geometry.taxel_count} in its messages")
             if geometry.taxel_count > MOST_TAXELS:
                 raise ValueError(f"{geometry.taxel_count} taxels, expected at most {MOST_TAXELS}")
         except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-            raise RecordingError(f"{self._path}: no geometry of its sensors: {_short(error)}") from error
-        self._geometry = geometry
+            raise RecordingError(f"{self._path}: no geometry of its sensors: {short(error)}") from error
+        self._geometry, self._named = geometry, True
+
+    def _take_facts(self, data: memoryview) -> None:
+        fields = SENSOR.decode(data)
+        sensor, text = fields["sensor"], fields["facts"]
+        if self._facts.get(sensor) == text:
+            return
+        try:
+            facts = json.loads(text)
+            for name, values in facts.items():
+                self._take_metadata(Metadata(name, {str(key): str(value) for key, value in values.items()}))
+        except (ValueError, AttributeError, RecursionError) as error:
+            if isinstance(error, RecordingError):
+                raise
+            raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
+        if len(self._facts) > MOST_SENSORS:
+            raise CdrError(f"facts of more than {MOST_SENSORS} sensors")
+        self._facts[sensor] = text
 
     def _take_message(self, data: memoryview) -> None:
         try:
             channel, _, log_ns, _ = _MESSAGE.unpack_from(data)
         except struct.error as error:
-            raise _DamageError("a message that is cut off") from error
+            raise DamageError("a message that is cut off") from error
         topic = self._topics.get(channel)
         if topic is None or topic.kind is None:
             return
         try:
             if topic.kind.name == SCAN_NAME:
                 self._take_scan(data[_MESSAGE.size :], log_ns)
+            elif topic.kind is SENSOR:
+                self._take_facts(data[_MESSAGE.size :])
             elif topic.kind is POSE:
                 self._take_pose(decode_pose(data[_MESSAGE.size :]))
             else:
@@ -205,6 +254,8 @@ class _Reading:
 
     def _take_scan(self, data: memoryview, log_ns: int) -> None:
         scan = decode_scan(data, self._geometry)
+        if scan.frame == f"emulated/{scan.sensor}":
+            self._origin = "emulated"
         lane = self._lanes.get(scan.sensor)
         if lane is None:
             if len(self._lanes) == MOST_SENSORS:
@@ -244,7 +295,7 @@ class _Reading:
         before = self._latest.get(sensor)
         if before is None and len(self._latest) == MOST_SENSORS:
             raise RecordingError(f"{self._path}: baselines of more than {MOST_SENSORS} sensors")
-        if sensor not in self._lanes:
+        if sensor not in self._lanes or (before is None and self._was_used(baseline)):
             self._baselines[sensor] = baseline
         elif before is not None and before.id != baseline.id and len(self._notes) < MOST_SENSORS:
             self._notes.append(
@@ -252,6 +303,11 @@ class _Reading:
                 f"{baseline.id}); played again it keeps to the baseline of its beginning"
             )
         self._latest[sensor] = baseline
+
+    def _was_used(self, baseline: Baseline) -> bool:
+        """Return True if a sensor's first scan was made with it: a part of a file may have it after that, repeated."""
+        first_unix_ns = self._lanes[baseline.sensor].times_ns[0] + (self._offset_ns or 0)
+        return baseline.created_unix_s < first_unix_ns / NS_PER_S
 
     def broken_off(self, why: str) -> None:
         """Keep the records so far and note that the file ends early."""
@@ -266,9 +322,15 @@ class _Reading:
             raise RecordingError(f"{self._path}: no scans that edge-sr recorded{self._instead()}")
         tracks = tuple(_track(sensor, lane, self._geometry) for sensor, lane in self._lanes.items())
         mountings = {name: one for name, one in self._mountings.items() if name in self._lanes}
+        bare = [] if self._described else sorted(self._lanes.keys() - self._facts.keys())
+        if bare:
+            self._notes.append(
+                f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
+                "copies a part of it: its axes and gains are those of the id map, unless --sensor FILE gives others"
+            )
         baselines = {name: one for name, one in self._baselines.items() if name in self._lanes}
         return Recording(
-            self._path,
+            self._whole,
             tracks,
             None,
             baselines,
@@ -289,68 +351,11 @@ class _Reading:
         return f"; its topics are {', '.join(map(repr, names[:MOST_SHOWN_TOPICS]))}{more}"
 
 
-def _records(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
-    """Yield each record up to the end of the data, those in chunks one by one; lengths are checked by its size."""
-    size_bytes = os.fstat(file.fileno()).st_size
-    while True:
-        at = file.tell()
-        head = file.read(_RECORD.size)
-        if len(head) < _RECORD.size:
-            raise _CutOffError(f"without an end, at byte {at}")
-        opcode, length = _RECORD.unpack(head)
-        if length > size_bytes - at - _RECORD.size:
-            raise _CutOffError(f"within a record, at byte {at}")
-        if opcode == Opcode.DATA_END:
-            return
-        if opcode not in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-            file.seek(length, os.SEEK_CUR)
-            continue
-        if length > MOST_RECORD_BYTES:
-            raise _DamageError(f"at byte {at}, a record of {length:,} bytes, expected at most {MOST_RECORD_BYTES:,}")
-        data = memoryview(file.read(length))
-        if opcode != Opcode.CHUNK:
-            yield opcode, data
-            continue
-        try:
-            unpacked = _unpacked(Chunk.read(ReadDataStream(BytesIO(data))))
-        except _BROKEN as error:
-            raise _DamageError(f"at byte {at}, a chunk that cannot be unpacked: {_short(error)}") from error
-        yield from _records_of(unpacked, at)
-
-
-def _records_of(chunk: bytes, at: int) -> Iterator[tuple[int, memoryview]]:
-    view, position = memoryview(chunk), 0
-    while position < len(chunk):
-        if len(chunk) - position < _RECORD.size:
-            raise _DamageError(f"at byte {at}, a chunk that is cut off")
-        opcode, length = _RECORD.unpack_from(chunk, position)
-        position += _RECORD.size
-        if length > len(chunk) - position:
-            raise _DamageError(f"at byte {at}, a chunk that is cut off")
-        yield opcode, view[position : position + length]
-        position += length
-
-
-def _unpacked(chunk: Chunk) -> bytes:
-    size_bytes = chunk.uncompressed_size
-    if size_bytes > MOST_RECORD_BYTES:
-        raise ValueError(f"{size_bytes:,} bytes, expected at most {MOST_RECORD_BYTES:,}")
-    if chunk.compression == "zstd":
-        unpacker = zstandard.ZstdDecompressor(max_window_size=MOST_WINDOW_BYTES)
-        data = unpacker.stream_reader(chunk.data).read(size_bytes + 1)
-    elif chunk.compression == "lz4":
-        import lz4.frame
-
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size_bytes + 1)
-    elif not chunk.compression:
-        data = chunk.data
-    else:
-        raise ValueError(f"compressed by {chunk.compression[:20]!r}, expected zstd, lz4 or nothing")
-    if len(data) != size_bytes:
-        raise ValueError(f"it does not hold the {size_bytes:,} bytes that it states")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("its check sum is wrong")
-    return data
+def _pad_with(taxels: int) -> SensorGeometry:
+    """Return the pad with so many taxels, for a file that names none yet."""
+    if not 0 < taxels <= MOST_TAXELS:
+        return USPA44
+    return next((pad for pad in PADS if pad.taxel_count == taxels), None) or pad_of(1, taxels)
 
 
 def _track(sensor: str, lane: _Lane, geometry: SensorGeometry) -> Track:
@@ -373,7 +378,3 @@ def _own(vendor: VendorReading) -> VendorReading:
     """Return a copy, since a view would keep the whole chunk in memory."""
     arrays = (vendor.newtons, vendor.temperature_k, vendor.ups_hz)
     return VendorReading(*(None if array is None else array.copy() for array in arrays))
-
-
-def _short(error: BaseException) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__

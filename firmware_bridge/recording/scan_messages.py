@@ -1,4 +1,4 @@
-"""Messages of scans and baselines: all the data needed to play a recording again, bit for bit. No I/O."""
+"""Messages of scans, baselines and sensors: all the data needed to play a recording again, bit for bit. No I/O."""
 
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -17,6 +17,7 @@ from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
 
 SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"
 BASELINE_NAME: Final = "tactile_edge_sr/msg/Baseline"
+SENSOR_NAME: Final = "tactile_edge_sr/msg/Sensor"
 # The reader takes a definition by its text, so not even a comment in it may change: earlier recordings have it.
 _SCAN_TEXT: Final = """\
 # One reading of all taxels of one sensor, raw.
@@ -43,6 +44,12 @@ int32 scans                     # that it is the median of
 float64 age_s                   # NaN where a clock was wrong
 float32[{counts}] counts              # [axis x, y, z][row][column]; NaN where a taxel was not zeroed
 """
+_SENSOR_TEXT: Final = """\
+# What the scans of a sensor mean, repeated, since tools copy messages alone, or those from some time on.
+std_msgs/Header header
+string sensor
+string facts                    # JSON: by name, what the file's metadata records hold as well, and units
+"""
 
 
 @lru_cache
@@ -59,11 +66,13 @@ def baseline_type(taxel_count: int) -> MessageType:
 
 SCAN: Final = scan_type(USPA44.taxel_count)
 BASELINE: Final = baseline_type(USPA44.taxel_count)
+SENSOR: Final = MessageType(SENSOR_NAME, _SENSOR_TEXT, STD_HEADER)
 
 
 class RecordedScan(NamedTuple):
     """Content of a scan message, checked; numbers as in `scan_type`."""
 
+    frame: str
     sensor: str
     number: int
     time_ns: int
@@ -125,7 +134,7 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
     }
     known = any(array is not None for array in vendor.values())
     return RecordedScan(
-        *(sensor, number, fields["time_ns"], fields["device_time_ns"], fresh, renewed),
+        *(fields["header"]["frame_id"], sensor, number, fields["time_ns"], fields["device_time_ns"], fresh, renewed),
         counts,
         VendorReading(**vendor) if known else None,
     )
@@ -170,6 +179,11 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
     _check(bool(inside.all()), "counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
     counts.setflags(write=False)
     return Baseline(sensor, counts, created_unix_s, scans, "file", fields["id"])
+
+
+def encode_sensor(sensor: str, frame: str, facts: str, unix_ns: int) -> bytes:
+    """Encode what the scans of a sensor mean, as JSON, at `unix_ns` [ns] since 1970."""
+    return SENSOR.encode({"header": {"stamp": stamp(unix_ns), "frame_id": frame}, "sensor": sensor, "facts": facts})
 
 
 def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:

@@ -26,6 +26,9 @@ SOURCE_METADATA: Final = "source"
 HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64
 """Most sensors of a recording; one wire can have sixteen."""
+RATES_HZ: Final = (1e-3, 1e5)
+"""Lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0."""
+A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,3 +102,8 @@ def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:
     if "emulated" in found:
         return "emulated"
     return "device" if found == {"device"} else None
+
+
+def is_rate(rate_hz: float) -> bool:
+    """Return True if scans can come at this rate in [Hz]."""
+    return RATES_HZ[0] <= rate_hz <= RATES_HZ[1]

@@ -17,7 +17,7 @@ import pytest
 from bridge_samples import write_recording
 from edge_samples import BASELINE, ROOT, make_scan, write_model
 from mcap.exceptions import EndOfFile
-from mcap.records import Message
+from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap_samples import SURE, TURNED, make_results, messages_of, odd_scans, record_into
 
@@ -46,10 +46,12 @@ def environment():
 
 def scans_on_disk(path):
     """Return the scans that the public package reads, front to back, from a file that has no end yet."""
-    seen = []
+    seen, own = [], set()
     with suppress(FileNotFoundError, EndOfFile), path.open("rb") as file:
         for record in StreamReader(file).records:
-            if isinstance(record, Message) and record.channel_id == 1:
+            if isinstance(record, Channel) and record.topic.endswith("/scan"):
+                own.add(record.id)
+            if isinstance(record, Message) and record.channel_id in own:
                 seen.append(decode_scan(record.data))
     return seen
 

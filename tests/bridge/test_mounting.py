@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.registry import open_source
-from firmware_bridge.recording.formats import CSV_HEADER, csv_header
+from firmware_bridge.recording.csv_reader import CSV_HEADER, csv_header
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
 from firmware_bridge.scans.scan import ABSENT, VendorReading

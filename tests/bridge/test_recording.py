@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.recording.formats import CSV_HEADER, load_recording
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.formats import load_recording
 
 HEADER = ",".join(CSV_HEADER) + "\n"
 
@@ -89,24 +91,18 @@ def test_csv_other_cells(tmp_path, written):
         load_recording(path)
 
 
-def axis_grouped() -> str:
-    return ",".join(f"txl{taxel}_{axis}" for axis in "xyz" for taxel in range(1, 17)) + "\n"
-
-
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
         ("", 1, "empty"),
-        (HEADER, 2, "row of counts"),
-        (axis_grouped() + row(0), 1, "side by side"),
         (row(0), 1, "48: txl1_x"),
-        ("a,b\n" + row(0), 1, "2 columns"),
-        (HEADER + row(0) + row(1).replace(",", "", 1), 3, "47 columns"),
+        ("a,b\n" + row(0), 1, "2 columns: a, b, expected .* txl1_x"),
+        (HEADER.replace("txl16_z", "txl17_z") + row(0), 1, "48: txl1_x"),
+        (HEADER.replace("txl16_z", "txl16_y") + row(0), 1, "two columns 'txl16_y'"),
+        (HEADER.strip() + ",pose_x\n" + row(0).strip() + ",1\n", 1, "pose_x_mm"),
         (HEADER + row(0).strip() + ",1\n", 2, "49 columns"),
-        (HEADER + row(0) + "\n", 3, "0 columns"),
-        (HEADER + row(0) + row(1)[:100], 3, "without its end"),
-        (HEADER + row(0) + row(1)[:-3], 3, "without its end"),
-        (HEADER.encode() + row(0).encode() + b"\xff\n", 3, "UTF-8"),
+        (HEADER + '"1\n', 2, "not CSV"),
+        (HEADER.encode("utf-16-le") + row(0).encode("utf-16-le"), 1, "txl1_x"),
     ],
 )
 def test_csv_that_is_none(tmp_path, text, line, words):
@@ -114,14 +110,150 @@ def test_csv_that_is_none(tmp_path, text, line, words):
         load_recording(write_csv(tmp_path, text))
 
 
-def test_csv_with_a_byte_order_mark_and_windows_lines(tmp_path):
-    text = "\ufeff" + (HEADER + row(0)).replace("\n", "\r\n")
-    assert len(load_recording(write_csv(tmp_path, text)).tracks[0].counts) == 1
+def test_nothing_of_a_header_reaches_a_terminal_as_a_command(tmp_path):
+    with pytest.raises(RecordingError) as refused:
+        load_recording(write_csv(tmp_path, "\x1b]0;mine\x07,\x9b2J\n"))
+    recording = load_recording(write_csv(tmp_path, with_columns("\x1b[2J,t\x1b", ["1,0", "2,10"])))
+    assert all(text.isprintable() for text in (str(refused.value), *recording.notes)) and len(recording.notes) == 2
 
 
-def test_csv_with_an_open_quote(tmp_path):
-    with pytest.raises(RecordingError, match="not CSV"):
-        load_recording(write_csv(tmp_path, HEADER + '"1\n'))
+def test_csv_without_a_row(tmp_path):
+    with pytest.raises(RecordingError, match=r"finger\.csv, .*expected a row of counts"):
+        load_recording(write_csv(tmp_path, HEADER))
+
+
+@pytest.mark.parametrize(
+    "tail",
+    [
+        row(1).replace(",", "", 1),
+        row(1)[:100],
+        row(1)[:-3],
+        row(1)[:-5],
+        "\0" * 100,
+        "\0" * 100_000,
+        row(1)[:50] + "\0" * 50 + row(1)[100:],
+        "\ufffd\n",
+        '"1\n',
+    ],
+)
+def test_a_damaged_tail_of_a_csv_costs_the_tail(tmp_path, tail):
+    recording = load_recording(write_csv(tmp_path, HEADER + row(0) + row(0) + tail))
+    assert len(recording.tracks[0].counts) == 2
+    (note,) = recording.notes
+    assert "finger.csv is damaged, line 4: " in note and "only the 2 scans before that are read" in note
+
+
+def by_axes(text: str) -> str:
+    """Return the lines of a CSV with all columns of x first, then those of y and z."""
+    lines = [line.split(",") for line in text.splitlines()]
+    return "".join(",".join(cell for axis in range(3) for cell in line[axis::3]) + "\n" for line in lines)
+
+
+PLAIN = HEADER + row(0) + row(7)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PLAIN[:-1],
+        PLAIN + "\n",
+        PLAIN + "  \r\n" + "," * 47 + "\n\n",
+        HEADER + "\n" + row(0) + "\n\n" + row(7),
+        PLAIN.replace(",", ";"),
+        PLAIN.replace(",", ";").replace(".0", ",0"),
+        PLAIN.replace(",", "\t"),
+        PLAIN.replace(",", " ; "),
+        "sep=,\n" + PLAIN,
+        "sep=;\r\n" + PLAIN.replace(",", ";").replace("\n", "\r\n"),
+        '"sep=|"\n' + PLAIN.replace(",", "|"),
+        PLAIN.replace("\n", ",\n"),
+        PLAIN.replace("\n", ",,\n"),
+        HEADER.replace("\n", ",\n") + row(0) + row(7),
+        PLAIN.replace("\n", "\r\n"),
+        PLAIN.replace("\n", "\r"),
+        "\ufeff" + PLAIN.replace("\n", "\r\n"),
+        "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in PLAIN.splitlines()),
+        PLAIN.replace(",", "\t").encode("utf-16"),
+        PLAIN.upper(),
+        by_axes(PLAIN),
+    ],
+)
+def test_csv_as_programs_write_it(tmp_path, text):
+    recording = load_recording(write_csv(tmp_path, text))
+    (track,) = recording.tracks
+    assert recording.rate_hz is None and recording.notes == ()
+    assert (track.counts == load_recording(write_csv(tmp_path, PLAIN, "plain.csv")).tracks[0].counts).all()
+
+
+def with_columns(names: str, cells: list[str]) -> str:
+    """Return a CSV with columns before those of the taxels."""
+    rows = zip([names, *cells], [HEADER, *(row(number) for number in range(len(cells)))], strict=True)
+    return "".join(f"{before},{line}" for before, line in rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "rate_hz"),
+    [
+        ("time", ["0.000", "0.010", "0.020", "0.031"], 100),
+        ("t", ["0", "10", "20", "31"], 100),
+        ("timestamp", ["1700000000000000000", "1700000000010000000", "1700000000020000000"], 100),
+        ("Timestamp", ["1700000000.01", "1700000000.02", "1700000000.03"], 100),
+        ("stamp", ["5000", "15000", "25000"], 100),
+        ("time [ms]", ["0", "1", "2"], 1000),
+        ("time_ms", ["0", "1000", "2000"], 1),
+        ("t (\u00b5s)", ["0", "10000", "20000"], 100),
+        ("time_ns", ["0", "10000000", "20000000"], 100),
+        ("datetime", ["2026-01-02 03:04:05.00", "2026-01-02 03:04:05.01", "2026-01-02T03:04:05.02"], 100),
+        ("time", ["0", "0", "0", "40", "40", "40", "40", "80", "80"], 100),
+        ("time", [f"{n / 100 + 30 * (n > 10):.2f}" for n in range(20)], 100),
+        ("t", ["0", "1", "2", "3"], None),
+        ("time", ["0", "30", "60"], 33),
+        ("time", ["0", "600", "1200"], 1667),
+        ("time", ["0", "0.4", "0.8"], None),
+        ("time", ["0.03", "0.02", "0.01"], None),
+        ("time", ["0", "", "0.02"], None),
+        ("time", ["00:00.0", "00:00.1", "00:00.2"], None),
+        ("time", ["5", "5", "5"], None),
+        ("time", ["5"], None),
+    ],
+)
+def test_the_rate_of_a_csv_comes_from_its_times(tmp_path, name, times, rate_hz):
+    recording = load_recording(write_csv(tmp_path, with_columns(name, times)))
+    assert len(recording.tracks[0].counts) == len(times)
+    assert (recording.rate_hz is None) if rate_hz is None else recording.rate_hz == pytest.approx(rate_hz, rel=0.05)
+    (note,) = recording.notes
+    assert f"{name!r} is left out as times, which give" in note
+
+
+def test_other_columns_of_a_csv_are_named_and_left_out(tmp_path):
+    recording = load_recording(write_csv(tmp_path, with_columns(",label", ["0,grasp", "1,"])))
+    assert (recording.tracks[0].counts[1] == load_recording(write_csv(tmp_path, PLAIN)).tracks[0].counts[0] + 1).all()
+    (note,) = recording.notes
+    assert "column 'label' is left out" in note and "rename it" in note
+
+
+def vendor_log(forces: list[str]) -> str:
+    """Return a log of the vendor's program: taxel n has force (n, 0.5, -2) N, or the text that is given."""
+    taxels = [f"{taxel}{axis}" for taxel in range(1, 17) for axis in "XYZ"]
+    header = ",".join(["Receive time", "Send time", "Message number", *taxels, *(f"Force {one}" for one in taxels)])
+    lines = [
+        f"{1700000000 + number / 80:.4f},{1699999999 + number / 80:.4f},{500 + number},{row(number).strip()},"
+        + ",".join(force or f"{cell:.5f}" for taxel in range(1, 17) for cell in (taxel, 0.5, -2))
+        for number, force in enumerate(forces)
+    ]
+    return "\n".join([header, *lines])
+
+
+def test_the_vendors_log(tmp_path):
+    path = write_csv(tmp_path, vendor_log(["", "", "", "nan", "", ""]))
+    recording = load_recording(path)
+    assert recording.rate_hz == pytest.approx(80, rel=0.01)
+    assert (recording.tracks[0].counts[1, :, 0, 0] == [1, 5001, 9001]).all()
+    with ReplayLink([path], paced=False) as link:
+        scans = [link.read(0.0)[0] for _ in range(6)]
+    assert scans[0].vendor_force_n == (136.0, 8.0, -32.0) and scans[3].vendor_force_n is None
+    assert "'Receive time', 'Send time' are left out as times" in recording.notes[0]
+    assert "'Message number' is left out" in recording.notes[1]
 
 
 def test_files_that_cannot_be_read(tmp_path):
@@ -130,7 +262,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(RecordingError, match=r"gone\.npz: cannot be read: No such file"):
         load_recording(tmp_path / "gone.npz")
     (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(RecordingError, match="directory"):
+    with pytest.raises(RecordingError, match=r"folder\.csv: a folder with nothing in it, expected \.mcap files"):
         load_recording(tmp_path / "folder.csv")
     with pytest.raises(RecordingError, match=r"ends in \.csv, \.npz or \.mcap"):
         load_recording(write_csv(tmp_path, HEADER + row(0), "finger.txt"))
@@ -196,9 +328,23 @@ def test_npz_with_objects_is_not_unpickled(tmp_path):
         load_recording(write_npz(tmp_path, sensor=np.array(["4", 6, None, {}], dtype=object)))
 
 
+def test_npz_that_lost_its_end_is_read_as_far_as_its_arrays_are_whole(tmp_path):
+    whole = write_npz(tmp_path, zpattern=np.arange(5000)).read_bytes()
+    expected = load_recording(write_csv(tmp_path, whole, "finger.npz"))
+    assert expected.notes == ()
+    for damaged in (whole[:-1], whole[:-100], whole[: len(whole) // 2], whole + bytes(100_000)):
+        recording = load_recording(write_csv(tmp_path, damaged, "finger.npz"))
+        (note,) = recording.notes
+        assert "finger.npz is damaged: its end is missing" in note
+        for track, other in zip(recording.tracks, expected.tracks, strict=True):
+            assert (track.counts == other.counts).all() and (track.time_ns == other.time_ns).all()
+    with pytest.raises(RecordingError, match=r"array 'counts': missing, .*; .*its end is missing"):
+        load_recording(write_csv(tmp_path, whole[: whole.index(b"counts.npy") + 300], "finger.npz"))
+
+
 def test_npz_that_is_cut_or_something_else(tmp_path):
     whole = write_npz(tmp_path).read_bytes()
-    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+    for size in (0, 10, len(whole) // 4):
         with pytest.raises(RecordingError, match="finger"):
             load_recording(write_csv(tmp_path, whole[:size], "finger.npz"))
     damaged = whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:]

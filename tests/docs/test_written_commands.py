@@ -165,6 +165,10 @@ def world(emulated, tmp_path, monkeypatch):
         monkeypatch.setattr(devices, "serial_ports", lambda: ports)
         if "press.mcap" in command and " record " not in command:
             cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
+        if command.endswith(" bag"):
+            cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:bag.mcap"])
+            Path("bag").mkdir()
+            Path("bag.mcap").rename("bag/bag_0.mcap")
         if "--forget-gains" in command:
             keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * GAINS))
         if "npz:press.npz" in command:

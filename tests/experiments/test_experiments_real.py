@@ -8,7 +8,7 @@ from experiment_samples import quick_bench
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
-from firmware_bridge.recording.formats import CSV_HEADER
+from firmware_bridge.recording.csv_reader import CSV_HEADER
 from train.data.real_grips import (
     from_other_trials,
     linear_from_others,

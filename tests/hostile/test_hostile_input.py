@@ -21,8 +21,10 @@ from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import read_model
 from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import NpzError, RecordingError
+from firmware_bridge.recording import csv_reader
 from firmware_bridge.recording import formats as recording
-from firmware_bridge.recording.formats import CSV_HEADER, load_recording
+from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
 from train.data.dataset import load_sequences
@@ -179,7 +181,7 @@ class TestText:
             load_recording(path)
 
     def test_a_csv_file_larger_than_is_read(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(recording, "MOST_CSV_BYTES", 1000)
+        monkeypatch.setattr(csv_reader, "MOST_CSV_BYTES", 1000)
         path = tmp_path / "finger.csv"
         path.write_text(",".join(CSV_HEADER) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
         with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):

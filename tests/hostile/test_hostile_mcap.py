@@ -20,8 +20,8 @@ from edge.pipeline.result_stream import Stream
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording import mcap_reader as mcap_recording
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.mcap_reader import MOST_RECORD_BYTES
-from firmware_bridge.recording.scan_messages import BASELINE, SCAN
+from firmware_bridge.recording.mcap_records import MOST_RECORD_BYTES
+from firmware_bridge.recording.scan_messages import BASELINE, SCAN, SENSOR
 
 MEMORY_LIMIT_BYTES = 60_000_000
 GOOD = {
@@ -119,7 +119,8 @@ def test_scans_are_found_in_whatever_another_writer_packs_them(tmp_path, compres
             writer.add_message(own, OFFSET_NS, SCAN.encode(GOOD | {"number": number}), OFFSET_NS)
         writer.finish()
     recording = load_recording(tmp_path / "other.mcap")
-    assert recording.tracks[0].numbers.tolist() == [0, 1, 2] and recording.notes == ()
+    assert recording.tracks[0].numbers.tolist() == [0, 1, 2]
+    assert "the mounting of sensor 4 is not in the file" in recording.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -240,7 +241,7 @@ def test_chunks_made_to_harm_end_it_and_keep_what_was_before(tmp_path, broken, w
     scan = message(SCAN, GOOD)
     recording = load_recording(written(tmp_path, *channel_of(SCAN), scan, broken, scan))
     assert len(recording.tracks[0].counts) == 1
-    (note,) = recording.notes
+    note, _ = recording.notes
     assert len(note) < 1000 and "\n" not in note
     if words == "within a record":
         assert "breaks off (within a record, at byte" in note
@@ -278,3 +279,11 @@ def test_a_flipped_bit_is_seen_or_changes_no_reading(tmp_path):
             continue
         for track in recording.tracks:
             assert (track.counts == counts[track.sensor][: len(track.counts)]).all()
+
+
+@pytest.mark.parametrize(
+    "said", ["", "[]", "[" * 5000, '{"mounting": 1}', '{"mounting": {}}', '{"geometry": {"rows": "9"}}']
+)
+def test_facts_of_a_sensor_that_are_none(tmp_path, said):
+    facts = message(SENSOR, {"header": GOOD["header"], "sensor": "4", "facts": said}, 2)
+    refused(written(tmp_path, *channel_of(SCAN), *channel_of(SENSOR, 2), facts, message(SCAN, GOOD)), r"made\.mcap")

@@ -41,7 +41,7 @@ FRONT = {
     *(
         "edge.terminal.argument_types",
         "edge.cli.run_options",
-        "edge.cli.silence_hint",
+        "edge.pipeline.silence_hint",
         "edge.doctor.options",
         "edge.bench.options",
     ),  # what may be asked

@@ -141,7 +141,7 @@ class TestEnds:
         assert done.returncode == 3 and done.stdout == ""
         doctor = f"edge-sr doctor --source {name} shows what is wrong"
         lines = done.stderr.splitlines()
-        assert re.match(rf"edge-sr: no scan in [56] s: is the sensor powered .*{doctor}$", lines[1])
+        assert re.match(rf"edge-sr: no scan in [56] s: nothing came: is the sensor powered .*{doctor}$", lines[1])
         assert lines[-1].startswith(f"edge-sr: no scan came from {name}: ") and lines[-1].endswith(doctor)
 
     def test_models_into_a_closed_pipe_stay_quiet(self, files):

@@ -19,7 +19,8 @@ from edge.view.frames import hello
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
-from firmware_bridge.recording.formats import csv_header, load_recording
+from firmware_bridge.recording.csv_reader import csv_header
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, USPA46_MAP, layout_c
 from firmware_bridge.scans.mounting import Mounting

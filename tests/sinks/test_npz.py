@@ -78,6 +78,7 @@ class TestNpz:
         self.record(tmp_path / "out.npz", results)
         data = dict(np.load(tmp_path / "out.npz"))
         assert str(data.pop("format")) == "tactile-recording" and int(data.pop("version")) == 1
+        assert str(data.pop("mountings")) == "{}"
         assert {len(column) for column in data.values()} == {len(results)}
         assert np.isnan(data["interval_mm"]).all() and "deviation" not in data
         for i, result in enumerate(results):

@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
-from firmware_bridge.recording.formats import CSV_HEADER
+from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import Scan
 

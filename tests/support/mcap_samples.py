@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
@@ -68,3 +69,32 @@ def same_scan(got: Scan, scan: Scan, moved_ns: int = 0) -> bool:
         and all((a is None) == (b is None) and (a is None or a.tobytes() == b.tobytes()) for a, b in arrays)
         and (got.counts[:, ~got.fresh] == ABSENT).all()
     )
+
+
+def messages_alone(
+    path: Path,
+    to: Path,
+    topics: str | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    more: Path | None = None,
+) -> Path:
+    """Copy messages of these topics and times (all by default), as tools do: without metadata and attachments.
+
+    Those of `more`, another recording, follow.
+    """
+    with to.open("wb") as target:
+        writer = Writer(target)
+        writer.start()
+        for one in filter(None, (path, more)):
+            channels: dict[int, int] = {}
+            with one.open("rb") as source:
+                for schema, channel, message in make_reader(source).iter_messages(
+                    topics, starting_at=start_ns, ending_before=end_ns
+                ):
+                    if channel.id not in channels:
+                        kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                        channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+                    writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return to

@@ -8,7 +8,7 @@ from edge_samples import ROOT
 
 PAGES = (ROOT / "README.md", *sorted(page for page in (ROOT / "docs").glob("*.md") if page.name != "log.md"))
 """Pages whose commands must work; the log holds commands as they were."""
-LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c"}
+LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c", "nginx"}
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
 _INDENTED = re.compile(r"(?<=\n\n)( {4,7})(?![-*] |\d+\. )\S.*\n(?:(?:\1.*|\n(?=\1))(?:\n|\Z))*")

@@ -14,7 +14,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from edge.sinks.mcap_writer import McapFile
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.recording.formats import CSV_HEADER, load_recording
+from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, Pad
@@ -58,14 +59,19 @@ def csv(data: bytes) -> None:
     if recording is not None:
         (track,) = recording.tracks
         check_counts(track.counts)
-        assert len(track.counts) == data.count(b"\n") - 1 and track.counts.min() >= 0
+        assert len(track.counts) <= len(re.split(b"[\r\n]", data)) and track.counts.min() >= 0
 
 
 def csv_seeds() -> list[bytes]:
     header = ",".join(CSV_HEADER)
     row = ",".join(f"{value}.0" for value in REST.reshape(3, 16).T.ravel())
     quoted = ",".join(f'"{value}"' for value in REST.reshape(3, 16).T.ravel())
-    return [f"{header}\n{row}\n".encode(), f"\ufeff{header}\r\n{row}\r\n{quoted}\r\n".encode(), b"a,b\n1,2\n"]
+    return [
+        f"{header}\n{row}\n".encode(),
+        f"\ufeff{header}\r\n{row}\r\n{quoted}\r\n".encode(),
+        b"a,b\n1,2\n",
+        f"sep=;\ntime;{header}\n0;{row}".replace(",", ";").encode("utf-16"),
+    ]
 
 
 def csv_rows(data: bytes) -> None:

@@ -88,7 +88,7 @@ def test_a_file_in_another_unit(tmp_path, unit_mm, scale):
 
 @pytest.mark.parametrize("unit_mm", [0, -1, float("nan"), float("inf")])
 def test_an_impossible_unit(tmp_path, unit_mm):
-    with pytest.raises(MeshError, match="unit_mm"):
+    with pytest.raises(MeshError, match="--unit-mm is"):
         load_mesh(saved(tmp_path, "part.stl", FILES["ascii.stl"]), unit_mm)
 
 
@@ -231,11 +231,11 @@ def test_an_impossible_size_says_the_size_and_the_unit(tmp_path):
         load_mesh(saved(tmp_path, "fits.stl", binary_stl(box((extent_mm, extent_mm / 2, extent_mm / 3)).triangles)))
     refused(
         saved(tmp_path, "big.stl", binary_stl(box((501, 8, 3)).triangles)),
-        "501 x 8 x 3 mm, at most 500 mm; .*scale it if it is not",
+        "501 x 8 x 3 mm, at most 500 mm; .*pass --unit-mm if it is not",
     )
     metres = saved(tmp_path, "metres.stl", binary_stl(box((0.02, 0.02, 0.002), at=(0, 0, 0)).triangles))
-    refused(metres, "0.02 x 0.02 x 0.002 mm, at least 1 mm; .*in metres scale it by 1000")
-    refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "unit_mm=1000, at most 500 mm", unit_mm=1000)
+    refused(metres, "0.02 x 0.02 x 0.002 mm, at least 1 mm; .*pass --unit-mm 1000 if it is in metres")
+    refused(saved(tmp_path, "unit.stl", binary_stl(box().triangles)), "by --unit-mm 1000, at most 500 mm", unit_mm=1000)
 
 
 def test_a_huge_grid_is_refused_for_its_triangles(tmp_path):

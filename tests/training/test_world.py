@@ -10,9 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from edge_samples import ROOT
 
+from train import generate
 from train.data import make_presses as making
 from train.data.make_presses import main, make_presses
 from train.data.presses import load_presses
@@ -135,6 +137,39 @@ def test_a_users_mesh_that_has_changed_is_another_world(tmp_path):
     assert world.facts() != first
     made = make_presses(world, tmp_path / "part.npz", jobs=1)
     assert set(made.family.tolist()) == {f"mesh:{path}"}
+
+
+def test_a_mesh_of_which_few_places_give_a_press_is_pressed_as_often_as_asked(tmp_path, capsys):
+    """A finger as thin as a sheet whose top slopes: most places that are drawn touch it beside the pattern."""
+    outline = shapely.Polygon([(0, 0), (44, 0), (44, 10), (0, 20)])
+    trimesh.creation.extrude_polygon(outline, 0.5).apply_transform(
+        trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+    ).export(tmp_path / "finger.stl")
+    options = ["--families", "none", "--mesh", str(tmp_path / "finger.stl"), "--count", "24", "--jobs", "1"]
+    assert main([str(tmp_path / "finger.npz"), *options]) == 0
+    size, made = capsys.readouterr().out.splitlines()
+    assert size == "finger.stl: 44 x 0.5 x 20 mm, taken as in mm: --unit-mm gives another unit"
+    assert ": 24 sequences, " in made
+    presses = load_presses(tmp_path / "finger.npz")
+    assert len(presses) == 24 and set(presses.pad.tolist()) == {0}
+    assert (presses.force_n[:, 2] > LEAST_FORCE_N).all() and presses.touching.any(axis=(1, 2)).all()
+
+
+def test_what_is_left_out_is_said(tmp_path, capsys):
+    options = ["--families", "wire", "--count", "30", "--spread", "0", "--seed", "4", "--jobs", "1"]
+    assert main([str(tmp_path / "few.npz"), *options]) == 0
+    first, last = capsys.readouterr().out.splitlines()
+    count = int(re.search(r": (\d+) sequences", first)[1])
+    assert count < 30 and last == f"{30 - count} of 30 presses left out: lighter than 0.1 N, or off the pattern"
+
+
+@pytest.mark.parametrize("tool", [main, generate.main])
+def test_a_mesh_in_another_unit_states_the_size_that_was_taken(tmp_path, capsys, tool):
+    trimesh.creation.box([1.97, 0.98, 0.5]).export(tmp_path / "inch.stl")
+    options = ["--mesh", str(tmp_path / "inch.stl"), "--unit-mm", "25.4", "--count", "1", "--taps", "1", "--jobs", "1"]
+    none = "--families" if tool is main else "--surfaces"
+    assert tool([str(tmp_path / "inch.npz"), none, "none", *options]) == 0
+    assert capsys.readouterr().out.startswith("inch.stl: 50.04 x 24.89 x 12.7 mm, by --unit-mm 25.4\n")
 
 
 def test_workers_ignore_an_interruption_those_that_replace_others_too():

@@ -103,6 +103,46 @@ class TestAccess:
     def test_only_our_own_page_may_open_a_socket(self, origin, refused):
         assert asks(grant("127.0.0.1", "robot", None), "/ws", origin=origin) == refused
 
+    @pytest.mark.parametrize(
+        ("origin", "path", "refused"),
+        [
+            # A proxy asks as 127.0.0.1:8077, whatever its own name; what it serves has the key.
+            ("http://127.0.0.1:80", "/ws?key={key}", None),
+            ("https://192.168.0.5", "/ws?key={key}", None),
+            ("https://[fe80::1]:8443", "/ws?key={key}", None),
+            ("http://localhost", "/ws?key={key}", None),
+            ("http://robot", "/ws?key={key}", None),
+            ("http://Robot.local:8080", "/ws?key={key}", None),
+            ("http://127.0.0.1:80", "/ws", 403),
+            ("http://127.0.0.1:80", "/ws?key=", 403),
+            ("http://127.0.0.1:80", "/ws?key={key}x", 403),
+            ("http://127.0.0.1:80", "/?key={key}", 403),
+            # A stranger's name may point to the proxy, and the stranger's page then read the key.
+            ("http://evil.example", "/ws?key={key}", 403),
+            ("http://robot.evil.example", "/ws?key={key}", 403),
+            ("http://127.0.0.1.evil.example", "/ws?key={key}", 403),
+            ("http://evil@127.0.0.1", "/ws?key={key}", 403),
+            ("null", "/ws?key={key}", 403),
+            ("file://127.0.0.1", "/ws?key={key}", 403),
+            (None, "/ws?key={key}&origin=http://evil.example", 403),
+            (None, "/ws?key={key}&origin=http://127.0.0.1:8077", None),
+        ],
+    )
+    def test_a_page_through_a_proxy_has_the_key_and_no_strangers_name(self, origin, path, refused):
+        access = grant("127.0.0.1", "Robot.lan", None)
+        assert asks(access, path.format(key=access.key), origin=origin) == refused
+
+    def test_with_the_token_a_page_may_have_any_name(self):
+        access = grant("127.0.0.1", "robot", TOKEN)
+        assert asks(access, f"/ws?token={TOKEN}", origin="https://robot.example") is None
+        assert asks(access, f"/ws?token={TOKEN}", "edge_upstream", "https://robot.example") is None
+        assert asks(access, "/ws?token=", origin="https://robot.example") == 403
+        assert asks(access, f"/ws?token={TOKEN}", "evil.example", "http://evil.example") == 403
+        assert asks(grant("127.0.0.1", "robot", None), "/ws", "edge_upstream") == 403
+
+    def test_every_run_has_a_key_of_its_own(self):
+        assert len({grant("127.0.0.1", "robot", None).key for _ in range(4)}) == 4
+
     def test_the_page_opens_again_without_the_token_that_it_took_out_of_the_address(self):
         assert asks(grant("192.168.0.5", "robot", TOKEN), "/", "192.168.0.5:8077") is None
 

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from math import ceil, isfinite
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -24,6 +23,7 @@ from train.physics.simulated_sensor import SimulatedSensor
 from train.physics.taxel_response import IN_PLANE_SHARE
 from train.physics.tpsf import BETA_MM
 from train.surfaces.depth_image import SAMPLES
+from train.surfaces.meshes import MESH, mesh_file
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import (
     ANGLE_STEP_DEG,
@@ -121,7 +121,7 @@ class Generation:
         facts = asdict(self) | {"surfaces": list(self.surfaces), "world": world}
         if self.pad == USPA44.name:
             del facts["pad"]  # what was made before there was a choice keeps its name
-        meshes = {name: mesh_sha256(name) for name in self.surfaces if name.startswith("mesh:")}
+        meshes = {name: mesh_sha256(name) for name in self.surfaces if name.startswith(MESH)}
         return facts | ({"meshes": meshes} if meshes else {})
 
     def targets(self, chunk: int, rng: np.random.Generator) -> Targets:
@@ -139,7 +139,7 @@ class Generation:
 def mesh_sha256(name: str) -> str:
     """Return the hash of a user's file, because the content under a name may change."""
     try:
-        return hashlib.sha256(Path(name.removeprefix("mesh:")).read_bytes()).hexdigest()
+        return hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest()
     except OSError as error:
         raise DatasetError(f"{name} cannot be read: {error.strerror or error}") from error
 

@@ -26,6 +26,7 @@ from train.data.workers import quiet_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
+from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.tap_schedules import SCHEDULES
 
 _INTERRUPTED: Final = 130
@@ -89,6 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started_s = time.monotonic()
     try:
         world = _world(options)
+        for name in world.families:
+            if name.startswith(MESH):
+                sys.stdout.write(f"{size_of(name)}\n")
+        sys.stdout.flush()  # before the simulation, which takes long
         with quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
             made = make_presses(world, options.out, options.jobs, compressed=options.compress)
     except TrainError as error:
@@ -99,6 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
     rate = len(made) * made.taps / (time.monotonic() - started_s)
     sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
+    if len(made) < world.count:
+        why = f"lighter than {LEAST_FORCE_N} N, or off the pattern"
+        sys.stdout.write(f"{world.count - len(made)} of {world.count} presses left out: {why}\n")
     return 0
 
 
@@ -111,7 +119,7 @@ def _world(options: argparse.Namespace) -> World:
     elif options.families != "all":
         names = [name for name in options.families.split(",") if name != "none"]
         families = {name: SHARES.get(name, 1.0) for name in names}
-    families |= {f"mesh:{path.resolve()}": options.mesh_share for path in options.mesh}
+    families |= {mesh_name(path, options.unit_mm): options.mesh_share for path in options.mesh}
     return World(
         count=options.count,
         taps=options.taps,
@@ -145,6 +153,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add"
+    )
+    parser.add_argument(
+        "--unit-mm", type=float, default=1.0, help="unit of the meshes in mm: 25.4 for inches, 1000 for metres (1)"
     )
     parser.add_argument("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
     parser.add_argument(

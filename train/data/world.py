@@ -1,7 +1,7 @@
 """Simulated world of grips: pads, families of shapes, depths and drags."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from math import ceil, inf
 from typing import Any, Final
 
@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.data.generation_config import mesh_sha256, one_thread
-from train.data.presses import VERSION, PressSet
+from train.data.presses import VERSION, PressSet, join_presses
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
+from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import surface_mesh
 from train.surfaces.poses import MAX_TAPS
 from train.surfaces.tap_schedules import SCHEDULES
@@ -22,6 +23,8 @@ INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
 LEAST_FORCE_N: Final = 0.1
 """Least force of a press that is kept: about twice the force at which a contact is detected above the noise."""
+MOST_DRAWS: Final = 40
+"""Most draws of a press of a user's mesh: of a sloping finger one in seven is kept, so that all are found."""
 _STILL: Final = 0.35
 """Share of presses without any drag; half of the others are twisted as well."""
 _SLIDE_MM: Final = (0.02, 0.6)
@@ -37,7 +40,8 @@ class World:
     """Configuration that determines a set of presses.
 
     Attributes:
-        count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out.
+        count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out, or drawn again
+            where they are of a user's mesh.
         taps: presses in each sequence.
         schedule: of the taps' poses, one of train.surfaces.tap_schedules.SCHEDULES.
         begun: share of sequences whose newest tap has only begun, while the earlier ones are as at their ends.
@@ -69,7 +73,7 @@ class World:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected 0 to 1")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
-        unknown = [name for name in self.families if name not in SHARES and not name.startswith("mesh:")]
+        unknown = [name for name in self.families if name not in SHARES and not name.startswith(MESH)]
         if unknown or not self.families:
             named = ", ".join(map(repr, unknown)) if unknown else "named"
             raise DatasetError(f"no family {named}: expected some of {', '.join(SHARES)}, or a mesh")
@@ -77,7 +81,7 @@ class World:
             if not 0 < share < inf:
                 raise DatasetError(f"frequency of {name} is {share}, expected more than 0")
         for name in self.families:
-            if name.startswith("mesh:"):
+            if name.startswith(MESH):
                 surface_mesh(name)  # checked before any work, because meshes fail most often
 
     @property
@@ -94,8 +98,8 @@ class World:
             "inputs": list(INPUTS),
             "version": VERSION,
         }
-        meshes = {name: mesh_sha256(name) for name in self.families if name.startswith("mesh:")}
-        return facts | ({"meshes": meshes} if meshes else {})
+        meshes = {name: mesh_sha256(name) for name in self.families if name.startswith(MESH)}
+        return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
 
 
 @one_thread()
@@ -111,9 +115,17 @@ def solve_pad(world: World, number: int) -> PressSet:
     at = (order + 0.5) / world.count
     family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
     schedule = SCHEDULES[world.schedule]
-    tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
-    made = press_shapes(rng, gripped, family, tapped, number, world.begun)
-    return made.pick((made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2)))
+    kept: list[PressSet] = []
+    for _ in range(MOST_DRAWS):
+        tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
+        made = press_shapes(rng, gripped, family, tapped, number, world.begun)
+        right = (made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2))
+        kept.append(made.pick(right))
+        family = family[~right & np.char.startswith(family, MESH)]
+        if not len(family):
+            break
+    made = join_presses(kept)
+    return replace(made, pad=np.full(len(made), number, dtype=np.int64))
 
 
 def press_shapes(

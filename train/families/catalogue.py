@@ -14,6 +14,7 @@ from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import over_surface, random_targets
 
@@ -87,7 +88,7 @@ def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: ND
         SurfaceError: nothing of a user's mesh lies under the pad.
         MeshError: the user's mesh cannot be used.
     """
-    if family in FIGURES or family.startswith("mesh:"):
+    if family in FIGURES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)
     if family == "soft":
         inner = draw_shape(rng, _another(rng), pad, poses)

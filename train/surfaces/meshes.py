@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from train.errors import MeshError
 
+MESH: Final = "mesh:"
+"""Beginning of a surface's name that is a user's file."""
+_UNIT: Final = "?unit_mm="
 SUFFIXES: Final = (".stl", ".obj", ".ply")
 MAX_TRIANGLES: Final = 2_000_000
 MAX_FILE_BYTES: Final = 400_000_000
@@ -22,6 +25,31 @@ _MERGED_DIGITS: Final = 4
 _TO_ASCII: Final = bytes(range(128)) + b"?" * 128
 _FLAT: Final = 1e-5
 """Ratio of thickness to length below which a body is a sheet: a hundred times the rounding of single precision."""
+
+
+def mesh_name(path: Path, unit_mm: float = 1.0) -> str:
+    """Return the name of a user's file as a surface, which states its unit in [mm] where that is not 1."""
+    return f"{MESH}{path.resolve()}" + (f"{_UNIT}{unit_mm:g}" if unit_mm != 1 else "")
+
+
+def mesh_file(name: str) -> tuple[Path, float]:
+    """Return the file in a name of `mesh_name`, and its unit in [mm]."""
+    path, found, unit = name.removeprefix(MESH).rpartition(_UNIT)
+    try:
+        return (Path(path), float(unit)) if found else (Path(unit), 1.0)
+    except ValueError:
+        return Path(name.removeprefix(MESH)), 1.0
+
+
+def size_of(name: str) -> str:
+    """Return a line with the size that is taken of the file in a name.
+
+    Raises:
+        MeshError: the file cannot be used.
+    """
+    path, unit_mm = mesh_file(name)
+    unit = "taken as in mm: --unit-mm gives another unit" if unit_mm == 1 else f"by --unit-mm {unit_mm:g}"
+    return f"{path.name}: {_sides(load_mesh(path, unit_mm).extents)}, {unit}"
 
 
 def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
@@ -39,7 +67,7 @@ def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
     """
     path = Path(path)
     if not (isfinite(unit_mm) and unit_mm > 0):
-        raise MeshError(f"unit_mm is {unit_mm}; it must be a length above 0, such as 1000 for a file in metres")
+        raise MeshError(f"--unit-mm is {unit_mm:g}; it must be a length above 0, such as 1000 for a file in metres")
     corners, faces = _read(path)
     corners = corners * unit_mm
     _check_size(path, corners[faces].reshape(-1, 3), unit_mm)
@@ -113,22 +141,26 @@ def _legible(content: bytes, suffix: str) -> bytes:
 
 def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> None:
     extent_mm = np.ptp(corners, axis=0)
-    sides = f"{' x '.join(f'{side:.4g}' for side in extent_mm)} mm"
-    asked = "" if unit_mm == 1.0 else f" with unit_mm={unit_mm:g}"  # which no command takes
+    sides = _sides(extent_mm)
+    asked = "" if unit_mm == 1.0 else f" by --unit-mm {unit_mm:g}"
     smallest_mm, largest_mm = EXTENT_MM
     if extent_mm.max() > largest_mm:
         raise MeshError(
             f"{path}: {sides}{asked}, at most {largest_mm:g} mm; "
-            "a file is taken to be in mm: scale it if it is not (micrometres by 0.001), else cut out the part to tap"
+            "a file is taken to be in mm: pass --unit-mm if it is not (0.001 for micrometres), else cut out a part"
         )
     if extent_mm.max() < smallest_mm:
         raise MeshError(
             f"{path}: {sides}{asked}, at least {smallest_mm:g} mm; "
-            "a file is taken to be in mm: if it is in metres scale it by 1000, if in inches by 25.4"
+            "a file is taken to be in mm: pass --unit-mm 1000 if it is in metres, 25.4 if in inches"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
     if spreads[0] <= _FLAT**2 * spreads[-1]:
         raise MeshError(f"{path}: flat, a sheet without thickness ({sides}); extrude it to a closed body")
+
+
+def _sides(extent_mm: NDArray[np.float64]) -> str:
+    return f"{' x '.join(f'{side:.4g}' for side in extent_mm)} mm"
 
 
 def _open_edges(faces: NDArray[np.int64]) -> int:

@@ -17,7 +17,7 @@ import trimesh
 from shapely.geometry.base import BaseGeometry
 
 from train.errors import SurfaceError
-from train.surfaces.meshes import load_mesh
+from train.surfaces.meshes import load_mesh, mesh_file
 from train.surfaces.paper_figures import LETTERS, SHAPES, figure
 from train.surfaces.random_figures import glyph, polygon
 
@@ -51,7 +51,7 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
 
     Args:
         name: one of SURFACES; `glyph:SEED` or `polygon:SEED`, random figures; `sphere:RADIUS_MM`, a dome;
-            `cylinder:RADIUS_MM`, lying, its axis along y; `mesh:PATH`, a user's file, without a plate.
+            `cylinder:RADIUS_MM`, lying, its axis along y; a user's file as `mesh_name` names it, without a plate.
 
     Raises:
         SurfaceError: no surface of that name.
@@ -67,7 +67,7 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
     if kind == "cylinder":
         return _on_plate([_lying_cylinder(_radius_mm(name, detail))])
     if kind == "mesh" and detail:
-        return load_mesh(detail)
+        return load_mesh(*mesh_file(name))
     raise SurfaceError(
         f"no surface {name!r}; there are {', '.join(SURFACES)}, and glyph:SEED, polygon:SEED (SEED 0 or more), "
         "sphere:RADIUS_MM, cylinder:RADIUS_MM, mesh:PATH"

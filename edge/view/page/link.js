@@ -43,19 +43,25 @@ const WAITS_S = [0.25, 0.5, 1, 2, 4];
 const VERSION = 1;
 const GOING_AWAY = 1001; // the run has ended
 const REFUSED = [403, 503]; // access refused; too many viewers
+const GRANTED = 426; // the answer to a plain request where a socket is granted
+const LOST_SOCKETS = 3; // so many in a row are not chance, as where the program begins between a socket and a request
 
 class Link {
   constructor({ onFrame, onChange }) {
     Object.assign(this, { onFrame, onChange, socket: null, up: false, tries: 0, timer: 0, receivedS: nowS(), nextS: null, ended: false, why: null });
+    // Beside the page, which a proxy may serve below a path.
+    this.url = new URL(`${location.pathname.replace(/\/?$/, "/")}ws`, location.href);
+    this.url.searchParams.set("key", document.querySelector("meta[name=edge-sr-key]").content);
     const token = takeToken();
-    this.path = token === null ? "/ws" : `/ws?token=${encodeURIComponent(token)}`;
+    if (token !== null) this.url.searchParams.set("token", token);
   }
 
   open() {
     clearTimeout(this.timer);
     this.nextS = null;
-    const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}${this.path}`);
+    const address = new URL(this.url);
+    address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
+    const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => this.take(socket, data);
     socket.onclose = (event) => this.lose(socket, event.code);
@@ -91,10 +97,15 @@ class Link {
 
   /** Ask for the reason of a refused socket by a plain request: a browser does not show it for a socket. */
   async inquire() {
+    const address = new URL(this.url);
+    address.searchParams.set("origin", location.origin); // which a browser sends for a socket alone
     let why = null;
     try {
-      const answer = await fetch(this.path, { signal: AbortSignal.timeout(1000 * SILENT_S) });
-      if (REFUSED.includes(answer.status)) why = (await answer.text()).trim();
+      const answer = await fetch(address, { signal: AbortSignal.timeout(1000 * SILENT_S) });
+      const plain = answer.headers.get("Content-Type")?.startsWith("text/plain");
+      if (REFUSED.includes(answer.status) && plain) why = (await answer.text()).trim();
+      else if (answer.status !== GRANTED) why = `${location.host} answers ${answer.status} for ${address.pathname}, and not edge-sr`;
+      else if (this.tries >= LOST_SOCKETS) why = "something between does not pass the socket on: a proxy must send HTTP/1.1 with the headers Upgrade and Connection";
     } catch { /* no server answers */ }
     if (this.up || why === this.why) return;
     this.why = why;

@@ -1,0 +1,268 @@
+"""Recordings as CSV, as loggers and spreadsheets write them: one line for each scan of one sensor."""
+
+import codecs
+import csv
+import itertools
+import math
+import re
+from array import array
+from collections.abc import Iterable, Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
+from firmware_bridge.recording.csv_columns import CsvColumns, rate_of
+from firmware_bridge.recording.csv_poses import CsvPoses
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
+from firmware_bridge.scans.scan import VendorReading
+from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
+
+MOST_CSV_BYTES: Final = 1 << 30
+"""Most bytes of a CSV: some eight hours of one sensor at 100 Hz."""
+LONGEST_CSV_LINE: Final = 1 << 14
+"""Most characters of a line: fifty times a row of counts."""
+_META_NAME: Final = "meta_data.csv"
+_META_RATE: Final = "frequency_hz"
+_WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
+_SEPARATOR = re.compile(r'"?sep=(.)"?\s*')
+_SEPARATORS: Final = ",;\t"
+
+
+def csv_header(taxel_count: int) -> tuple[str, ...]:
+    """Return the columns of so many taxels."""
+    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
+
+
+CSV_HEADER: Final = csv_header(USPA44.taxel_count)
+
+
+class _Row(NamedTuple):
+    """Cells of a line, without spaces around them and with decimal points; `whole` if the line has its end."""
+
+    line: int
+    cells: list[str]
+    whole: bool
+
+
+class _DamageError(Exception):
+    """A line cannot be read, so that what follows is not read either."""
+
+    def __init__(self, line: int, got: str, expected: str) -> None:
+        super().__init__(f"line {line}: {got}, expected {expected}")
+
+
+def load_csv(path: Path) -> Recording:
+    """Read a CSV up to its end, or up to a damaged line, which `notes` then report.
+
+    Raises:
+        RecordingError: it is no recording, or a value in a whole line is impossible.
+        OSError: the file cannot be read.
+    """
+    rows = _rows(path)
+    scans = damaged = None
+    try:
+        header = next(rows, _Row(1, [], whole=True))
+        scans = _Scans(path, header)
+        for row in rows:
+            scans.add(row)
+    except _DamageError as damage:
+        damaged = damage
+    if scans is None or not scans.count:
+        raise RecordingError(f"{path}, {damaged or 'after its first line: no row, expected a row of counts'}")
+    notes = []
+    if damaged is not None:
+        notes.append(f"{path} is damaged, {damaged}: only the {scans.count} scans before that are read")
+    return scans.recording(notes)
+
+
+class _Scans:
+    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file."""
+
+    def __init__(self, path: Path, header: _Row) -> None:
+        """Begin without a row, by the names of the columns.
+
+        Raises:
+            RecordingError: they are not those of a sensor.
+        """
+        self._path = path
+        try:
+            self._columns = CsvColumns(header.cells)
+        except ValueError as error:
+            raise RecordingError(f"{path}, line {header.line}: {error}") from error
+        self._width = max(place + 1 for place, name in enumerate(header.cells) if name)
+        self._counts = array("i")
+        self._newtons = array("f")
+        self._poses = CsvPoses()
+        self._times = {column: array("d") for column in self._columns.times}
+        self._before: list[str] = []
+        self.count = 0
+
+    def add(self, row: _Row) -> None:
+        """Take one row.
+
+        Raises:
+            RecordingError: a value in a whole row is impossible.
+            _DamageError: the row is damaged.
+        """
+        cells, columns = row.cells, self._columns
+        _check_whole(row, self._width, self._before)
+        self._counts.extend(_count(self._path, row.line, cells[column]) for column in columns.counts)
+        wrong = self._poses.add(self.count, [cells[column] for column in columns.poses])
+        if wrong is not None:
+            _refuse(self._path, row.line, f"'{wrong[:20]}'", "a number for each value of a pose, or for none")
+        self._newtons.extend(_number(cells[column]) for column in columns.newtons)
+        for column, times in self._times.items():
+            times.append(_time_s(cells[column]))
+        self._before = cells
+        self.count += 1
+
+    def recording(self, notes: list[str]) -> Recording:
+        """Return the recording, with these notes and others.
+
+        Raises:
+            RecordingError: a pose is out of range, or the file with the rate cannot be used.
+        """
+        path, columns = self._path, self._columns
+        rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
+        rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
+        if rates_hz:
+            by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
+            notes.append(f"{path}: {_listed(columns.times.values())} left out as times, {by}")
+        if columns.left_out:
+            notes.append(
+                f"{path}: {_listed(columns.left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
+                "it, such as txl1_x, time_s, pose_x_mm"
+            )
+        geometry = columns.pad
+        track = Track(
+            path.stem,
+            _by_axis(np.frombuffer(self._counts, np.int32), geometry),
+            time_ns=None,
+            vendor=_vendor(self._newtons, geometry) if self._newtons else None,
+        )
+        rate_hz = rate_hz or _meta_rate_hz(path.with_name(_META_NAME))
+        try:
+            return Recording(path, (track,), rate_hz, notes=tuple(notes), poses=self._poses.poses())
+        except ValueError as error:
+            raise RecordingError(f"{path}: its poses: {error}") from error
+
+
+def _rows(path: Path) -> Iterator[_Row]:
+    """Yield the rows that are not empty, each from one line; the first one is the header, and tells the separator."""
+    read, separator = 0, None
+    with path.open("rb") as file:
+        start = file.read(2)
+    utf16 = start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # as Excel's "Unicode text"
+    with path.open(encoding="utf-16" if utf16 else "utf-8-sig", errors="replace", newline="") as file:
+        for number in itertools.count(1):
+            line = file.readline(LONGEST_CSV_LINE + 1)
+            if not line:
+                return
+            read += len(line)
+            if read > MOST_CSV_BYTES:
+                _refuse(path, number, f"a file larger than {MOST_CSV_BYTES:,} bytes", "a smaller one: cut it in parts")
+            if len(line) > LONGEST_CSV_LINE:
+                raise _DamageError(number, f"a line longer than {LONGEST_CSV_LINE} bytes", "a row of counts")
+            if "\ufffd" in line and separator is not None:  # a header may have a name in another encoding
+                raise _DamageError(number, "bytes that are no UTF-8 text", "a row of counts")
+            named = _SEPARATOR.fullmatch(line) if separator is None else None
+            if named is not None:
+                separator = named[1]
+                continue
+            separator = separator or max(_SEPARATORS, key=line.count)
+            try:
+                cells = next(csv.reader([line], delimiter=separator, strict=True))
+            except csv.Error as error:
+                raise _DamageError(number, f"not CSV ({error})", "a row of counts") from error
+            cells = [(cell if separator == "," else cell.replace(",", ".")).strip() for cell in cells]
+            if any(cells):
+                yield _Row(number, cells, line.endswith(("\n", "\r")))
+
+
+def _check_whole(row: _Row, width: int, before: list[str]) -> None:
+    """Check that a row has `width` cells, and that its last line was not cut off within a number.
+
+    Raises:
+        _DamageError: it has others, or a last line without its end ends in a shorter number than the one above.
+    """
+    cells = row.cells[:width]
+    if len(cells) < width or any(row.cells[width:]):
+        raise _DamageError(row.line, f"{len(row.cells)} columns", f"{width}")
+    unprintable = [cell for cell in cells if not cell.isprintable()]
+    if unprintable:
+        raise _DamageError(row.line, ascii(unprintable[0][:10]), "a row of counts")
+    # A line without its end may be whole; a number that was cut off is still a number, and shorter.
+    if not row.whole and before and len(cells[-1].lstrip("-")) < len(before[width - 1].lstrip("-")):
+        raise _DamageError(row.line, f"a last line that ends in '{cells[-1][:20]}'", "its end: it seems cut off")
+
+
+def _count(path: Path, line: int, cell: str) -> int:
+    # Not float(): it takes nan, 1e4 and 1_0 as well.
+    whole = int(cell.partition(".")[0]) if _WHOLE_NUMBER.fullmatch(cell) else None
+    if whole is None or whole > HIGHEST_COUNT:
+        _refuse(path, line, f"'{cell[:20]}'", f"a whole number 0..{HIGHEST_COUNT}")
+    return whole
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+def _time_s(cell: str) -> float:
+    """Return the number in a cell, or the seconds since 1970 of a date and time."""
+    value = _number(cell)
+    if math.isnan(value):
+        try:
+            return datetime.fromisoformat(cell).timestamp()
+        except (ValueError, OverflowError, OSError):
+            return math.nan
+    return value
+
+
+def _by_axis(values: NDArray[Any], geometry: SensorGeometry) -> NDArray[Any]:
+    """Return values of rows as (n, 3, rows, cols)."""
+    taxels = values.reshape(-1, geometry.taxel_count, len(AXES))
+    return np.ascontiguousarray(taxels.transpose(0, 2, 1)).reshape(-1, *geometry.scan_shape)
+
+
+def _vendor(newtons: "array[float]", geometry: SensorGeometry) -> tuple[VendorReading | None, ...]:
+    """Return the vendor's newtons of each scan, None where one of them is missing or out of range."""
+    scans = _by_axis(np.frombuffer(newtons, np.float32), geometry)
+    right = np.abs(scans).reshape(len(scans), -1).max(axis=1) <= HIGHEST_NEWTONS
+    return tuple(VendorReading(one) if sound else None for one, sound in zip(scans, right, strict=True))
+
+
+def _meta_rate_hz(path: Path) -> float | None:
+    if not path.is_file():
+        return None
+    try:
+        rows = list(itertools.islice(_rows(path), 2))
+    except _DamageError as damage:
+        raise RecordingError(f"{path}, {damage}") from damage
+    if not rows or _META_RATE not in rows[0].cells:
+        return None
+    column = rows[0].cells.index(_META_RATE)
+    cell = rows[1].cells[column] if len(rows) > 1 and len(rows[1].cells) > column else ""
+    rate_hz = _number(cell)
+    if not is_rate(rate_hz):
+        _refuse(path, 2, f"{_META_RATE} '{cell[:20]}'", A_RATE)
+    return rate_hz
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return "column a is" or "columns a, b are", with the names of a few."""
+    shown = [repr(name[:30]) for name in names]
+    text = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "")
+    return f"column {text} is" if len(shown) == 1 else f"columns {text} are"
+
+
+def _refuse(path: Path, line: int, got: str, expected: str) -> NoReturn:
+    raise RecordingError(f"{path}, line {line}: {got}, expected {expected}")

@@ -1,0 +1,104 @@
+"""Records of an MCAP file, one by one, up to the end of its data or to a damage.
+
+A file is not trusted: records are read up to a limit, and a chunk is unpacked up to its stated size.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from typing import BinaryIO, Final
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+
+MOST_RECORD_BYTES: Final = 1 << 25
+"""Most bytes of one record, and of a chunk when unpacked: writers make chunks of one to a few megabytes."""
+MOST_WINDOW_BYTES: Final = 1 << 25
+"""Largest window of zstd, in bytes."""
+_RECORD: Final = struct.Struct("<BQ")
+BROKEN: Final = (
+    *(struct.error, McapError, zstandard.ZstdError, ValueError, OverflowError, MemoryError),
+    *(EOFError, RuntimeError),  # of lz4
+)
+
+
+class DamageError(Exception):
+    """A record cannot be read, so the rest of the file is not read either."""
+
+
+class CutOffError(DamageError):
+    """The file ends too early."""
+
+
+def records(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
+    """Yield each record up to the end of the data, those in chunks one by one; lengths are checked by its size."""
+    size_bytes = os.fstat(file.fileno()).st_size
+    while True:
+        at = file.tell()
+        head = file.read(_RECORD.size)
+        if len(head) < _RECORD.size:
+            raise CutOffError(f"without an end, at byte {at}")
+        opcode, length = _RECORD.unpack(head)
+        if length > size_bytes - at - _RECORD.size:
+            raise CutOffError(f"within a record, at byte {at}")
+        if opcode == Opcode.DATA_END:
+            return
+        if opcode not in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+            file.seek(length, os.SEEK_CUR)
+            continue
+        if length > MOST_RECORD_BYTES:
+            raise DamageError(f"at byte {at}, a record of {length:,} bytes, expected at most {MOST_RECORD_BYTES:,}")
+        data = memoryview(file.read(length))
+        if opcode != Opcode.CHUNK:
+            yield opcode, data
+            continue
+        try:
+            unpacked = _unpacked(Chunk.read(ReadDataStream(BytesIO(data))))
+        except BROKEN as error:
+            raise DamageError(f"at byte {at}, a chunk that cannot be unpacked: {short(error)}") from error
+        yield from _records_of(unpacked, at)
+
+
+def _records_of(chunk: bytes, at: int) -> Iterator[tuple[int, memoryview]]:
+    view, position = memoryview(chunk), 0
+    while position < len(chunk):
+        if len(chunk) - position < _RECORD.size:
+            raise DamageError(f"at byte {at}, a chunk that is cut off")
+        opcode, length = _RECORD.unpack_from(chunk, position)
+        position += _RECORD.size
+        if length > len(chunk) - position:
+            raise DamageError(f"at byte {at}, a chunk that is cut off")
+        yield opcode, view[position : position + length]
+        position += length
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    size_bytes = chunk.uncompressed_size
+    if size_bytes > MOST_RECORD_BYTES:
+        raise ValueError(f"{size_bytes:,} bytes, expected at most {MOST_RECORD_BYTES:,}")
+    if chunk.compression == "zstd":
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MOST_WINDOW_BYTES)
+        data = unpacker.stream_reader(chunk.data).read(size_bytes + 1)
+    elif chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size_bytes + 1)
+    elif not chunk.compression:
+        data = chunk.data
+    else:
+        raise ValueError(f"compressed by {chunk.compression[:20]!r}, expected zstd, lz4 or nothing")
+    if len(data) != size_bytes:
+        raise ValueError(f"it does not hold the {size_bytes:,} bytes that it states")
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("its check sum is wrong")
+    return data
+
+
+def short(error: BaseException) -> str:
+    """Return the text of an error in one line."""
+    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -1,0 +1,161 @@
+"""Recordings that a tool has copied in part: messages alone, some of their topics, or those from some time on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import BASELINE, FakeModel, make_scan
+from mcap_samples import OFFSET_NS, SURE, TURNED, make_results, messages_alone, record_into
+
+from edge import api
+from edge.api import open_recording, open_runtime
+from edge.perception.runtime import Runtime
+from edge.pipeline.result_stream import Stream
+from edge.sinks.mcap import McapSink
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.pad_geometry import SensorGeometry
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
+
+PERIOD_NS = 50_000_000
+
+
+@pytest.fixture
+def turned(tmp_path):
+    """Three seconds of a sensor that sits turned, and of one that does not."""
+    scans = [
+        make_scan(number, sensor=name, time_ns=(number + 1) * PERIOD_NS, press_counts=3000, noise=2)
+        for number in range(60)
+        for name in ("4", "left/6")
+    ]
+    return record_into(tmp_path / "turned.mcap", make_results(scans, mountings={"4": TURNED}), mountings={"4": TURNED})
+
+
+def patterns(path):
+    with open_recording(path) as source:
+        runtime = open_runtime(FakeModel(SURE), source, every_scan=True)
+        results = []
+        while (taken := source.take(1.0)) is not None:
+            results += [runtime.push(one) for one in taken if isinstance(one, Scan)]
+    return [(one.scan.time_ns, one.zeroed.tobytes()) for one in results]
+
+
+def test_messages_alone_give_the_same_patterns(turned, tmp_path):
+    copy = messages_alone(turned, tmp_path / "copy.mcap")
+    assert patterns(copy) == patterns(turned)
+    assert load_recording(copy).origin == "device" and load_recording(copy).notes == ()
+
+
+def test_and_so_do_those_from_some_time_on(turned, tmp_path):
+    start_ns = OFFSET_NS + 21 * PERIOD_NS + 1
+    part = messages_alone(turned, tmp_path / "part.mcap", start_ns=start_ns)
+    recording = load_recording(part)
+    assert dict(recording.mountings) == {"4": TURNED} and recording.notes == ()
+    assert {name: one.id for name, one in recording.baselines.items()} == {"4": BASELINE.id, "left/6": BASELINE.id}
+    assert patterns(part) == [one for one in patterns(turned) if one[0] + OFFSET_NS >= start_ns]
+
+
+def test_a_baseline_that_was_taken_after_a_part_began_is_none_of_its_beginning(tmp_path):
+    results = make_results([make_scan(number, time_ns=(number + 1) * PERIOD_NS) for number in range(60)])
+    taken = replace(BASELINE, created_unix_s=(OFFSET_NS + 30 * PERIOD_NS) / 1e9)
+    results = [replace(one, baseline=taken if number >= 30 else None) for number, one in enumerate(results)]
+    assert load_recording(record_into(tmp_path / "zeroed.mcap", results)).baselines == {}
+
+
+def test_what_a_tool_left_out_is_named(turned, tmp_path):
+    part = messages_alone(turned, tmp_path / "part.mcap", topics="/s4/scan")
+    (note,) = load_recording(part).notes
+    assert "the mounting of sensor 4 is not in the file" in note and "--sensor FILE" in note
+
+
+@pytest.mark.parametrize("topics", [None, "/s4/scan"])
+def test_an_emulated_sensor_stays_one_without_metadata(tmp_path, topics):
+    path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source="emulated"))
+    path = messages_alone(path, tmp_path / "part.mcap", topics)
+    for generation in range(2):
+        recording = load_recording(path)
+        assert recording.origin == "emulated"
+        assert f"{path} was recorded from an emulated sensor" in recording.notes
+        with open_recording(path) as source:
+            path = tmp_path / f"{generation}.mcap"
+            sink = api.open_sink(f"mcap:{path}", SURE, source)
+            for result in Stream(source, Runtime(FakeModel(SURE), source=source.kind)):
+                sink.write(result, {})
+            sink.close()
+        path = messages_alone(path, tmp_path / f"{generation}-alone.mcap")
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(4, 6), (5, 5)])
+def test_another_pad_is_known_without_metadata(tmp_path, rows, cols):
+    geometry, grid = SensorGeometry("mine", rows, cols, 5.0, 30.0, 30.0), (rows, cols)
+    baseline = replace(BASELINE, counts=np.full((3, *grid), 30_000.0, np.float32))
+    sink = McapSink(tmp_path / "a.mcap", SURE, unix_offset_ns=OFFSET_NS, geometry=geometry)
+    result = make_results([make_scan()])[0]
+    everything = np.ones(grid, bool)
+    scan = replace(result.scan, counts=np.full((3, *grid), 30_000, np.int32), fresh=everything, renewed=everything)
+    sink.write(replace(result, scan=scan, baseline=baseline, pattern=None), {})
+    sink.close()
+    recording = load_recording(messages_alone(tmp_path / "a.mcap", tmp_path / "b.mcap"))
+    assert recording.tracks[0].geometry == geometry
+
+
+def test_two_mountings_of_one_sensor_are_refused(turned, tmp_path):
+    straight = record_into(tmp_path / "straight.mcap", make_results([make_scan()]), mountings={"4": Mounting()})
+    with pytest.raises(RecordingError, match="two mountings of sensor '4'"):
+        load_recording(messages_alone(turned, tmp_path / "both.mcap", more=straight))
+
+
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: mcap
+  relative_file_paths:
+    - bag_2.mcap
+    - bag_10.mcap
+  message_count: 120
+"""
+
+
+@pytest.fixture
+def bag(turned, tmp_path):
+    """A folder with the recording in two files, as `ros2 bag record` splits it, and `ros2 bag convert` copies it."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    half_ns = OFFSET_NS + 31 * PERIOD_NS
+    messages_alone(turned, folder / "bag_2.mcap", end_ns=half_ns)
+    messages_alone(turned, folder / "bag_10.mcap", start_ns=half_ns)
+    return folder
+
+
+@pytest.mark.parametrize("metadata", [METADATA, None, "relative_file_paths: []\n", "\0"])
+def test_the_files_of_a_bag_are_played_in_their_order(turned, bag, metadata):
+    if metadata is not None:
+        (bag / "metadata.yaml").write_text(metadata)
+    assert patterns(bag) == patterns(turned)
+    assert load_recording(bag).notes == ()
+
+
+def test_a_bag_goes_by_its_metadata_and_names_a_file_that_is_not_there(bag, tmp_path):
+    (bag / "bag_2.mcap").rename(bag / "z.mcap")
+    (bag / "metadata.yaml").write_text(METADATA.replace("- bag_2.mcap", "- 'z.mcap'\n    - bag_3.mcap"))
+    recording = load_recording(bag)
+    assert len(recording.tracks[0].counts) == 60
+    assert recording.notes == (f"{bag}: its metadata.yaml names 'bag_3.mcap', which is not there",)
+
+
+def test_a_file_of_a_bag_that_breaks_off_costs_its_end(bag):
+    data = (bag / "bag_10.mcap").read_bytes()
+    (bag / "bag_10.mcap").write_bytes(data[: len(data) // 5])
+    recording = load_recording(bag)
+    assert 30 <= len(recording.tracks[0].counts) < 60 and "bag_10.mcap breaks off" in recording.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [((), "nothing in it"), (("a_0.db3", "metadata.yaml"), "'a_0.db3', .*ros2 bag convert")]
+)
+def test_a_folder_without_mcap_files_is_refused_with_what_is_in_it(tmp_path, names, words):
+    (tmp_path / "bag").mkdir()
+    for name in names:
+        (tmp_path / "bag" / name).touch()
+    with pytest.raises(RecordingError, match=rf"bag: a folder with {words}"):
+        load_recording(tmp_path / "bag")
