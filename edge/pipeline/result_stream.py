@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from numbers import Real
 
 from edge.errors import NoResultError, UsageError
 from edge.perception.event import Event
@@ -154,8 +153,7 @@ class Stream:
                 f"{self._source.name} is a recording: give `runtime.pose` a PadPose and a time of its scans"
             )
         now_ns = self._clock_ns()
-        numbers = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
-        fields = {name: float(value) if isinstance(value, Real) else value for name, value in numbers.items()}
+        fields = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
         fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
         try:
             self._rounds.poses.put(pose_of_fields(fields, now_ns))

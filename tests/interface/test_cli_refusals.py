@@ -21,6 +21,8 @@ class TestRefusals:
         ("arguments", "words"),
         [
             (["--rate-hz", "0"], ["--rate-hz: '0' is not a positive number"]),
+            (["--rate-hz", "1e-300"], ["--rate-hz: '1e-300' is not a positive number, 1e-09 to 1e+09"]),
+            (["--counts-per-newton", "1e8"], ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
             (["--duration-s", "nan"], ["--duration-s: 'nan' is not a positive number"]),
             (["--counts-per-newton", "x"], ["--counts-per-newton: 'x' is not"]),
             (["--budget-us", "0"], ["--budget-us: '0' is not a positive number"]),
