@@ -213,7 +213,8 @@ def _bench(arguments: Sequence[str]) -> int:
         raise UsageError("--soak is a part of --system: add it")
     from edge.bench.command import Settings, run
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
     settings = Settings(
         out=options.out,
         rate_hz=options.rate_hz,

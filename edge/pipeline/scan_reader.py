@@ -79,7 +79,7 @@ class Source:
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
-        self._sleepers: list[Callable[[], None]] = []
+        self._sleepers: dict[object, Callable[[], None]] = {}
         self._capacity_scans = capacity_scans
         self._through = False
         self._open = ExitStack()
@@ -208,20 +208,22 @@ class Source:
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
-            loop.call_soon_threadsafe(woken.set)
+            try:
+                loop.call_soon_threadsafe(woken.set)
+            except RuntimeError:  # the loop was closed, and its task will never go on
+                self._sleepers.pop(woken, None)
 
         with self._lock:
             if self._through or not self._bell.empty():
                 return
-            self._sleepers.append(wake)
+            self._sleepers[woken] = wake
         try:
             async with asyncio.timeout(timeout_s):
                 await woken.wait()
         except TimeoutError:
             pass
-        finally:
-            with self._lock:
-                self._sleepers.remove(wake)
+        finally:  # without the lock: a forgotten task ends wherever it is collected, also in a thread that holds it
+            self._sleepers.pop(woken, None)
 
     def _open_links(self) -> None:
         with ExitStack() as opening:
@@ -262,7 +264,7 @@ class Source:
 
     def _ring(self) -> None:
         self._bell.put(None)
-        for wake in self._sleepers:
+        for wake in tuple(self._sleepers.values()):
             wake()
 
     def _make_room(self) -> None:
