@@ -72,15 +72,15 @@ class Stream:
             clock_ns: clock of the scans, in [ns].
 
         Raises:
-            UsageError: the duration is out of range.
+            UsageError: the duration is out of range; SourceTakenError if the source has another stream.
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)
         self._source = source
-        self._newest = NewestResults()
+        newest = self._newest = NewestResults()
 
         def tell(event: Event) -> None:
-            self._newest.tell(event)
+            newest.tell(event)
             on_event(event)
 
         self._rounds = Rounds(
@@ -105,7 +105,7 @@ class Stream:
         self._worker: ThreadPoolExecutor | None = None
         self._clock_s = clock_s
         self._clock_ns = clock_ns
-        source.before_close(self._close)
+        source.lend(self)
 
     def __repr__(self) -> str:
         statistics = self.statistics
@@ -114,7 +114,7 @@ class Stream:
     @property
     def ended(self) -> bool:
         """True once there are no more results to make."""
-        return self._newest.ended
+        return self._newest.ended or self._error is not None
 
     @property
     def counters(self) -> dict[str, int]:
@@ -301,12 +301,12 @@ class Stream:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
         await asyncio.get_running_loop().run_in_executor(self._worker, self._keep_step)
 
-    def _close(self) -> None:
-        """End the stream; its sinks, which may be closed by now, get nothing more."""
+    def close(self) -> None:
+        """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
         if self._worker is not None:
             self._worker.shutdown()
         self._rounds.sinks = ()
         with self._turn, suppress(ValueError):  # a callback that closes the source is still within the generator
             self._made.clear()
             self._running.close()
-            self._error = UsageError(f"source {self._source.name} is closed: results that were left are old")
+            self._error = UsageError(f"the stream of source {self._source.name} is closed: results that were left are old")

@@ -3,13 +3,14 @@
 import atexit
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
 from contextlib import ExitStack
 from queue import Empty, SimpleQueue
-from typing import Final, Self
+from typing import Final, Protocol, Self
 
-from edge.errors import UsageError
+from edge.errors import SourceTakenError, UsageError
 from edge.pipeline.link_reader import LinkReader, started
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
@@ -21,6 +22,19 @@ from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
+
+
+class Reading(Protocol):
+    """Stream as seen by its source."""
+
+    @property
+    def ended(self) -> bool:
+        """True once it takes no more scans."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
 
 
 class Source:
@@ -83,6 +97,7 @@ class Source:
         self._capacity_scans = capacity_scans
         self._through = False
         self._open = ExitStack()
+        self._stream: Callable[[], Reading | None] = lambda: None  # a stream that was dropped has ended
         self._reader: LinkReader | None = None
 
     def __repr__(self) -> str:
@@ -124,14 +139,28 @@ class Source:
     def close(self) -> None:
         """End its streams, all reading and all threads, and close the links; closing twice does nothing."""
         self._closed = True
+        stream = self._stream()
+        if stream is not None:
+            stream.close()
         if self._opening is not None:
             wait([self._opening])
         atexit.unregister(self.close)
         self._open.close()
 
-    def before_close(self, callback: Callable[[], object]) -> None:
-        """Register a function that is called when an open source is about to close."""
-        self._open.callback(callback)
+    def lend(self, stream: "Reading | None" = None) -> None:
+        """Let a stream take the scans from now on; None only asks whether one could.
+
+        Raises:
+            SourceTakenError: another stream does, which is in use and has not ended.
+        """
+        before = self._stream()
+        if before is not None and not before.ended:
+            raise SourceTakenError(
+                f"source {self.name} has a stream already, and each would get a part of its scans: use that one, or "
+                "end it with close()"
+            )
+        if stream is not None:
+            self._stream = weakref.ref(stream)
 
     @property
     def kind(self) -> SourceKind:
