@@ -309,4 +309,6 @@ class Stream:
         with self._turn, suppress(ValueError):  # a callback that closes the source is still within the generator
             self._made.clear()
             self._running.close()
-            self._error = UsageError(f"the stream of source {self._source.name} is closed: results that were left are old")
+            self._error = UsageError(
+                f"the stream of source {self._source.name} is closed: results that were left are old"
+            )
