@@ -173,5 +173,6 @@ def _of_gains_alone(pad: Pad | None) -> bool:
 
 
 def _serial_number(port: str) -> str | None:
-    device = str(Path(port).resolve())
-    return next((one.serial_number for one in serial_ports() if one.path == device), None)
+    device, ports = str(Path(port).resolve()), serial_ports()
+    number = next((one.serial_number for one in ports if one.path == device), None)
+    return number if [one.serial_number for one in ports].count(number) == 1 else None

@@ -58,6 +58,7 @@ def serial_devices(
     sys_root: Path = SYS_ROOT,
     proc_root: Path = Path("/proc"),
     may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
+    by_path: Path = Path("/dev/serial/by-path"),
 ) -> list[Found]:
     """Describe the serial ports, in their order.
 
@@ -66,6 +67,7 @@ def serial_devices(
         sys_root: folder of sysfs.
         proc_root: folder of procfs.
         may_open: returns True if this user may read and write a path.
+        by_path: folder of links that are named by place.
     """
     serials = [port.serial_number for port in ports]
     found: list[Found] = []
@@ -94,7 +96,7 @@ def serial_devices(
                 port.serial_number,
                 looks_like,
                 port.adapter is not None,
-                f"slcan:serial={port.serial_number}" if alone else f"slcan:{port.path}",
+                f"slcan:serial={port.serial_number}" if alone else f"slcan:{_by_place(port.path, by_path)}",
                 tuple(problems),
             )
         )
@@ -123,21 +125,31 @@ def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | 
 
 def _gs_usb_adapters() -> list[Found]:
     # Imported here, since only this needs libusb.
-    from firmware_bridge.links.gs_usb_devices import gs_usb_devices, udev_rule
+    from firmware_bridge.links.gs_usb_devices import gs_usb_devices, source_name, udev_rule
 
+    present = gs_usb_devices()
     return [
         Found(
             "gs_usb",
-            f"bus {one.bus} device {one.address}",
+            one.where,
             _usb_id(one.usb_id),
             one.serial_number,
             one.product or "gs_usb adapter",
             True,
-            f"gs_usb:{one.serial_number}" if one.serial_number else "gs_usb",
+            source_name(one, present) or "gs_usb",
             () if one.serial_number or one.product else (f"no permission: {udev_rule(one.usb_id)}",),
         )
-        for one in gs_usb_devices()
+        for one in present
     ]
+
+
+def _by_place(path: str, by_path: Path) -> str:
+    """Return the link to a port that is named by its place; its path where there is none."""
+    with suppress(OSError):
+        for link in sorted(by_path.iterdir()):
+            if link.resolve() == Path(path).resolve():
+                return str(link)
+    return path
 
 
 def _usb_id(usb_id: tuple[int, int]) -> str:

@@ -24,7 +24,7 @@ FORMS: Final = (
     "slcan:/dev/ttyUSB0[@baud]",
     "slcan:serial=D30BL366[@baud]",
     "xela-server:ws://HOST[:5000]",
-    "gs_usb[:SERIAL]",
+    "gs_usb[:SERIAL or :BUS-PORT]",
     "can:INTERFACE:CHANNEL",
     "replay:FILE[,FILE]",
     "demo[:loop]",
