@@ -152,6 +152,7 @@ class Stream:
             raise UsageError(
                 f"{self._source.name} is a recording: give `runtime.pose` a PadPose and a time of its scans"
             )
+        self.check_sensor(sensor)
         now_ns = self._clock_ns()
         fields = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
         fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
@@ -197,10 +198,12 @@ class Stream:
             sensor: name of the sensor, such as "4" or "left/4"; None for the only one.
 
         Raises:
-            UsageError: no sensor is named, and there are several; or the source is a recording that is not paced.
+            UsageError: no sensor has this name; or none is named, and there are several; or the source is a recording
+                that is not paced.
             LinkLostError: and other errors, as `__iter__` does, now and at every later call.
         """
         self._round(0.0)
+        self.check_sensor(sensor)
         return self._taken_newest(sensor)
 
     def latest_of_all(self) -> dict[str, Latest]:
@@ -233,11 +236,24 @@ class Stream:
             await self._step_beside(min(POLL_S, self._left_s(end_s, sensor)))
         return self._taken_newest(sensor)
 
+    def check_sensor(self, sensor: str | None) -> None:
+        """Refuse the name of a sensor that does not exist.
+
+        Before the sensors of its link have sent some scans, any name is accepted that one of them may have.
+
+        Raises:
+            UsageError: no sensor has this name; the message lists those that there are.
+        """
+        why = None if sensor is None else self._rounds.no_sensor(sensor)
+        if why is not None:
+            raise UsageError(why)
+
     def _end_s(self, timeout_s: float) -> float:
         check_positive("timeout_s", timeout_s)
         return self._clock_s() + timeout_s
 
     def _left_s(self, end_s: float, sensor: str | None) -> float:
+        self.check_sensor(sensor)
         left_s = end_s - self._clock_s()
         if left_s <= 0 or self._newest.ended:
             name = "" if sensor is None else f" of sensor {sensor}"
