@@ -11,9 +11,14 @@ EdgeError
     +-- SinkClosedError       the reader of the sink has gone
 """
 
+from firmware_bridge.errors import harmless
+
 
 class EdgeError(Exception):
-    """Root of all errors of the runtime."""
+    """Root of all errors of the runtime; its text holds no control characters."""
+
+    def __str__(self) -> str:
+        return harmless(super().__str__())
 
 
 class ModelError(EdgeError, ValueError):

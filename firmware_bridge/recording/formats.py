@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import NpzError, RecordingError
+from firmware_bridge.errors import NpzError, RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry
 from firmware_bridge.recording.csv_poses import CsvPoses
 from firmware_bridge.recording.npz_poses import NPZ_POSES, npz_poses
@@ -98,7 +98,9 @@ def _load_csv(path: Path) -> Recording:
     counts = np.ascontiguousarray(taxels.transpose(0, 3, 1, 2))
     rate_hz = _meta_rate_hz(path.with_name(_META_NAME))
     try:
-        return Recording(path, (Track(path.stem, counts, time_ns=None),), rate_hz, poses=poses.poses())
+        return Recording(
+            path, (Track(harmless(path.stem, kept=""), counts, time_ns=None),), rate_hz, poses=poses.poses()
+        )
     except ValueError as error:
         raise RecordingError(f"{path}: its poses: {error}") from error
 
