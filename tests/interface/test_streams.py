@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -86,3 +87,20 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
         printed = (done.stdout + done.stderr).decode()
         assert done.returncode == (0 if name in path.name else 2) and "Traceback" not in printed
         assert text not in printed and printed.replace("\n", "").isprintable()
+
+
+def test_odd_surroundings_end_in_one_line():
+    """A terminal one column wide, and fewer descriptors than a run needs."""
+    helped = subprocess.run(
+        [*EDGE_SR, "--help"], capture_output=True, text=True, cwd=ROOT, env=os.environ | {"COLUMNS": "1"}
+    )
+    assert (helped.returncode, helped.stderr) == (0, "") and "--source" in helped.stdout
+    done = subprocess.run(
+        [*EDGE_SR, "--source", "demo", "--duration-s", "1"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (14, 14)),
+    )
+    assert done.returncode == 5 and "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"
