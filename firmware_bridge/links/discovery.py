@@ -12,6 +12,7 @@ from typing import Final, Literal, NamedTuple
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
+from firmware_bridge.links.holders import holders
 from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, latency_timer_ms, serial_ports
 
 _IP_TIMEOUT_S: Final = 2.0
@@ -81,8 +82,8 @@ def serial_devices(
         problems: list[str] = []
         if not may_open(port.path):
             problems.append(NO_PERMISSION)
-        if holders := _holders(port.path, proc_root):
-            problems.append(f"held by {', '.join(holders)}: end it first")
+        if held := holders(port.path, proc_root):
+            problems.append(f"held by {', '.join(held)}: end it first")
         latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
         if latency_ms >= SLOW_LATENCY_MS:
             problems.append(
@@ -154,32 +155,6 @@ def _by_place(path: str, by_path: Path) -> str:
 
 def _usb_id(usb_id: tuple[int, int]) -> str:
     return f"{usb_id[0]:04x}:{usb_id[1]:04x}"
-
-
-def _text(path: Path) -> str | None:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return None
-
-
-def _holders(path: str, proc_root: Path) -> list[str]:
-    """List the other processes that have it open; those of other users are visible to root alone."""
-    real_path = Path(path).resolve()
-    holders: list[str] = []
-    for process in sorted(proc_root.glob("[0-9]*"), key=lambda process: int(process.name)):
-        if process.name != str(os.getpid()) and real_path in _opened(process):
-            holders.append(f"{_text(process / 'comm') or 'a process'} ({process.name})")
-    return holders
-
-
-def _opened(process: Path) -> set[Path]:
-    opened: set[Path] = set()
-    with suppress(OSError):  # the process has gone, or is another user's
-        for descriptor in (process / "fd").iterdir():
-            with suppress(OSError):  # closed meanwhile
-                opened.add(descriptor.readlink())
-    return opened
 
 
 def _bitrate_hz(name: str) -> int | None:

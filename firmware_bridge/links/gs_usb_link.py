@@ -18,6 +18,7 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
+from firmware_bridge.links.holders import holders
 from firmware_bridge.links.recognition import Recognised
 from firmware_bridge.links.unread import Unread
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
@@ -36,8 +37,7 @@ MOST_OLD_TRANSFERS: Final = 1000
 """Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
 
 _BUSY = (
-    "in use: end the program that holds it, such as another edge-sr or candump; "
-    "sudo ip link set can0 down frees the kernel's"
+    "end the program that holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
 )
 
 
@@ -227,7 +227,8 @@ def _reason(error: Exception, described: GsUsbDevice) -> str:
     if code in (errno.EACCES, errno.EPERM):
         return f"no permission: {udev_rule(described.usb_id)}"
     if code == errno.EBUSY:
-        return _BUSY
+        held = ", ".join(holders(f"/dev/bus/usb/{described.bus:03d}/{described.address:03d}"))
+        return f"in use{f' by {held}' if held else ''}: {_BUSY}"
     if code == errno.ETIMEDOUT:
         return f"does not answer: unplug it and plug it in again ({described})"
     if code is None:
