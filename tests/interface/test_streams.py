@@ -66,7 +66,7 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
 
 @pytest.mark.parametrize("text", ["\x1b[2J", "\x1b]0;title\x07", "\x9b2J", "\x1b[31m\r"])
 def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
-    """Of a cell, a header, a key, and the name of a file, which need not be UTF-8 either."""
+    """It may stand in a cell, a header, a key, or in the name of a file, which need not be UTF-8 either."""
     columns = [f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz"]
     quoted = json.dumps(text)
     name = os.fsdecode(b"\xfc") + text
