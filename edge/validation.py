@@ -1,6 +1,5 @@
 """Checks of the arguments that a caller of the library passes; each refuses in one line."""
 
-import math
 from collections.abc import Mapping
 from numbers import Integral, Real
 from typing import Any
@@ -8,27 +7,39 @@ from typing import Any
 from edge.errors import UsageError
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
+from firmware_bridge.schedule import POSITIVE
 from firmware_bridge.zeroing.baseline import Baseline
 
 
-def check_positive(name: str, number: Any) -> None:
-    """Check that the value called `name` is a finite number above 0.
+def as_float(value: Any) -> float | None:
+    """Return a number as a float; None for anything else, and for a whole number that no float can hold."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def check_positive(name: str, number: Any, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> None:
+    """Check that the value called `name` is a positive number in a range.
 
     Raises:
         UsageError: it is not.
     """
-    if not isinstance(number, Real) or not 0 < float(number) < math.inf:
-        raise UsageError(f"{name} is {number!r}, expected a positive number")
+    value = as_float(number)
+    if value is None or not low <= value <= high:
+        raise UsageError(f"{name} is {number!r}, expected a positive number, {low:g} to {high:g}")
 
 
 def check_whole(name: str, number: Any, least: int) -> None:
-    """Check that the value called `name` is a whole number from `least`.
+    """Check that the value called `name` is a whole number from `least`, and one that fits into an int32.
 
     Raises:
         UsageError: it is not.
     """
-    if not isinstance(number, Integral) or int(number) < least:
+    if not isinstance(number, Integral) or not least <= int(number) < 2**31:
         raise UsageError(f"{name} is {number!r}, expected a whole number from {least}")
 
 
@@ -88,13 +99,13 @@ def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry)
 
 
 def check_counts_per_newton(counts: float | Mapping[str, float] | None) -> None:
-    """Refuse counts per newton, of all sensors or by name, that are not positive and finite.
+    """Refuse counts per newton, of all sensors or by name, that no pad has.
 
     Raises:
         UsageError: they are out of range.
     """
     if isinstance(counts, Mapping):
         for name, one in counts.items():
-            check_positive(f"counts_per_newton of sensor {name}", one)
+            check_positive(f"counts_per_newton of sensor {name}", one, *PAD_RANGES["counts_per_newton"])
     elif counts is not None:
-        check_positive("counts_per_newton", counts)
+        check_positive("counts_per_newton", counts, *PAD_RANGES["counts_per_newton"])

@@ -15,8 +15,27 @@ Bad frames, skipped bytes and torn scans are counted, never raised.
 """
 
 
+def harmless(text: str, kept: str = "\n\t") -> str:
+    """Return text of a stranger without control characters, which could move a terminal's cursor or set its title.
+
+    Files, devices and models state names and texts, and so do file names, whose bytes need not be UTF-8. What is not
+    printable is escaped, but for `kept`; the result can be encoded.
+    """
+    if text.isprintable():
+        return text
+    return "".join(one if one.isprintable() or one in kept else _escaped(one) for one in text)
+
+
+def _escaped(letter: str) -> str:
+    # Python decodes a byte that is not UTF-8 in a file name as U+DC80 to U+DCFF.
+    return f"\\x{ord(letter) - 0xDC00:02x}" if "\udc80" <= letter <= "\udcff" else ascii(letter)[1:-1]
+
+
 class BridgeError(Exception):
-    """Root of all errors of the bridge."""
+    """Root of all errors of the bridge; its text holds no control characters."""
+
+    def __str__(self) -> str:
+        return harmless(super().__str__())
 
 
 class DeviceError(BridgeError, OSError):

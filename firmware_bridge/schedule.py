@@ -8,6 +8,8 @@ from typing import Final
 LAST_TIME_NS: Final = 1 << 60
 """Latest time in a recording, in [ns] (36 years): sums of two times stay below 2^63."""
 NS_PER_S: Final = 1_000_000_000
+POSITIVE: Final = (1e-9, 1e9)
+"""Range of a positive number that a user gives: times and rates beyond it have no use, and no room in nanoseconds."""
 
 Clock = Callable[[], int]
 """Clock of monotonic time, in [ns]."""

@@ -24,7 +24,7 @@ from firmware_bridge.errors import BridgeError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
 from train.learning.contact_mixture import CONSTANTS, normalise
@@ -107,7 +107,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             pads[name] = learner.pad()
             sys.stdout.write(table(name, learner.contacts, pads[name]) + "\n")
         if options.out is not None:
-            save_sensor_file(options.out, extended(options.out, pads))
+            with changing(options.out):
+                save_sensor_file(options.out, extended(options.out, pads))
             sys.stdout.write(f"{options.out}: pads of {', '.join(pads)}\n")
     except (TrainError, BridgeError, EdgeError) as error:
         sys.stderr.write(f"train.identify: {error}\n")

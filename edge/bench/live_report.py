@@ -4,6 +4,8 @@ from collections.abc import Iterable, Iterator, Sized
 from typing import Final, TextIO, TypeVar
 
 from edge.terminal.progress_bar import Progress
+from edge.terminal.text_wrap import drawn
+from firmware_bridge.errors import harmless
 
 _CLEAR_LINE: Final = "\r\x1b[K"
 _Thing = TypeVar("_Thing")
@@ -41,7 +43,7 @@ class Page:
         if self._bar is not None:
             self._bar.note(text, at_once=True)
         elif self._watched:
-            self._err.write(f"{_CLEAR_LINE}{text}")
+            drawn(self._err).write(f"{_CLEAR_LINE}{harmless(text)}")
             self._err.flush()
 
     def tracked(

@@ -16,6 +16,7 @@ from edge.pipeline.commands import RESET, Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.terminal.heatmap import choose_palette
+from edge.terminal.text_wrap import drawn
 
 if TYPE_CHECKING:
     from edge.view.live_view import LiveView
@@ -73,7 +74,7 @@ class Demo:
             sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
 
     def _print(self, part: DemoScore | DemoMap) -> None:
-        stream = self._stream
+        stream = drawn(self._stream)
         palette = choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)
         columns = shutil.get_terminal_size().columns
         if isinstance(part, DemoMap):

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import errno
 import math
 import os
 import shlex
@@ -73,6 +74,12 @@ def _main(arguments: Sequence[str]) -> int:
         with contextlib.suppress(OSError):  # the terminal may have gone
             print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
         return _exit_code(error)
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE):
+            raise
+        # Anything may meet it: a thread, a link, or Python as it loads a module.
+        print(f"edge-sr: {error.strerror}: allow more of them, ulimit -n 256", file=sys.stderr)
+        return EXIT_SINK
 
 
 def _exit_code(error: BridgeError | EdgeError) -> int:
@@ -213,7 +220,8 @@ def _bench(arguments: Sequence[str]) -> int:
         raise UsageError("--soak is a part of --system: add it")
     from edge.bench.command import Settings, run
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
     settings = Settings(
         out=options.out,
         rate_hz=options.rate_hz,

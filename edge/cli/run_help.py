@@ -26,6 +26,7 @@ sources, SRC (found by itself if one adapter is plugged in):
 slcan:/dev/ttyUSB0[@BAUD]\tserial CAN adapter, such as VScom or CANable
 slcan:serial=D30BL366[@BAUD]\tthe same, by its serial number
 gs_usb[:SERIAL]\tUSB CAN adapter with candleLight firmware
+gs_usb:BUS-PORT\tthe one at this bus and socket, such as gs_usb:1-2.3
 can:socketcan:can0\tadapter that python-can knows
 xela-server:ws://HOST[:5000]\tthe vendor's server
 replay:FILE[,FILE]\trecording: .mcap, .npz or .csv

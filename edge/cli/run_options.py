@@ -25,7 +25,7 @@ from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.pose_sources.open_poses import check_poses
 from edge.sinks.registry import check_apart, check_sink
-from edge.terminal.argument_types import Parser, add_source, not_negative, port, positive, whole
+from edge.terminal.argument_types import Parser, add_source, counts_per_newton, not_negative, port, positive, whole
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
@@ -255,7 +255,7 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
     contact(
         "--counts-per-newton",
         metavar="C",
-        type=positive,
+        type=counts_per_newton,
         help="summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it",
     )
     contact(

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Final, TextIO, cast
 
 from edge.errors import SinkError
+from firmware_bridge.errors import harmless
 
 STDIN, STDOUT, STDERR = 0, 1, 2
 _MODES: Final = {STDIN: os.O_RDONLY, STDOUT: os.O_RDONLY, STDERR: os.O_WRONLY}
@@ -61,17 +62,27 @@ def _stand_in(stream: TextIO, number: int) -> None:
 
 
 class _Checked:
-    """Stream that reports in one line why it cannot be written."""
+    """Stream that reports in one line why it cannot be written, and that escapes control characters.
 
-    def __init__(self, stream: TextIO) -> None:
+    All printed text passes here, and much of it holds names and texts of files, devices and models.
+
+    Attributes:
+        drawn: the same stream for text with control characters of our own.
+    """
+
+    def __init__(self, stream: TextIO, *, escapes: bool = True) -> None:
         self._stream = stream
+        self._escapes = escapes
+        self.drawn = type(self)(stream, escapes=False) if escapes else self
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         with self._refused():
-            self._stream.write(text)
+            encoding = getattr(self._stream, "encoding", None) or "utf-8"
+            shown = harmless(text) if self._escapes else text
+            self._stream.write(shown.encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:

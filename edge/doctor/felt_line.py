@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final, TextIO
 
 from edge.doctor.press_guide import PATIENCE_S, Guide
-from edge.terminal.text_wrap import columns, rewritable
+from edge.terminal.text_wrap import columns, drawn, rewritable
 
 REFRESH_S: Final = 0.1
 BAR: Final = 10
@@ -18,7 +18,7 @@ class FeltLine:
     """Line that is rewritten in place on a terminal; nothing is written elsewhere."""
 
     def __init__(self, stream: TextIO, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._stream = stream
+        self._stream = drawn(stream)
         self._clock_s = clock_s
         self._shown = 0
         self._shown_s = self._asked_s = clock_s()

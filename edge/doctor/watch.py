@@ -55,7 +55,7 @@ class Watch:
         if rate_hz is not None:
             check_positive("rate_hz", rate_hz)
         check_baselines(references, known.model_map.geometry)
-        (self.link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=None)
+        (self.link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=0)
         self.known = with_recorded(known, [self.link])
         self.scans: dict[str, list[Scan]] = {}
         self.duration_s = 0.0

@@ -11,7 +11,7 @@ from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
 
 _AS_WIRED = frozenset({"mounting"})
@@ -76,7 +76,26 @@ def keep(
     Raises:
         SensorFileError: the file cannot be written, or holds values that were not measured this time.
     """
+    with changing(path):
+        return _kept(path, known, port, baselines, found, counts_per_newton, gains, emulated=emulated)
+
+
+def _kept(
+    path: Path,
+    known: SensorFile,
+    port: str | None,
+    baselines: Mapping[str, Baseline],
+    found: Mapping[str, Mounting],
+    counts_per_newton: Mapping[str, float],
+    gains: Mapping[str, Pad],
+    *,
+    emulated: bool,
+) -> SensorFile:
+    before = _before(path)
     entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
+    if known.path is not None and known.path.resolve() == path.resolve():  # a run may have learned gains meanwhile
+        for name, entry in before.sensors.items():
+            entries[name] = replace(entries.get(name, entry), learned=entry.learned)
     for name in sorted({*baselines, *found, *counts_per_newton, *gains}):
         entry = entries.get(name, SensorEntry(as_wired, assumed=_AS_WIRED))
         parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines, "gains": gains}
@@ -103,7 +122,7 @@ def keep(
     # A sensor of a named source is one of several, each with an adapter of its own.
     serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
     written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
-    _refuse_loss(path, _before(path), written)
+    _refuse_loss(path, before, written)
     save_sensor_file(path, written)
     return written
 
@@ -154,5 +173,6 @@ def _of_gains_alone(pad: Pad | None) -> bool:
 
 
 def _serial_number(port: str) -> str | None:
-    device = str(Path(port).resolve())
-    return next((one.serial_number for one in serial_ports() if one.path == device), None)
+    device, ports = str(Path(port).resolve()), serial_ports()
+    number = next((one.serial_number for one in ports if one.path == device), None)
+    return number if [one.serial_number for one in ports].count(number) == 1 else None

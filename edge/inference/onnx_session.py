@@ -21,6 +21,7 @@ from edge.inference.contract import (
 from edge.inference.onnx_guard import read_model
 from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
 from edge.inference.timed_loading import flush_denormals, within_limit
+from firmware_bridge.errors import harmless
 
 WARM_UP_RUNS: Final = 10
 """Runs before run times stay: the first takes 3 to 10 times as long as the tenth."""
@@ -85,7 +86,7 @@ class ModelSession:
                 loading takes too long.
         """
         self._path = path
-        self.name = path.stem.encode(errors="replace").decode()  # records are UTF-8, file names need not be
+        self.name = harmless(path.stem, kept="")
         self._session = load_session(path, threads, stop)
         try:
             self.contract = Contract.from_metadata(self._session.get_modelmeta().custom_metadata_map)

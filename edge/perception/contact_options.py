@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from edge.errors import UsageError
-from edge.validation import check_whole
+from edge.validation import as_float, check_whole
 
 ON_COUNTS: Final = 1500.0
 """Summed z at which a tap begins: about 1.3 N, twelve times the thermal drift of one taxel."""
@@ -47,7 +47,8 @@ class RuntimeOptions:
         on_counts, off_counts = self.contact_on_counts, self.contact_off_counts
         if not 0 < off_counts <= on_counts < math.inf:
             raise UsageError(f"contact thresholds are on {on_counts}, off {off_counts}: expected 0 < off <= on")
-        if not self.idle_reset_s > 0:
+        idle_reset_s = as_float(self.idle_reset_s)
+        if idle_reset_s is None or not idle_reset_s > 0:
             raise UsageError(f"idle_reset_s is {self.idle_reset_s} s, expected more than 0")
         if self.taps is not None:
             check_whole("taps", self.taps, 1)

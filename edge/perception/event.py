@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, get_args
 
+from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import Notice, NoticeKind
 
 ZeroingKind = Literal["zeroing", "zeroed", "in_contact", "given_up", "rest_level"]
@@ -58,6 +59,7 @@ class Event:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"event kind is {self.kind!r}, expected one of {', '.join(sorted(KINDS))}")
+        object.__setattr__(self, "detail", harmless(self.detail))
 
     @property
     def text(self) -> str:

@@ -42,6 +42,7 @@ class Command:
     on: bool = False
 
 
+FORMS: Final = '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}, or a pose'
 RESET: Final = Command("reset")
 ZERO: Final = Command("zero")
 
@@ -51,6 +52,7 @@ class Commands:
 
     Attributes:
         refused: messages that were no command, or came when too many waited.
+        reason: why the first of them since the reason was taken was refused; None without.
         record: begins or ends a recording; nothing is recorded without.
         signalled: asked for by a signal, which may come at any moment, also while another is put; twice is once.
         poses: poses of pads, which wait in a queue of their own: a stream of them must not hold up a command.
@@ -59,6 +61,7 @@ class Commands:
     def __init__(self) -> None:
         """Start empty, without a producer."""
         self.refused = 0
+        self.reason: str | None = None
         self.record: Callable[[bool], object] = lambda on: None
         self.signalled: set[Command] = set()
         self.poses = PoseQueue()
@@ -75,10 +78,11 @@ class Commands:
         """Put a command into the queue."""
         self._waiting.put(command)
 
-    def refuse(self) -> None:
-        """Count a message that is not a command."""
+    def refuse(self, reason: str | None = None) -> None:
+        """Count a message that is not a command; the reason is for the user, where its sender is not told."""
         with self._lock:
             self.refused += 1
+            self.reason = self.reason or reason
 
     def ask(self, producer: Callable[[], object]) -> None:
         """Register a producer without a thread; it is called before commands are taken and must never wait."""
@@ -112,12 +116,14 @@ class Controlled(Protocol):
         ...
 
 
-def obey(commands: Commands, runtime: Controlled) -> None:
-    """Carry out the commands that were put since the last call."""
+def obey(commands: Commands, runtime: Controlled, may_come: Callable[[str], bool] = lambda name: False) -> None:
+    """Carry out the commands that were put since the last call; one for a sensor that `may_come` yet waits for it."""
     for command in commands.poll():
         if command.name == "reset":
             runtime.reset()
-        elif command.name == "zero":
+        elif command.sensor is not None and not commands.full and may_come(command.sensor):
+            commands.put(command)
+        else:
             runtime.zero(command.sensor, force=command.force)
 
 
@@ -181,7 +187,8 @@ class CommandLines:
             return
         command = runtime_command(parsed) if isinstance(parsed, dict) else None
         if command is None:
-            self._commands.refuse()
+            shown = ascii(line[:60].decode(errors="replace"))
+            self._commands.refuse(f"a line on stdin is refused: {shown}{'...' * (len(line) > 60)}, expected {FORMS}")
         else:
             self._commands.put(command)
 

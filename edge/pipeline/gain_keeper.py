@@ -8,7 +8,7 @@ from typing import Final
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
-from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 
 _AS_WIRED: Final = frozenset({"mounting"})
 
@@ -62,13 +62,15 @@ def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = Fals
     Raises:
         SensorFileError: the file cannot be read or written.
     """
-    known = load_sensor_file(path)
-    entry = known.sensors.get(sensor, SensorEntry(assumed=_AS_WIRED))
-    before = entry.learned
-    if (emulated and not entry.emulated) or (before is not None and before.gains_certainty > learned.gains_certainty):
-        return
-    entry = replace(entry, learned=learned)
-    save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: entry}), keep_before=False)
+    with changing(path):
+        known = load_sensor_file(path)
+        entry = known.sensors.get(sensor, SensorEntry(assumed=_AS_WIRED))
+        before = entry.learned
+        surer = before is not None and before.gains_certainty > learned.gains_certainty
+        if surer or (emulated and not entry.emulated):
+            return
+        entry = replace(entry, learned=learned)
+        save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: entry}), keep_before=False)
 
 
 def forget_learned(path: Path, sensor: str) -> None:
@@ -77,9 +79,10 @@ def forget_learned(path: Path, sensor: str) -> None:
     Raises:
         SensorFileError: the file has none, or cannot be read or written.
     """
-    known = load_sensor_file(path)
-    entry = known.sensors.get(sensor)
-    if entry is None or entry.learned is None:
-        there = ", ".join(name for name, one in known.sensors.items() if one.learned is not None) or "of no sensor"
-        raise SensorFileError(f"{path}: no learned gains of sensor {sensor}, expected one that has them: {there}")
-    save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: replace(entry, learned=None)}))
+    with changing(path):
+        known = load_sensor_file(path)
+        entry = known.sensors.get(sensor)
+        if entry is None or entry.learned is None:
+            there = ", ".join(name for name, one in known.sensors.items() if one.learned is not None) or "of no sensor"
+            raise SensorFileError(f"{path}: no learned gains of sensor {sensor}, expected one that has them: {there}")
+        save_sensor_file(path, replace(known, sensors=dict(known.sensors) | {sensor: replace(entry, learned=None)}))

@@ -1,11 +1,13 @@
 """Pairing of the results of several sensors by their times. No I/O, no clock."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from edge.errors import UsageError
 from edge.perception.result import Result
+from edge.pipeline.result_rounds import ALL_HEARD_SCANS
+from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import CAPACITY_SCANS
 from edge.validation import check_positive
 
@@ -28,7 +30,8 @@ def paired(
         apart_s: longest time from the first to the last result of a pair, in [s].
 
     Raises:
-        UsageError: fewer than two sensors, one twice, or the time is out of range.
+        UsageError: fewer than two sensors, one twice, or the time is out of range; while pairs are taken, no sensor
+            has one of these names.
     """
     check_positive("apart_s", apart_s)
     if isinstance(sensors, str) or len(sensors) < 2 or len(set(sensors)) < len(sensors):
@@ -39,14 +42,24 @@ def paired(
 
 def _pairs(results: Iterable[Result], waiting: dict[str, deque[Result]], apart_ns: int) -> Iterator[tuple[Result, ...]]:
     newest_ns = 0
+    missing, heard = set(waiting), Counter[str]()
     for result in results:
-        queue = waiting.get(result.scan.sensor)
+        sensor = result.scan.sensor
+        if missing:
+            missing.discard(sensor)
+            heard[sensor] += 1
+            if isinstance(results, Stream):
+                for name in missing:
+                    results.check_sensor(name)
+        queue = waiting.get(sensor)
         if queue is None:
             continue
         queue.append(result)
         newest_ns = max(newest_ns, result.scan.on_bus_ns)
         yield from _matches(waiting, apart_ns, newest_ns)
     yield from _matches(waiting, apart_ns, None)
+    if missing and max(heard.values(), default=0) >= ALL_HEARD_SCANS:
+        raise UsageError(f"no result of sensor {min(missing)!r}: there are those of {', '.join(sorted(heard))}")
 
 
 def _matches(waiting: dict[str, deque[Result]], apart_ns: int, newest_ns: int | None) -> Iterator[tuple[Result, ...]]:

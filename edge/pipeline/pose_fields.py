@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
+from edge.validation import as_float
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import is_sensor_name
@@ -50,7 +51,7 @@ def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
         raise PoseError("sensor", f"sensor is {_shown(sensor)}, expected the name of a sensor, or null")
     if not isinstance(holds, bool):
         raise PoseError("holds", f"holds is {_shown(holds)}, expected true or false")
-    if not isinstance(time_ns, int) or isinstance(time_ns, bool) or time_ns < 0:
+    if not isinstance(time_ns, int) or isinstance(time_ns, bool) or not 0 <= time_ns < 2**63:
         raise PoseError("time_ns", f"time_ns is {_shown(time_ns)}, expected a whole number of nanoseconds")
     try:
         pose = PadPose(**values)
@@ -76,14 +77,15 @@ def in_time(timed: TimedPose, now_ns: int) -> TimedPose:
 
 
 def _number(name: str, value: object) -> float:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except OverflowError:
-            pass
-    raise PoseError(name, f"{name} is {'missing' if value is None else _shown(value)}, expected a number")
+    number = as_float(value)
+    if number is None:
+        raise PoseError(name, f"{name} is {'missing' if value is None else _shown(value)}, expected a number")
+    return number
 
 
 def _shown(value: object) -> str:
     """Return a value of a stranger in a few printable characters."""
-    return ascii(value)[:40]
+    try:
+        return ascii(value)[:40]
+    except ValueError:
+        return "a number of too many digits"

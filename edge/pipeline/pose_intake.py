@@ -1,6 +1,6 @@
 """Way of poses into the runtime, with their counts, and detection of a source of them that falls silent."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
@@ -43,7 +43,13 @@ class PoseIntake:
     """
 
     def __init__(
-        self, runtime: Posed, queue: PoseQueue, *, recorded: bool = False, unused_by: str | None = None
+        self,
+        runtime: Posed,
+        queue: PoseQueue,
+        *,
+        recorded: bool = False,
+        unused_by: str | None = None,
+        no_sensor: Callable[[str], str | None] = lambda name: None,
     ) -> None:
         """Begin without a pose.
 
@@ -52,12 +58,14 @@ class PoseIntake:
             queue: of the poses that come from outside.
             recorded: scans are of another time than now, so that no pose of now belongs to them.
             unused_by: name of the model, where neither it nor any sink uses poses.
+            no_sensor: returns why no sensor has a name.
         """
         self.used = 0
         self._runtime = runtime
         self._queue = queue
         self._recorded = recorded
         self._unused_by = unused_by
+        self._no_sensor = no_sensor
         self._played: set[str | None] = set()
         self._courses: dict[str | None, _Course] = {}
         self._reported_ns: dict[str, int] = {}
@@ -86,7 +94,9 @@ class PoseIntake:
             waiting = [one for one in waiting if not self._refused_for_recording(one)]
         taken: list[TimedPose] = []
         for timed in (*recorded, *waiting):
-            if self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
+            if timed.sensor is not None and (why := self._no_sensor(timed.sensor)) is not None:
+                self._queue.refuse(PoseError("sensor", why))
+            elif self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
                 taken.append(replace(timed, used_from_ns=now_ns if first_scan_ns is None else first_scan_ns))
             else:
                 earlier = f"that of the pose{_of(timed.sensor)} before"

@@ -40,6 +40,12 @@ RESTLESS_NS: Final = 1_000_000_000
 """Time after a contact, in [ns], during which every scan is still handed on at once."""
 
 
+ALL_HEARD_SCANS: Final = 10
+"""Scans of one sensor of a link after which all sensors of that link have sent some."""
+REFUSED_AGAIN_S: Final = 10.0
+"""Time until another refused command is told, in [s]: a stream of them must not flood."""
+
+
 class Rounds:
     """Maker of results from scans, commands and poses, for a stream; its settings are those of the stream.
 
@@ -78,11 +84,13 @@ class Rounds:
         self._duration_s = duration_s
         self._commands = commands
         unused_by = None if any(sink.uses_poses for sink in self.sinks) else runtime.unposed
-        self._intake = PoseIntake(runtime, self.poses, recorded=source.patient, unused_by=unused_by)
+        self._intake = PoseIntake(
+            runtime, self.poses, recorded=source.patient, unused_by=unused_by, no_sensor=self.no_sensor
+        )
         self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
         self._deadlines: dict[str, Deadline] = {}
         self._now_ns = 0
-        self._waited_s = -math.inf
+        self._waited_s = self._refused_s = -math.inf
         self._clock_s = clock_s
         self._clock_ns = clock_ns
         self._received: dict[str, int] | None = None
@@ -129,8 +137,7 @@ class Rounds:
         try:
             for taken in self._taken():
                 if self._commands is not None:
-                    obey(self._commands, self._runtime)
-                    self.statistics.commands_refused = self._commands.refused
+                    self._obey(self._commands)
                 for one in taken:
                     if isinstance(one, TimedPose):
                         self.poses.begun = True
@@ -161,6 +168,32 @@ class Rounds:
             yield from self._patterns()
             raise
         yield from self._patterns()
+
+    def no_sensor(self, name: str) -> str | None:
+        """Return why no sensor has this name; None if one has, or if one that has it may still come.
+
+        The sensors of a link send their scans in turn: once one has sent many, all have sent some.
+        """
+        heard = self.statistics.scans_of_each()
+        if name in heard or name in self._runtime.expected:
+            return None
+        prefix = max((prefix for prefix in self._source.prefixes if name.startswith(prefix)), key=len, default=None)
+        if prefix is None:
+            return f"no sensor {name!r}: the names begin with {', '.join(self._source.prefixes)}"
+        most = max((scans for other, scans in heard.items() if other.startswith(prefix)), default=0)
+        return f"no sensor {name!r}: sensors are {', '.join(sorted(heard))}" if most >= ALL_HEARD_SCANS else None
+
+    def _obey(self, commands: Commands) -> None:
+        def may_come(name: str) -> bool:
+            return name not in self.statistics.scans_of_each() and self.no_sensor(name) is None
+
+        obey(commands, self._runtime, may_come)
+        self.statistics.commands_refused = commands.refused
+        now_s = self._clock_s()
+        if commands.reason is not None and now_s - self._refused_s >= REFUSED_AGAIN_S:
+            self._refused_s = now_s
+            self._tell(Event(self._clock_ns(), "refused", None, commands.reason))
+            commands.reason = None
 
     def _rest(self) -> None:
         """Let the sinks do what is due, four times a second while no scan comes."""

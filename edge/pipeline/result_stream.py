@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from numbers import Real
 
 from edge.errors import NoResultError, UsageError
 from edge.perception.event import Event
@@ -73,15 +72,15 @@ class Stream:
             clock_ns: clock of the scans, in [ns].
 
         Raises:
-            UsageError: the duration is out of range.
+            UsageError: the duration is out of range; SourceTakenError if the source has another stream.
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)
         self._source = source
-        self._newest = NewestResults()
+        newest = self._newest = NewestResults()
 
         def tell(event: Event) -> None:
-            self._newest.tell(event)
+            newest.tell(event)
             on_event(event)
 
         self._rounds = Rounds(
@@ -106,7 +105,7 @@ class Stream:
         self._worker: ThreadPoolExecutor | None = None
         self._clock_s = clock_s
         self._clock_ns = clock_ns
-        source.before_close(self._close)
+        source.lend(self)
 
     def __repr__(self) -> str:
         statistics = self.statistics
@@ -115,7 +114,7 @@ class Stream:
     @property
     def ended(self) -> bool:
         """True once there are no more results to make."""
-        return self._newest.ended
+        return self._newest.ended or self._error is not None
 
     @property
     def counters(self) -> dict[str, int]:
@@ -153,9 +152,9 @@ class Stream:
             raise UsageError(
                 f"{self._source.name} is a recording: give `runtime.pose` a PadPose and a time of its scans"
             )
+        self.check_sensor(sensor)
         now_ns = self._clock_ns()
-        numbers = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
-        fields = {name: float(value) if isinstance(value, Real) else value for name, value in numbers.items()}
+        fields = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
         fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
         try:
             self._rounds.poses.put(pose_of_fields(fields, now_ns))
@@ -199,10 +198,12 @@ class Stream:
             sensor: name of the sensor, such as "4" or "left/4"; None for the only one.
 
         Raises:
-            UsageError: no sensor is named, and there are several; or the source is a recording that is not paced.
+            UsageError: no sensor has this name; or none is named, and there are several; or the source is a recording
+                that is not paced.
             LinkLostError: and other errors, as `__iter__` does, now and at every later call.
         """
         self._round(0.0)
+        self.check_sensor(sensor)
         return self._taken_newest(sensor)
 
     def latest_of_all(self) -> dict[str, Latest]:
@@ -235,11 +236,24 @@ class Stream:
             await self._step_beside(min(POLL_S, self._left_s(end_s, sensor)))
         return self._taken_newest(sensor)
 
+    def check_sensor(self, sensor: str | None) -> None:
+        """Refuse the name of a sensor that does not exist.
+
+        Before the sensors of its link have sent some scans, any name is accepted that one of them may have.
+
+        Raises:
+            UsageError: no sensor has this name; the message lists those that there are.
+        """
+        why = None if sensor is None else self._rounds.no_sensor(sensor)
+        if why is not None:
+            raise UsageError(why)
+
     def _end_s(self, timeout_s: float) -> float:
         check_positive("timeout_s", timeout_s)
         return self._clock_s() + timeout_s
 
     def _left_s(self, end_s: float, sensor: str | None) -> float:
+        self.check_sensor(sensor)
         left_s = end_s - self._clock_s()
         if left_s <= 0 or self._newest.ended:
             name = "" if sensor is None else f" of sensor {sensor}"
@@ -303,12 +317,14 @@ class Stream:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
         await asyncio.get_running_loop().run_in_executor(self._worker, self._keep_step)
 
-    def _close(self) -> None:
-        """End the stream; its sinks, which may be closed by now, get nothing more."""
+    def close(self) -> None:
+        """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
         if self._worker is not None:
             self._worker.shutdown()
         self._rounds.sinks = ()
         with self._turn, suppress(ValueError):  # a callback that closes the source is still within the generator
             self._made.clear()
             self._running.close()
-            self._error = UsageError(f"source {self._source.name} is closed: results that were left are old")
+            self._error = UsageError(
+                f"the stream of source {self._source.name} is closed: results that were left are old"
+            )

@@ -129,6 +129,10 @@ class Statistics:
         """Count one event."""
         self.events[event.kind] = self.events.get(event.kind, 0) + 1
 
+    def scans_of_each(self) -> dict[str, int]:
+        """Return the number of scans of each sensor; any thread may call it."""
+        return {name: span.scans for name, span in list(self._spans.items())}
+
     def rate_hz(self) -> dict[str, float]:
         """Return the scans a second of each sensor over the whole run, for sensors with two or more."""
         return {name: rate_hz for name, span in self._spans.items() if (rate_hz := span.rate_hz()) is not None}

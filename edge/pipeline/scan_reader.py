@@ -3,13 +3,14 @@
 import atexit
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
 from contextlib import ExitStack
 from queue import Empty, SimpleQueue
-from typing import Final, Self
+from typing import Final, Protocol, Self
 
-from edge.errors import UsageError
+from edge.errors import SourceTakenError, UsageError
 from edge.pipeline.link_reader import LinkReader, started
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
@@ -21,6 +22,19 @@ from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
+
+
+class Reading(Protocol):
+    """Stream as seen by its source."""
+
+    @property
+    def ended(self) -> bool:
+        """True once it takes no more scans."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
 
 
 class Source:
@@ -35,6 +49,7 @@ class Source:
         name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all their names.
         patient: True if the link waits for its reader, and its scans have another clock than now.
         states_poses: True if poses of some sensors come with the scans, as in a recording.
+        prefixes: beginnings of the names of the sensors of each link, such as "left/".
         sensor_file: properties of its sensors.
         rate_hz: requested rate of each sensor, in [Hz]; None without.
         overruns: scans discarded.
@@ -64,6 +79,7 @@ class Source:
         _one_kind(links)
         self.name = ", ".join(link.name for link in links)
         self.patient = len(links) == 1 and links[0].patient
+        self.prefixes = tuple(link.prefix for link in links)
         self.states_poses = any(link.states_poses for link in links)
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
         self.rate_hz = rate_hz
@@ -79,10 +95,11 @@ class Source:
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
-        self._sleepers: list[Callable[[], None]] = []
+        self._sleepers: dict[object, Callable[[], None]] = {}
         self._capacity_scans = capacity_scans
         self._through = False
         self._open = ExitStack()
+        self._stream: Callable[[], Reading | None] = lambda: None  # a stream that was dropped has ended
         self._reader: LinkReader | None = None
 
     def __repr__(self) -> str:
@@ -124,14 +141,28 @@ class Source:
     def close(self) -> None:
         """End its streams, all reading and all threads, and close the links; closing twice does nothing."""
         self._closed = True
+        stream = self._stream()
+        if stream is not None:
+            stream.close()
         if self._opening is not None:
             wait([self._opening])
         atexit.unregister(self.close)
         self._open.close()
 
-    def before_close(self, callback: Callable[[], object]) -> None:
-        """Register a function that is called when an open source is about to close."""
-        self._open.callback(callback)
+    def lend(self, stream: "Reading | None" = None) -> None:
+        """Let a stream take the scans from now on; None only asks whether one could.
+
+        Raises:
+            SourceTakenError: another stream does, which is in use and has not ended.
+        """
+        before = self._stream()
+        if before is not None and not before.ended:
+            raise SourceTakenError(
+                f"source {self.name} has a stream already, and each would get a part of its scans: use that one, or "
+                "end it with close()"
+            )
+        if stream is not None:
+            self._stream = weakref.ref(stream)
 
     @property
     def kind(self) -> SourceKind:
@@ -208,20 +239,22 @@ class Source:
         loop, woken = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
-            loop.call_soon_threadsafe(woken.set)
+            try:
+                loop.call_soon_threadsafe(woken.set)
+            except RuntimeError:  # the loop was closed, and its task will never go on
+                self._sleepers.pop(woken, None)
 
         with self._lock:
             if self._through or not self._bell.empty():
                 return
-            self._sleepers.append(wake)
+            self._sleepers[woken] = wake
         try:
             async with asyncio.timeout(timeout_s):
                 await woken.wait()
         except TimeoutError:
             pass
-        finally:
-            with self._lock:
-                self._sleepers.remove(wake)
+        finally:  # without the lock: a forgotten task ends wherever it is collected, also in a thread that holds it
+            self._sleepers.pop(woken, None)
 
     def _open_links(self) -> None:
         with ExitStack() as opening:
@@ -262,7 +295,7 @@ class Source:
 
     def _ring(self) -> None:
         self._bell.put(None)
-        for wake in self._sleepers:
+        for wake in tuple(self._sleepers.values()):
             wake()
 
     def _make_room(self) -> None:

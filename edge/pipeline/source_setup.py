@@ -46,7 +46,7 @@ def links_to(
     known: SensorFile,
     *,
     rate_hz: float | None = None,
-    give_up_s: float | None = math.inf,
+    give_up_s: float = math.inf,
 ) -> list[Link]:
     """Return the links to the requested sources, not yet entered.
 
@@ -54,7 +54,7 @@ def links_to(
         texts: as in firmware_bridge.links.registry; without any, the adapter of the sensor file or the only one.
         known: settings of the sensors.
         rate_hz: rate at which recordings are played, in [Hz].
-        give_up_s: longest time that a lost source may be away, in [s]; None leaves its loss to the caller.
+        give_up_s: longest time that a lost source may be away, in [s]; 0: its first loss is raised.
 
     Raises:
         SourceError: as in open_sources; NoDeviceError and RecordingError as well.

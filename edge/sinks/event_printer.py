@@ -8,7 +8,8 @@ from typing import Final, TextIO
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.terminal.text_wrap import rewritable
+from edge.terminal.text_wrap import drawn, rewritable
+from firmware_bridge.errors import harmless
 from firmware_bridge.silence import SHOWN_AT_REST_S
 
 CLEAR_LINE: Final = "\r\x1b[K"
@@ -73,15 +74,11 @@ class MessageSink(Sink):
         if self._stream is None:
             return
         try:
-            self._stream.write(f"{CLEAR_LINE if rewritable(self._stream) else ''}edge-sr: {_harmless(text)}\n")
+            start = CLEAR_LINE if rewritable(self._stream) else ""
+            drawn(self._stream).write(f"{start}edge-sr: {harmless(text, kept='')}\n")
             self._stream.flush()
         except OSError:
             self._stream = None  # the window was closed; that ends no recording
 
     def close(self) -> None:
         """Do nothing: there is nothing to finish."""
-
-
-def _harmless(text: str) -> str:
-    """Escape control characters, because text from devices and files could move the cursor or set the title."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

@@ -73,11 +73,6 @@ def event_record(event: Event, counters: Mapping[str, int], source: str | None) 
         "source": source,
         "state": "event",
         "event": event.kind,
-        "note": encodable(event.text),
+        "note": event.text,
         "counters": dict(counters),
     }
-
-
-def encodable(text: str) -> str:
-    """Replace characters that UTF-8 cannot hold: the name of a file may be any bytes, and JSON is UTF-8."""
-    return text.encode(errors="replace").decode()

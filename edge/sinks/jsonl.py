@@ -6,7 +6,8 @@ import stat
 import sys
 import threading
 from collections.abc import Collection, Mapping
-from io import BufferedWriter
+from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from typing import Final
 
@@ -81,21 +82,22 @@ class JsonLinesSink(Sink):
             if not self._lossless or self._stop.wait(_ROOM_S):
                 self.unwritten += 1
                 return
+        written = 0
         try:
-            self._file.write(line)
-            self._file.flush()
+            while written < len(line):  # a disk that fills takes a part of it, and refuses the rest
+                written += self._file.write(line[written:])
         except BrokenPipeError as error:
             raise SinkClosedError(f"the reader of {self._target} has gone") from error
         except OSError as error:
+            if not self._may_be_full:
+                whole_bytes = os.lseek(self._file.fileno(), -written, os.SEEK_CUR)
+                os.ftruncate(self._file.fileno(), whole_bytes)
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
 
     def close(self) -> None:
-        """Close the file. Every record is on its way already; what an error kept back is lost and was reported."""
-        try:
+        """Close the file. Every record is on its way already."""
+        with suppress(OSError):
             self._file.close()
-        except OSError:
-            # The writer tries its last record again, and fails again as it did in `write`.
-            return
 
 
 def record_line(result: Result, counters: Mapping[str, int], form: RecordForm = _ALL) -> bytes:
@@ -108,15 +110,15 @@ def event_line(event: Event, counters: Mapping[str, int], source: str | None) ->
     return orjson.dumps(event_record(event, counters, source), option=orjson.OPT_APPEND_NEWLINE)
 
 
-def _open(target: str) -> BufferedWriter:
+def _open(target: str) -> FileIO:
     if target == "-":
         if sys.stdout is None:
             raise OSError(0, "it is closed")
         # A writer of our own: Python would try again at exit to write what an error leaves in sys.stdout.
-        return os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+        return FileIO(os.dup(sys.stdout.fileno()), "wb")
     path = Path(target)
     if not path.is_fifo():
-        return path.open("wb")
+        return FileIO(path, "wb")
     descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)  # a blocking open would wait for a reader
     os.set_blocking(descriptor, True)
-    return os.fdopen(descriptor, "wb")
+    return FileIO(descriptor, "wb")

@@ -10,7 +10,7 @@ from edge.perception.event import Event
 from edge.perception.result import NextTap, Result
 from edge.pipeline.scan_rate import Rate
 from edge.pipeline.sink import Sink
-from edge.terminal.text_wrap import rewritable
+from edge.terminal.text_wrap import drawn, rewritable
 from firmware_bridge.silence import SHOWN_AT_REST_S, SHOWN_SILENT_S
 
 REFRESH_S: Final = 0.1
@@ -80,7 +80,7 @@ class StatusSink(Sink):
     def _show(self, end: str = "") -> None:
         # The last column stays free: some terminals wrap as soon as it is filled.
         try:
-            self._stream.write("\r" + self._fitted(self._columns() - 1) + CLEAR_TO_END + end)
+            drawn(self._stream).write("\r" + self._fitted(self._columns() - 1) + CLEAR_TO_END + end)
             self._stream.flush()
         except OSError:
             self._terminal = False  # the window was closed; that ends no recording

@@ -9,6 +9,8 @@ from typing import Any, Final, NoReturn
 from edge import __version__
 from edge.terminal.help_format import HelpFormatter
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
+from firmware_bridge.scans.pad_constants import PAD_RANGES
+from firmware_bridge.schedule import POSITIVE
 
 EXIT_USAGE: Final = 2
 MOST_PORT: Final = 65535
@@ -51,15 +53,20 @@ def add_source(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action
     return add
 
 
-def positive(text: str) -> float:
-    """Parse a number above 0."""
+def positive(text: str, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> float:
+    """Parse a positive number in a range."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    if not low <= value <= high:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number, {low:g} to {high:g}")
     return value
+
+
+def counts_per_newton(text: str) -> float:
+    """Parse the sensitivity of a pad."""
+    return positive(text, *PAD_RANGES["counts_per_newton"])
 
 
 def not_negative(text: str) -> float:
@@ -71,7 +78,7 @@ def whole(least: int) -> Callable[[str], int]:
     """Return a parser of whole numbers from `least`."""
 
     def whole_number(text: str) -> int:
-        if not (text.isascii() and text.isdigit()) or int(text) < least:
+        if not (text.isascii() and text.isdigit() and len(text) < 10) or int(text) < least:
             raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least}")
         return int(text)
 
@@ -80,7 +87,7 @@ def whole(least: int) -> Callable[[str], int]:
 
 def port(text: str) -> int:
     """Parse a port of this machine; 0 stands for any free one."""
-    if not (text.isascii() and text.isdigit()) or int(text) > MOST_PORT:
+    if not (text.isascii() and text.isdigit() and len(text) < 10) or int(text) > MOST_PORT:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a port: expected 0 to {MOST_PORT}, or none; write FILE or command before it"
         )

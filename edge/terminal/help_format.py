@@ -4,6 +4,8 @@ import argparse
 import textwrap
 from typing import Final
 
+from edge.terminal.text_wrap import FEWEST_COLUMNS
+
 MOST_COLUMNS: Final = 80
 _GAP: Final = 2
 
@@ -17,7 +19,7 @@ class HelpFormatter(argparse.HelpFormatter):
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog)
-        self._width = min(self._width, MOST_COLUMNS)
+        self._width = max(min(self._width, MOST_COLUMNS), FEWEST_COLUMNS)
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return "\n".join(

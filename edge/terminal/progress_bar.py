@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Self, TextIO, TypeVar
 
+from edge.terminal.text_wrap import drawn
+from firmware_bridge.errors import harmless
+
 if TYPE_CHECKING:
     from tqdm import tqdm
 
@@ -45,7 +48,7 @@ class Progress:
             clock_s: monotonic, in [s].
             delay_s: time before the bar appears, in [s].
         """
-        self._what, self._total, self._unit = what, total, unit
+        self._what, self._total, self._unit = harmless(what, kept=""), total, unit
         self._before = self._done = done
         self._note = ""
         self._stream = sys.stderr if stream is None else stream
@@ -105,7 +108,7 @@ class Progress:
             initial=self._before,
             unit=self._unit,
             unit_scale=True,
-            file=self._stream,
+            file=drawn(self._stream),
             leave=False,
             dynamic_ncols=True,
             miniters=0,

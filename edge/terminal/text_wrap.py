@@ -18,6 +18,11 @@ def rewritable(stream: TextIO | None) -> bool:
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
+def drawn(stream: TextIO) -> TextIO:
+    """Return the stream for text with control characters of our own, which it otherwise escapes."""
+    return getattr(stream, "drawn", stream)
+
+
 def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[str]:
     """Wrap text into lines.
 

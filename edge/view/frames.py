@@ -10,8 +10,9 @@ from edge.inference.contract import Contract
 from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
-from edge.sinks.json_encoding import encodable, event_record, record
+from edge.sinks.json_encoding import event_record, record
 from edge.view.run_snapshot import Newest, NumberedEvent, Point, RunSnapshot
+from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import PlayerState
 from firmware_bridge.silence import SENSOR_SILENT_NS
@@ -143,7 +144,7 @@ def hello(run: Run, recording: Path | None) -> bytes:
         "kind": "hello",
         "version": VERSION,
         "run": run.id,
-        "name": encodable(run.name),
+        "name": harmless(run.name),
         "source": run.kind,
         "model": run.model,
         "taps": contract.taps,
@@ -187,7 +188,7 @@ def _event(fields: Mapping[str, Any], age_ns: int, number: Mapping[str, int]) ->
 
 
 def _path(path: Path | None) -> str | None:
-    return None if path is None else encodable(str(path))
+    return None if path is None else harmless(str(path))
 
 
 def _drawn(point: Point, first_ns: int) -> list[float | None]:

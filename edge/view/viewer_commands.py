@@ -5,6 +5,7 @@ import math
 from typing import Any, Final
 
 from edge.pipeline.commands import WAITING, Command, Commands, runtime_command
+from edge.validation import as_float
 from edge.view.viewer_state import Viewer
 from firmware_bridge.links.replay_player import Player
 
@@ -56,7 +57,8 @@ def _play(parsed: dict[str, Any], message: str | bytes, player: Player | None) -
     if player is None:
         return "no recording is played that a page can steer"
     at_s, speed, on = (parsed.get(key) for key in ("at_s", "speed", "on"))
-    numbers = all(type(one) in (int, float) and math.isfinite(one) for one in (at_s, speed) if one is not None)
+    floats = [as_float(one) for one in (at_s, speed) if one is not None]
+    numbers = all(one is not None and math.isfinite(one) for one in floats)
     known = parsed.keys() <= {"cmd", "at_s", "speed", "on"} and (on is None or isinstance(on, bool))
     if not (numbers and known and (speed is None or speed > 0)):
         return f'{_shown(message)}: expected {{"cmd": "play"}} with numbers "at_s", "speed", and "on": true or false'

@@ -84,6 +84,7 @@ class Link(Protocol):
             not available, or equals `kind`.
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
         states_poses: True where poses of the sensors come with the scans.
+        prefix: beginning of the names of all its sensors.
     """
 
     name: str
@@ -95,6 +96,7 @@ class Link(Protocol):
     origin: SourceKind | None = None
     mountings: Mapping[str, Mounting] = MappingProxyType({})
     states_poses: bool = False
+    prefix: str = ""
 
     def __enter__(self) -> "Link": ...
 

@@ -12,6 +12,7 @@ from typing import Final, Literal, NamedTuple
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
+from firmware_bridge.links.holders import holders
 from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, latency_timer_ms, serial_ports
 
 _IP_TIMEOUT_S: Final = 2.0
@@ -58,6 +59,7 @@ def serial_devices(
     sys_root: Path = SYS_ROOT,
     proc_root: Path = Path("/proc"),
     may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
+    by_path: Path = Path("/dev/serial/by-path"),
 ) -> list[Found]:
     """Describe the serial ports, in their order.
 
@@ -66,6 +68,7 @@ def serial_devices(
         sys_root: folder of sysfs.
         proc_root: folder of procfs.
         may_open: returns True if this user may read and write a path.
+        by_path: folder of links that are named by place.
     """
     serials = [port.serial_number for port in ports]
     found: list[Found] = []
@@ -79,8 +82,8 @@ def serial_devices(
         problems: list[str] = []
         if not may_open(port.path):
             problems.append(NO_PERMISSION)
-        if holders := _holders(port.path, proc_root):
-            problems.append(f"held by {', '.join(holders)}: end it first")
+        if held := holders(port.path, proc_root):
+            problems.append(f"held by {', '.join(held)}: end it first")
         latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
         if latency_ms >= SLOW_LATENCY_MS:
             problems.append(
@@ -94,7 +97,7 @@ def serial_devices(
                 port.serial_number,
                 looks_like,
                 port.adapter is not None,
-                f"slcan:serial={port.serial_number}" if alone else f"slcan:{port.path}",
+                f"slcan:serial={port.serial_number}" if alone else f"slcan:{_by_place(port.path, by_path)}",
                 tuple(problems),
             )
         )
@@ -123,51 +126,35 @@ def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | 
 
 def _gs_usb_adapters() -> list[Found]:
     # Imported here, since only this needs libusb.
-    from firmware_bridge.links.gs_usb_devices import gs_usb_devices, udev_rule
+    from firmware_bridge.links.gs_usb_devices import gs_usb_devices, source_name, udev_rule
 
+    present = gs_usb_devices()
     return [
         Found(
             "gs_usb",
-            f"bus {one.bus} device {one.address}",
+            one.where,
             _usb_id(one.usb_id),
             one.serial_number,
             one.product or "gs_usb adapter",
             True,
-            f"gs_usb:{one.serial_number}" if one.serial_number else "gs_usb",
+            source_name(one, present) or "gs_usb",
             () if one.serial_number or one.product else (f"no permission: {udev_rule(one.usb_id)}",),
         )
-        for one in gs_usb_devices()
+        for one in present
     ]
+
+
+def _by_place(path: str, by_path: Path) -> str:
+    """Return the link to a port that is named by its place; its path where there is none."""
+    with suppress(OSError):
+        for link in sorted(by_path.iterdir()):
+            if link.resolve() == Path(path).resolve():
+                return str(link)
+    return path
 
 
 def _usb_id(usb_id: tuple[int, int]) -> str:
     return f"{usb_id[0]:04x}:{usb_id[1]:04x}"
-
-
-def _text(path: Path) -> str | None:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return None
-
-
-def _holders(path: str, proc_root: Path) -> list[str]:
-    """List the other processes that have it open; those of other users are visible to root alone."""
-    real_path = Path(path).resolve()
-    holders: list[str] = []
-    for process in sorted(proc_root.glob("[0-9]*"), key=lambda process: int(process.name)):
-        if process.name != str(os.getpid()) and real_path in _opened(process):
-            holders.append(f"{_text(process / 'comm') or 'a process'} ({process.name})")
-    return holders
-
-
-def _opened(process: Path) -> set[Path]:
-    opened: set[Path] = set()
-    with suppress(OSError):  # the process has gone, or is another user's
-        for descriptor in (process / "fd").iterdir():
-            with suppress(OSError):  # closed meanwhile
-                opened.add(descriptor.readlink())
-    return opened
 
 
 def _bitrate_hz(name: str) -> int | None:

@@ -1,5 +1,6 @@
 """List of the gs_usb adapters of this machine, and selection of one. Loads pyusb and libusb."""
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple
@@ -9,6 +10,7 @@ import usb.util
 from usb.backend import IBackend
 
 from firmware_bridge.errors import DeviceError, NoDeviceError
+from firmware_bridge.links.recognition import Recognised
 
 GS_USB_IDS: Final = {
     (0x1D50, 0x606F): "candleLight",  # and most of its kin, CANable among them
@@ -19,23 +21,37 @@ GS_USB_IDS: Final = {
 }
 """Adapters by vendor and product id. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity."""
 
+_PLACE: Final = re.compile(r"[0-9]+-[0-9]+(\.[0-9]+)*")
+"""Bus and sockets, as the kernel names a USB device."""
+
 # A device without readable texts is still listed: pyusb reports "no langid" where it may not open it.
 _NO_TEXT: Final = (usb.core.USBError, ValueError, NotImplementedError)
 
 
 class GsUsbDevice(NamedTuple):
-    """One adapter. `serial_number` and `product` are None where they cannot be read."""
+    """One adapter. `serial_number` and `product` are None where they cannot be read; `place` is such as "1-2.3"."""
 
     bus: int
     address: int
     usb_id: tuple[int, int]
     serial_number: str | None
     product: str | None
+    place: str | None = None
+
+    @property
+    def identity(self) -> tuple[object, ...] | None:
+        """Its identity at any socket; None without a serial number."""
+        return None if self.serial_number is None else (self.usb_id, self.serial_number)
+
+    @property
+    def where(self) -> str:
+        """Its address until it is unplugged, and the bus and sockets that lead to it."""
+        return f"bus {self.bus} device {self.address}{f' at {self.place}' if self.place else ''}"
 
     def __str__(self) -> str:
         serial = f" serial={self.serial_number}" if self.serial_number else ""
         usb_id = f"{self.usb_id[0]:04x}:{self.usb_id[1]:04x}"
-        return f"bus {self.bus} device {self.address} {usb_id}{serial} ({self.product or GS_USB_IDS[self.usb_id]})"
+        return f"{self.where} {usb_id}{serial} ({self.product or GS_USB_IDS[self.usb_id]})"
 
 
 def usb_backend() -> IBackend:
@@ -63,28 +79,57 @@ def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
     return [described for described, _ in _found(backend)]
 
 
-def find_gs_usb(serial_number: str | None, backend: IBackend | None = None) -> tuple[GsUsbDevice, usb.core.Device]:
-    """Return the adapter with this serial number; for None the only one there is.
+def find_gs_usb(
+    wanted: str | None, known: Recognised[GsUsbDevice], backend: IBackend | None = None
+) -> tuple[GsUsbDevice, usb.core.Device]:
+    """Return the wanted adapter, and let `known` learn it.
+
+    Args:
+        wanted: its serial number, or its place such as "1-2.3"; None for the only one there is.
+        known: that of an earlier opening, which is found again unless a place is wanted.
+        backend: of pyusb; by default libusb.
 
     Raises:
         NoDeviceError: there is no such adapter, or there are several.
         DeviceError: USB cannot be read.
     """
     found = _found(backend)
-    seen = f"gs_usb adapters seen: {'; '.join(str(described) for described, _ in found) or 'none'}"
-    fitting = [one for one in found if serial_number in (None, one[0].serial_number)]
+    present = [described for described, _ in found]
+    seen = f"gs_usb adapters seen: {'; '.join(map(str, present)) or 'none'}"
+    placed = wanted is not None and _PLACE.fullmatch(wanted) is not None
+    if known.device is not None and not placed:
+        wanted, same = known.device.serial_number, known.find(present)
+        fitting = [one for one in present if one is same]
+    else:
+        fitting = [one for one in present if wanted in (None, one.place if placed else one.serial_number)]
     if len(fitting) == 1:
-        return fitting[0]
-    if serial_number is not None:
-        unread = [described.usb_id for described, _ in found if described.serial_number is None]
+        known.learn(fitting[0], present)
+        return found[present.index(fitting[0])]
+    named = next((name for one in present if (name := source_name(one, present))), "gs_usb:SERIAL")
+    if placed:
+        raise NoDeviceError(f"no gs_usb adapter at {wanted}: plug it in there. {seen}")
+    if wanted is not None:
+        unread = [one.usb_id for one in present if one.serial_number is None]
         hint = f"; a serial number that is not shown could not be read: {udev_rule(unread[0])}" if unread else ""
+        several = f": name one by its place, such as --source {named}" if len(fitting) > 1 else ""
+        if known.device is not None and wanted in [one.serial_number for one in present]:
+            several = f", and others have the same: plug it in where it was, at {known.device.place}"
         raise NoDeviceError(
-            f"{len(fitting) or 'no'} gs_usb adapter with serial number {serial_number}, expected one. {seen}{hint}"
+            f"{len(fitting) or 'no'} gs_usb adapter with serial number {wanted}, expected one{several}. {seen}{hint}"
         )
     if not found:
         raise NoDeviceError(f"no gs_usb adapter found: plug one in, or name another source. {seen}")
-    named = next((described.serial_number for described, _ in found if described.serial_number), "SERIAL")
-    raise NoDeviceError(f"{len(found)} gs_usb adapters found: name one, such as --source gs_usb:{named}. {seen}")
+    raise NoDeviceError(f"{len(found)} gs_usb adapters found: name one, such as --source {named}. {seen}")
+
+
+def source_name(device: GsUsbDevice, present: Sequence[GsUsbDevice]) -> str | None:
+    """Return the source that selects one of the present adapters: by serial number if that is its own, else by place.
+
+    None where it has neither.
+    """
+    own = device.serial_number is not None and [one.serial_number for one in present].count(device.serial_number) == 1
+    name = device.serial_number if own else device.place
+    return name and f"gs_usb:{name}"
 
 
 def udev_rule(usb_id: tuple[int, int]) -> str:
@@ -117,4 +162,6 @@ def _describe(device: usb.core.Device) -> GsUsbDevice:
             product = device.product
     finally:
         usb.util.dispose_resources(device)
-    return GsUsbDevice(device.bus or 0, device.address or 0, _usb_id(device), serial_number or None, product or None)
+    bus, sockets = device.bus or 0, device.port_numbers or ()  # pyright: ignore[reportAttributeAccessIssue]
+    place = f"{bus}-{'.'.join(map(str, sockets))}" if sockets else None
+    return GsUsbDevice(bus, device.address or 0, _usb_id(device), serial_number or None, product or None, place)

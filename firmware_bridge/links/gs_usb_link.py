@@ -18,6 +18,8 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
+from firmware_bridge.links.holders import holders
+from firmware_bridge.links.recognition import Recognised
 from firmware_bridge.links.unread import Unread
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans
@@ -35,8 +37,7 @@ MOST_OLD_TRANSFERS: Final = 1000
 """Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
 
 _BUSY = (
-    "in use: end the program that holds it, such as another edge-sr or candump; "
-    "sudo ip link set can0 down frees the kernel's"
+    "end the program that holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
 )
 
 
@@ -48,12 +49,12 @@ class GsUsbLink(Link):
     on opening, since an earlier client may have died, and on closing; and the USB device is never reset.
 
     Attributes:
-        serial_number: serial number of the adapter; once it is read, only that adapter is opened again.
+        serial_number: serial number of the adapter as it was read last, and before as it was asked for.
     """
 
     def __init__(
         self,
-        serial_number: str | None = None,
+        wanted: str | None = None,
         *,
         model: ModelMap = USPA44_MAP,
         triggers: Sequence[CanFrame] = (),
@@ -63,17 +64,20 @@ class GsUsbLink(Link):
         """Prepare a link; nothing is opened yet.
 
         Args:
-            serial_number: serial number of the adapter, or None for the only one there is.
+            wanted: serial number of the adapter, or its place such as "1-2.3"; None for the only one there is. Once it
+                was open, only that adapter is opened again, or with a place the one that is there.
             model: map from CAN ids to taxels.
             triggers: frames that wake older controllers, sent once after opening.
             backend: backend of pyusb; by default libusb.
             clock_ns: monotonic clock, in [ns].
         """
-        self.name = "gs_usb" if serial_number is None else f"gs_usb:{serial_number}"
+        self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
         self.ended = False
         self.trouble: str | None = None
-        self.serial_number = serial_number
+        self.serial_number = wanted
+        self._wanted = wanted
+        self._known: Recognised[GsUsbDevice] = Recognised()
         self._triggers = tuple(triggers)
         self._backend = backend
         self._clock_ns = clock_ns
@@ -89,7 +93,7 @@ class GsUsbLink(Link):
     def __enter__(self) -> Self:
         with self._counting:
             self._scans.begin_anew()
-        described, device = find_gs_usb(self.serial_number, self._backend)
+        described, device = find_gs_usb(self._wanted, self._known, self._backend)
         try:
             self._claim(device)
             self._start(device)
@@ -223,7 +227,8 @@ def _reason(error: Exception, described: GsUsbDevice) -> str:
     if code in (errno.EACCES, errno.EPERM):
         return f"no permission: {udev_rule(described.usb_id)}"
     if code == errno.EBUSY:
-        return _BUSY
+        held = ", ".join(holders(f"/dev/bus/usb/{described.bus:03d}/{described.address:03d}"))
+        return f"in use{f' by {held}' if held else ''}: {_BUSY}"
     if code == errno.ETIMEDOUT:
         return f"does not answer: unplug it and plug it in again ({described})"
     if code is None:

@@ -36,10 +36,10 @@ class MountedLink(Link):
         self.origin = link.origin
         self.states_poses = link.states_poses
         self.wrapped = link
-        self._prefix = f"{name}/" if name else ""
+        self.prefix = f"{name}/" if name else ""
         self._prefix_text = f"{name}: " if name else ""
         self._places = dict(places)
-        self.mountings = {f"{self._prefix}{sensor}": one for sensor, one in link.mountings.items()}
+        self.mountings = {f"{self.prefix}{sensor}": one for sensor, one in link.mountings.items()}
 
     def __enter__(self) -> Self:
         self.wrapped.__enter__()
@@ -55,12 +55,12 @@ class MountedLink(Link):
         self.ended, self.trouble = self.wrapped.ended, self.wrapped.trouble
         if self._places:
             scans = [self._places[scan.sensor].place(scan) if scan.sensor in self._places else scan for scan in scans]
-        return [replace(scan, sensor=f"{self._prefix}{scan.sensor}") for scan in scans] if self._prefix else scans
+        return [replace(scan, sensor=f"{self.prefix}{scan.sensor}") for scan in scans] if self.prefix else scans
 
     def set_pace(self, pace: Pace) -> None:
         """Pass on how late scans may come, and for which of its own sensors not."""
-        size = len(self._prefix)
-        own = frozenset(name[size:] for name in pace.restless if name.startswith(self._prefix))
+        size = len(self.prefix)
+        own = frozenset(name[size:] for name in pace.restless if name.startswith(self.prefix))
         self.wrapped.set_pace(pace._replace(restless=own))
 
     def wait_on(self) -> Wait | None:
@@ -78,16 +78,16 @@ class MountedLink(Link):
     def notices(self) -> list[Notice]:
         """Return the notices of the wrapped link, with the user's name for it."""
         return [
-            notice._replace(sensors=f"{self._prefix}{notice.sensors}", text=f"{self._prefix_text}{notice.text}")
+            notice._replace(sensors=f"{self.prefix}{notice.sensors}", text=f"{self._prefix_text}{notice.text}")
             for notice in self.wrapped.notices()
         ]
 
     def poses(self) -> list[TimedPose]:
         """Return the poses of the wrapped link; those of all its sensors stay those of all."""
         poses = self.wrapped.poses()
-        if not self._prefix:
+        if not self.prefix:
             return poses
-        return [one if one.sensor is None else replace(one, sensor=f"{self._prefix}{one.sensor}") for one in poses]
+        return [one if one.sensor is None else replace(one, sensor=f"{self.prefix}{one.sensor}") for one in poses]
 
     def counters(self) -> dict[str, int]:
         """Return the counters of the wrapped link."""

@@ -1,11 +1,17 @@
-"""Wrapper that opens a lost or silent link again, for as long as it takes."""
+"""Wrapper that opens a lost or silent link again, for as long as it takes.
+
+It is also the border where the errors of drivers and of network libraries stop: each is the loss of one link.
+"""
 
 import math
 import time
+import traceback
 from collections.abc import Callable
-from typing import Final
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, TypeVar
 
-from firmware_bridge.errors import DeviceError, LinkLostError
+from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Notice, NoticeKind, Pace, SerialLine, SourceKind, Wait
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import LINK_SILENT_S
@@ -16,6 +22,8 @@ SOON_RETRY_S: Final = 0.5
 LATE_RETRY_S: Final = 2.0
 SOON_S: Final = 60.0
 """Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
+
+_Answer = TypeVar("_Answer")
 
 
 class LastingLink(Link):
@@ -58,7 +66,7 @@ class LastingLink(Link):
         self._notices: list[Notice] = []
 
     def __enter__(self) -> "LastingLink":
-        self._link.__enter__()
+        self._guarded(self._link.__enter__)
         self.kind = self._link.kind
         self._entered = self._open = True
         self._received_ns = self._clock_ns()
@@ -68,7 +76,8 @@ class LastingLink(Link):
         self._open = False
         if self._entered:
             self._entered = False
-            self._link.__exit__(*exc_info)
+            with suppress(LinkLostError):  # it was lost anyway, or the run is over
+                self._guarded(self._link.__exit__, *exc_info)
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; an empty list while the link is away.
@@ -83,7 +92,7 @@ class LastingLink(Link):
             self._come_back(timeout_s)
             return []
         try:
-            scans = self._link.read(timeout_s)
+            scans = self._guarded(self._link.read, timeout_s)
         except LinkLostError as error:
             self._close(f"{error}")
             return []
@@ -150,7 +159,7 @@ class LastingLink(Link):
 
     def _reopen(self, now_ns: int) -> None:
         try:
-            self._link.__enter__()
+            self._guarded(self._link.__enter__)
         except DeviceError as error:
             self._close(f"{error}", now_ns)
         else:
@@ -177,9 +186,7 @@ class LastingLink(Link):
 
     def _come_back(self, timeout_s: float) -> None:
         """Close the link if it is still open, and open it again: at once if it was silent, else when a try is due."""
-        if self._entered:
-            self._entered = False
-            self._link.__exit__(None, None, None)
+        self.__exit__(None, None, None)
         if not self._away:
             self._reopen(self._clock_ns())
             return
@@ -191,6 +198,23 @@ class LastingLink(Link):
             self._received_ns, self._silent_s = now_ns, LINK_SILENT_S  # its silence begins with the opening
             self._away = False
             self._reopen(now_ns)
+
+    def _guarded(self, call: Callable[..., _Answer], *arguments: object) -> _Answer:
+        """Return what the wrapped link returns.
+
+        Raises:
+            LinkLostError: it raised an error that no link is expected to raise.
+            BridgeError: it raised another.
+        """
+        try:
+            return call(*arguments)
+        except BridgeError:
+            raise
+        except Exception as error:  # a library's, of any class: it must not end the links beside this one
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{'/'.join(Path(place.filename).parts[-2:])}, line {place.lineno}"
+            text = " ".join(f"{type(error).__name__} {error}".split())
+            raise LinkLostError(f"{self.name}: link lost by an unforeseen {text} ({where})") from error
 
     def _tell(self, kind: NoticeKind, text: str) -> None:
         self._notices.append(Notice(self._clock_ns(), kind, text))

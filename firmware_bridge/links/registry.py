@@ -25,6 +25,7 @@ FORMS: Final = (
     "slcan:serial=D30BL366[@baud]",
     "xela-server:ws://HOST[:5000]",
     "gs_usb[:SERIAL]",
+    "gs_usb:BUS-PORT",
     "can:INTERFACE:CHANNEL",
     "replay:FILE[,FILE]",
     "demo[:loop]",
@@ -47,7 +48,7 @@ def open_sources(
     rate_hz: float | None = None,
     demo_recording: str | Path | None = None,
     model: ModelMap = USPA44_MAP,
-    give_up_s: float | None = math.inf,
+    give_up_s: float = math.inf,
     *,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> list[Link]:
@@ -59,7 +60,7 @@ def open_sources(
         rate_hz: as in `open_source`.
         demo_recording: as in `open_source`.
         model: as in `open_source`.
-        give_up_s: longest outage of a source, in [s]; None leaves its loss to the caller.
+        give_up_s: longest outage of a source, in [s]; 0: its first loss is raised.
         mountings: mountings of sensors, by name including that of their source.
 
     Raises:
@@ -73,7 +74,7 @@ def open_sources(
         name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
         own = {sensor.removeprefix(f"{name}/"): one for sensor, one in mountings.items() if _is_of(sensor, name)}
         link = open_source(form, rate_hz, demo_recording, model, own)
-        if give_up_s is not None and not (form or "").startswith(_FINITE):
+        if not (form or "").startswith(_FINITE):
             link = LastingLink(link, give_up_s)
         if name in named:
             raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import SourceError
+from firmware_bridge.errors import SourceError, harmless
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
 from firmware_bridge.links.replay_poses import PoseLane, timed_by_rows
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -57,7 +57,7 @@ class ReplayLink(Link):
         timed = next((one.path for one in self.recordings for track in one.tracks if track.time_ns is not None), None)
         if not paced and rate_hz is not None and timed is not None:
             raise SourceError(f"{timed} has times of its own, which are kept: leave out --rate-hz, or add --paced")
-        self.name = f"replay:{','.join(str(one.path) for one in self.recordings)}"
+        self.name = harmless(f"replay:{','.join(str(one.path) for one in self.recordings)}")
         self.kind: SourceKind = "replay"
         self.ended = False
         self.patient = not paced

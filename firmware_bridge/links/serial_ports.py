@@ -10,6 +10,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.errors import NoDeviceError
+from firmware_bridge.links.recognition import Recognised
 
 FTDI_X: Final = (0x0403, 0x6015)
 """Id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables."""
@@ -40,6 +41,7 @@ class Port(NamedTuple):
         product: name that the device reports.
         manufacturer: manufacturer that the device reports.
         interface: port of a device with several ones, such as "1.0".
+        location: bus and sockets of the USB device, such as "1-2.3".
     """
 
     path: str
@@ -49,6 +51,17 @@ class Port(NamedTuple):
     product: str | None = None
     manufacturer: str | None = None
     interface: str | None = None
+    location: str | None = None
+
+    @property
+    def identity(self) -> tuple[object, ...] | None:
+        """Its identity at any socket; None without a serial number."""
+        return None if self.serial_number is None else (self.usb_id, self.serial_number, self.interface)
+
+    @property
+    def place(self) -> str:
+        """Socket of the USB device, or where that is not known the path."""
+        return self.location or self.path
 
     @property
     def adapter(self) -> str | None:
@@ -78,6 +91,7 @@ def serial_ports() -> list[Port]:
             info.product or None,
             info.manufacturer or None,
             (info.location or "").partition(":")[2] or None,
+            (info.location or "").partition(":")[0] or None,
         )
         for info in _comports()
     )
@@ -137,15 +151,16 @@ def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
 
 
 class PluggedAdapter:
-    """Adapter that is recognised at any port by the USB serial number that it had first.
+    """Adapter that is found again at any port by its USB serial number, unless the user named its place.
 
-    If the device has several ports, it is always the same one of them.
+    A name that is a link, such as those in /dev/serial/by-path, is a place, and is followed. One of the kernel's, such
+    as /dev/ttyUSB0, changes when a plug is pulled. Of a device with several ports it is always the same one.
     """
 
     def __init__(self, path: str) -> None:
         """Identify it by the path of its port, until `find` has its serial number."""
         self._path = path
-        self._port: Port | None = None
+        self._known: Recognised[Port] = Recognised()
 
     def find(self, ports: Sequence[Port]) -> str:
         """Return the path of its port among the present ones, or the first path if it has no serial number.
@@ -153,24 +168,23 @@ class PluggedAdapter:
         Raises:
             NoDeviceError: it is missing, or another one has the same identity.
         """
-        if self._port is None:
+        known = self._known.device
+        if known is None or Path(self._path).is_symlink():
             real_path = Path(self._path).resolve()
-            self._port = next((port for port in ports if Path(port.path).resolve() == real_path), None)
-        known = self._port
-        if known is None or known.serial_number is None:
-            self._port = None
-            return self._path
-        same = [port for port in ports if port[1:3] == known[1:3] and port.interface == known.interface]
-        if known.path in (port.path for port in same):
-            return known.path
-        if len(same) != 1:
-            count = f"{len(same)} adapters" if same else "no adapter"
+            port = next((port for port in ports if Path(port.path).resolve() == real_path), None)
+            if port is None and known is None:  # a port that is not listed
+                return self._path
+            if port is None:
+                raise NoDeviceError(f"no adapter at {self._path}: plug it in again. {_seen(ports)}")
+            self._known.learn(port, ports)
+            return port.path
+        port = self._known.find(ports)
+        if port is None:
             raise NoDeviceError(
-                f"{count} with serial number {known.serial_number}, which was at {known.path}, expected one: "
-                f"plug it in again, alone. {_seen(ports)}"
+                f"no adapter that is surely the one with serial number {known.serial_number} that was at {known.path}: "
+                f"plug it in where it was. {_seen(ports)}"
             )
-        self._port = same[0]
-        return same[0].path
+        return port.path
 
 
 def _example(port: Port) -> str:

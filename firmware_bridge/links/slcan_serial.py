@@ -21,6 +21,7 @@ from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Pace, SerialLine, SourceKind, Wait
 from firmware_bridge.links.fd_reader import BurstReader
+from firmware_bridge.links.holders import in_use
 from firmware_bridge.links.paced_reader import PacedReader, Piece
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
@@ -48,7 +49,6 @@ LATE_STAMPS_FRAMES: Final = 1000
 
 # pyserial lets termios.error through, which is no OSError; Windows has no termios.
 _PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
-_BUSY = "in use: end the program that holds it, such as slcand, xela_server or another edge-sr"
 
 
 class SlcanSerialLink(Link):
@@ -230,7 +230,7 @@ class SlcanSerialLink(Link):
                 write_timeout=WRITE_TIMEOUT_S,
             )
         except (*_PORT_ERRORS, ValueError) as error:
-            raise DeviceError(f"{self.port}: {_reason(error)}") from error
+            raise DeviceError(f"{self.port}: {_reason(error, self.port)}") from error
         try:
             port.set_low_latency_mode(True)
         except (OSError, ValueError, NotImplementedError, AttributeError):
@@ -324,12 +324,12 @@ def _wait_until_sent(port: serial.Serial) -> None:
         time.sleep(0.001)
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, port: str) -> str:
     code = getattr(error, "errno", None)
     if code in (errno.EACCES, errno.EPERM):
         return NO_PERMISSION
     if code in (errno.EBUSY, errno.EAGAIN):
-        return _BUSY
+        return in_use(port)
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return f"no such port. Serial ports seen: {'; '.join(map(str, serial_ports())) or 'none'}"
     return f"cannot be used as a serial port: {os.strerror(code) if code else error}"

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import RecordingError
+from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.recording.csv_columns import CsvColumns, rate_of
 from firmware_bridge.recording.csv_poses import CsvPoses
@@ -140,7 +140,7 @@ class _Scans:
             )
         geometry = columns.pad
         track = Track(
-            path.stem,
+            harmless(path.stem, kept=""),
             _by_axis(np.frombuffer(self._counts, np.int32), geometry),
             time_ns=None,
             vendor=_vendor(self._newtons, geometry) if self._newtons else None,

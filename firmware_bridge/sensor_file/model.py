@@ -29,13 +29,12 @@ from firmware_bridge.sensor_file.toml_reader import (
     flat_cells,
     is_number,
     one_of,
-    positive,
     sensor_tables,
     text_value,
     truth,
     whole,
 )
-from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, Baseline
+from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, LAST_UNIX_S, Baseline
 
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1
@@ -185,7 +184,7 @@ def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeo
     swap_xy = table.take("swap_xy", truth, required=False)
     signs = table.take("signs", _signs, required=False)
     gains = table.take("gains", partial(_gains, geometry), required=False)
-    counts_per_newton = table.take("counts_per_newton", positive, required=False)
+    counts_per_newton = table.take("counts_per_newton", between(*PAD_RANGES["counts_per_newton"]), required=False)
     pads = {key: table.take(key, a_table, required=False) for key in ("pad", "learned")}
     baseline = table.take("baseline", a_table, required=False)
     frame = table.take("frame", a_table, required=False)
@@ -248,7 +247,7 @@ def _numbers(expected: str, count: int, value: Any) -> tuple[float, ...]:
 def _baseline(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Baseline:
     table = Table(path, f"sensors.{name}.baseline.", values)
     expected_id = table.take("id", text_value, required=False)
-    created_unix_s = table.take("created_unix_s", positive)
+    created_unix_s = table.take("created_unix_s", between(1, LAST_UNIX_S))
     scans = table.take("scans", whole)
     axes = [table.take(axis, partial(_rest_counts, geometry)) for axis in AXES]
     table.end()

@@ -4,10 +4,19 @@ So a pad's numbers have the same arrangement in the file as on the pad, and comm
 """
 
 import json
-from collections.abc import Sequence
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 import numpy as np
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.in_place import write_in_place
@@ -25,6 +34,42 @@ from firmware_bridge.sensor_file.model import (
 )
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.zeroing.baseline import Baseline
+
+LOCKED_S: Final = 5.0
+"""Longest wait for another program that changes the file, in [s]: reading and writing take some milliseconds."""
+_LOOK_S: Final = 0.01
+
+
+@contextmanager
+def changing(path: str | Path) -> Iterator[None]:
+    """Change a sensor file within a with statement, from its reading to its writing, while no other program does.
+
+    The lock is on the folder, since the file is replaced by a new one each time, and goes with the program. Where a
+    file system has no locks, none is taken.
+
+    Raises:
+        SensorFileError: another program holds the lock for too long.
+    """
+    try:
+        folder = os.open(Path(path).parent, os.O_RDONLY)
+    except OSError:  # a folder that is missing or closed, which reading or writing reports
+        yield
+        return
+    try:
+        end_s = time.monotonic() + LOCKED_S
+        while fcntl is not None:
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() >= end_s:
+                    raise SensorFileError(f"{path}: another program has kept it locked for {LOCKED_S:g} s") from error
+                time.sleep(_LOOK_S)
+            except OSError:
+                break
+        yield
+    finally:
+        os.close(folder)
 
 
 def save_sensor_file(path: str | Path, sensor_file: SensorFile, *, keep_before: bool = True) -> None:

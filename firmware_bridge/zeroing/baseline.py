@@ -351,7 +351,7 @@ def _read_entry(path: Path, entry: Any) -> Baseline:
         _refuse_file(path, "sensor", sensor, f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
     if not _is_number(created_unix_s) or not 0 < created_unix_s <= LAST_UNIX_S:
         _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970")
-    if type(scans) is not int or scans < 1:
+    if type(scans) is not int or not 1 <= scans < 2**31:
         _refuse_file(path, "scans", scans, "a whole number from 1")
     baseline = Baseline.of(sensor, _read_counts(path, entry.get("counts")), created_unix_s, scans, "file")
     if entry.get("id", baseline.id) != baseline.id:

@@ -22,8 +22,8 @@ def test_the_adapters_of_this_machine():
     backend = GsUsbBackend(GsUsbPort(serial_number="AB"), foreign, nameless)
     nameless.address = 9
     named, unnamed = list_devices(backend)
-    assert str(named) == "bus 1 device 5 1d50:606f serial=AB (candleLight USB to CAN adapter)"
-    assert str(unnamed) == "bus 1 device 9 1209:2323 (candleLight)"
+    assert str(named) == "bus 1 device 5 at 1-1 1d50:606f serial=AB (candleLight USB to CAN adapter)"
+    assert str(unnamed) == "bus 1 device 9 at 1-1 1209:2323 (candleLight)"
     assert list_devices(GsUsbBackend(foreign)) == []
     assert [port.handles for port in backend.ports] == [0, 0, 0]
 
@@ -34,6 +34,40 @@ def test_only_one_may_go_unnamed():
         GsUsbLink(backend=backend).__enter__()
     with GsUsbLink("CD", backend=backend):
         assert [port.adapter.started for port in backend.ports] == [False, True]
+
+
+def test_of_two_with_one_serial_number_each_is_named_by_its_place():
+    """And the one that is left is not taken for the other, whichever way they are plugged in again."""
+    left, right = (GsUsbPort(serial_number="AB", sockets=sockets) for sockets in ((2,), (1, 3)))
+    backend = GsUsbBackend(left, right)
+    for wanted in (None, "AB"):
+        with pytest.raises(NoDeviceError, match=r"2 gs_usb adapter.*--source gs_usb:1-2\b"):
+            GsUsbLink(wanted, backend=backend).__enter__()
+    links = [GsUsbLink(place, backend=backend) for place in ("1-2", "1-1.3")]
+    for link, port, other in ((links[0], left, right), (links[1], right, left)):
+        with link:
+            assert link.name in ("gs_usb:1-2", "gs_usb:1-1.3")
+            assert port.adapter.started and not other.adapter.started
+    left.adapter.unplug()
+    with pytest.raises(NoDeviceError, match=r"no gs_usb adapter at 1-2: .* at 1-1\.3"):
+        links[0].__enter__()
+
+
+def test_a_serial_number_that_was_seen_twice_identifies_nothing_any_more():
+    known, other = (GsUsbPort(serial_number="AB", sockets=(socket,)) for socket in (2, 3))
+    backend = GsUsbBackend(known)
+    link = GsUsbLink("AB", backend=backend)
+    with link:
+        pass
+    backend.ports.append(other)
+    with link:
+        assert known.adapter.started
+    known.adapter.unplug()
+    with pytest.raises(NoDeviceError, match="others have the same: plug it in where it was, at 1-2"):
+        link.__enter__()
+    known.plug()
+    with link:
+        assert known.adapter.started and not other.adapter.started
 
 
 def test_none_or_another():

@@ -197,7 +197,45 @@ def test_one_that_comes_back_as_another_kind_is_given_up():
     assert not inner.is_open
 
 
+@pytest.mark.parametrize("error", [AssertionError(), RecursionError("deep"), ValueError("a\nb"), OSError(5, "bus")])
+def test_an_error_of_any_class_is_the_loss_of_its_link_and_it_is_opened_again(error):
+    """Libraries raise what nobody foresees, when they read, open and close."""
+
+    class Broken(WorldLink):
+        def __enter__(self):
+            if 1.0 < self.world.now_ns / S < 2.0:
+                raise error
+            return super().__enter__()
+
+        def read(self, timeout_s):
+            scans = super().read(timeout_s)
+            if 1.0 < self.world.now_ns / S < 2.0:
+                raise error
+            return scans
+
+        def __exit__(self, *exc_info):
+            super().__exit__()
+            raise error
+
+    world, notices, scans = World(), [], 0
+    with LastingLink(Broken(world), clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
+        while world.now_ns < 4 * S:
+            scans += len(link.read(0.1))
+            notices += link.notices()
+    assert kinds(notices) == ["lost", "back"] and scans > 200
+    told = (
+        f"slcan:x: link lost by an unforeseen {' '.join(f'{type(error).__name__} {error}'.split())} (bridge/test_links"
+    )
+    assert notices[0].text.startswith(told) and "\n" not in notices[0].text
+
+
 def test_the_first_opening_must_succeed():
+    class Broken(WorldLink):
+        def __enter__(self):
+            raise AssertionError("no such thing")
+
+    with pytest.raises(DeviceError, match="unforeseen AssertionError no such thing"):
+        LastingLink(Broken(World())).__enter__()
     with pytest.raises(DeviceError, match="no such port"):
         lasting(World(away=[(0.0, 1.0)]), 1.0)
 

@@ -2,6 +2,8 @@ import errno
 import os
 import pty
 import select
+import subprocess
+import sys
 import threading
 import time
 import tty
@@ -125,9 +127,25 @@ def test_two_clients_cannot_share_a_port():
     with (
         Emulator([make_recording(1)]) as emulator,
         SlcanSerialLink(emulator.port),
-        pytest.raises(DeviceError, match=r"in use: .*slcand"),
+        pytest.raises(DeviceError, match=r"in use by this program, or .*slcand"),
     ):
         SlcanSerialLink(emulator.port).__enter__()
+
+
+def test_the_program_that_holds_a_port_is_named_and_so_is_the_one_that_tries_each_new_port():
+    hold = "import fcntl, sys; f = open(sys.argv[1], 'r+b', 0); fcntl.flock(f, fcntl.LOCK_EX)"
+    held = f"{hold}; print(1, flush=True); input()"
+    with Emulator([make_recording(1)]) as emulator:
+        process = subprocess.Popen(
+            [sys.executable, "-c", held, emulator.port], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        with process:
+            assert process.stdout is not None and process.stdin is not None and process.stdout.readline() == b"1\n"
+            with pytest.raises(DeviceError, match=rf"in use by \S+ \({process.pid}\): .*ModemManager.*udev rule ATTRS"):
+                SlcanSerialLink(emulator.port).__enter__()
+            process.stdin.close()
+        with SlcanSerialLink(emulator.port) as link:
+            assert len(read_scans(link, 1)) == 1
 
 
 def test_the_wrong_line_speed_gives_no_scan():

@@ -34,7 +34,7 @@ def test_the_ports_of_this_machine(monkeypatch):
     usb.vid, usb.pid, usb.serial_number, usb.description = 0x0403, 0x6015, "D30BL366", "x"
     usb.product, usb.manufacturer, usb.location = "USB-CAN Plus", "VScom", "1-2.1:1.0"
     monkeypatch.setattr(list_ports, "comports", lambda: [usb, none])
-    expected = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30BL366", "x", "USB-CAN Plus", "VScom", "1.0")
+    expected = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30BL366", "x", "USB-CAN Plus", "VScom", "1.0", "1-2.1")
     assert serial_ports() == [BUILT_IN, expected]
     usb.location = "1-2.1"
     assert serial_ports()[1].interface is None

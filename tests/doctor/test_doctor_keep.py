@@ -14,6 +14,7 @@ from edge.api import open_source
 from edge.cli import main as cli
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.write_sensor_file import check_writable
+from edge.pipeline.gain_keeper import keep_learned
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -96,6 +97,16 @@ class TestLoss:
             assert ("this baseline is not stored" in " ".join(done.out.split())) is not stored
             now = load_sensor_file(path).sensors["4"].baseline
             assert (now.id != baseline.id) is stored and np.abs(now.counts - baseline.counts).max() < 10
+
+    def test_gains_that_a_run_learned_during_the_visit_are_kept(self, tmp_path):
+        path, learned = tmp_path / "s.toml", Pad(gains=GAINS, gain_half_widths=(0.05,) * 48)
+        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(assumed=frozenset({"mounting"}))}))
+        known = load_sensor_file(path)
+        for name in ("4", "6"):
+            keep_learned(path, name, learned)
+        keep.keep(path, known, None, {"4": BASELINE}, NONE, NONE)
+        now = load_sensor_file(path)
+        assert now.pads == {"4": learned, "6": learned} and now.baselines["4"].id == BASELINE.id
 
     def test_the_adapters_number_is_a_part(self, tmp_path):
         path = tmp_path / "s.toml"

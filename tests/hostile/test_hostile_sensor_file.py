@@ -11,8 +11,8 @@ from firmware_bridge.sensor_file.model import load_sensor_file
     ("old", "new", "complaint"),
     [
         ("version = 1", "version = 1" + ".a" * 30_000, "a line longer than 2048 bytes"),
-        ("1200.5", "1" + "0" * 400, "'sensors.4.counts_per_newton': 1000.*a positive number"),
-        ("1000.0", "1" + "0" * 400, "'sensors.4.baseline.created_unix_s': 1000.*a positive number"),
+        ("1200.5", "1" + "0" * 400, "'sensors.4.counts_per_newton': 1000.*a number from 0.001 to 1e"),
+        ("1000.0", "1" + "0" * 400, "'sensors.4.baseline.created_unix_s': 1000.*a number from 1 to 1e"),
         ("gains = [1.0", "gains = [1" + "0" * 400, "'sensors.4.gains': .*expected positive numbers"),
         ("version = 1", "version = 0x" + "f" * 1999, "'version': .*expected 1"),
         ("version = 1", "version = 1\n" + "#" * 70_000, "larger than the 65,536 bytes"),

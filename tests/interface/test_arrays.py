@@ -136,7 +136,8 @@ def test_a_silent_finger_lets_nothing_pile_up():
             most = max(most, len(alive))
             yield result
 
-    assert list(paired(alone(), ("left", "right"))) == []
+    with pytest.raises(UsageError, match="no result of sensor 'right': there are those of left"):
+        list(paired(alone(), ("left", "right")))
     assert 0 < most < 1100
 
 

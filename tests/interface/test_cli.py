@@ -168,7 +168,10 @@ class TestReplay:
                 process.stdin.write('{"cmd": "reset"}\nnonsense\n')
                 process.stdin.flush()
                 break
-        used += [json.loads(line)["taps_used"] for line in process.stdout]
+        rest = [json.loads(line) for line in process.stdout]
+        refused = [record["note"] for record in rest if record["state"] == "event" and record["event"] == "refused"]
+        assert len(refused) == 1 and "a line on stdin is refused: 'nonsense', expected " in refused[0]
+        used += [record["taps_used"] for record in rest if record["state"] != "event"]
         assert process.wait(TIMEOUT_S) == 0
         after = used[used.index(4) :]
         assert 1 in after and after.index(1) < 30

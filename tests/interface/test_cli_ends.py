@@ -57,6 +57,22 @@ class TestEnds:
         assert errors.startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans") and "Traceback" not in errors
         assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got)
 
+    @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
+    def test_a_signal_that_the_parent_wants_ignored_is_ignored(self, emulator, files, number):
+        """As under nohup, or in the background of a shell without jobs."""
+        before = signal.signal(number, signal.SIG_IGN)
+        try:
+            process, _ = self.follow(emulator, files)
+        finally:
+            signal.signal(number, before)
+        assert process.stdout is not None
+        process.send_signal(number)
+        got = records("".join(process.stdout.readline() for _ in range(100)))
+        assert len(got) == 100 and not [one for one in got if one["state"] == "event"]
+        process.send_signal(signal.SIGTERM if number != signal.SIGTERM else signal.SIGINT)
+        self.rest(process)
+        assert process.returncode == 0
+
     def test_a_closed_pipe_ends_it_cleanly_with_the_summary(self, emulator, files):
         process, _ = self.follow(emulator, files)
         assert process.stdout is not None and process.stderr is not None

@@ -1,11 +1,12 @@
 """Refusals of `edge-sr` as a user meets them: one line, and an exit code."""
 
+import resource
 import subprocess
 
 import numpy as np
 import pytest
-from cli_samples import assert_refused, base_options, files, records, run, write_recording
-from edge_samples import BASELINE, make_contract, write_model
+from cli_samples import EDGE_SR, assert_refused, base_options, files, records, run, write_recording
+from edge_samples import BASELINE, ROOT, make_contract, write_model
 
 from edge.cli import main as cli
 from edge.inference import bundled as bundle
@@ -21,6 +22,8 @@ class TestRefusals:
         ("arguments", "words"),
         [
             (["--rate-hz", "0"], ["--rate-hz: '0' is not a positive number"]),
+            (["--rate-hz", "1e-300"], ["--rate-hz: '1e-300' is not a positive number, 1e-09 to 1e+09"]),
+            (["--counts-per-newton", "1e8"], ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
             (["--duration-s", "nan"], ["--duration-s: 'nan' is not a positive number"]),
             (["--counts-per-newton", "x"], ["--counts-per-newton: 'x' is not"]),
             (["--budget-us", "0"], ["--budget-us: '0' is not a positive number"]),
@@ -109,6 +112,24 @@ class TestRefusals:
         kept.write_text("old")
         assert_refused(run(*base_options(files), "--source", "slcan:/dev/none", "--sink", f"jsonl:{kept}"), 3)
         assert kept.read_text() == "old"
+
+    @pytest.mark.parametrize("to", ["file", "stdout"])
+    @pytest.mark.parametrize("limit", [100, 20_011])
+    def test_a_disk_that_fills_leaves_whole_records(self, files, tmp_path, to, limit):
+        path = tmp_path / "a.jsonl"
+        replay = ["replay", files / "taps.npz", "--model", files / "tiny.onnx", "--baseline", files / "zero.json"]
+        with path.open("ab") as out:
+            done = subprocess.run(
+                [*EDGE_SR, *map(str, replay), "--sink", f"jsonl:{path if to == 'file' else '-'}"],
+                stdout=out,
+                stderr=subprocess.PIPE,
+                text=True,
+                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+                cwd=ROOT,
+            )
+        assert done.returncode == 5 and "File too large" in done.stderr
+        text = path.read_text()
+        assert text.endswith("\n") == (limit > 10_000) and len(records(text)) >= 5 * (limit > 10_000)
 
     def test_a_full_disk_is_5_after_the_summary(self, files):
         done = run(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:/dev/full")

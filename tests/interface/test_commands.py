@@ -6,8 +6,9 @@ import time
 
 import pytest
 
-from edge.cli.user_commands import user_commands, zero_on_signal
+from edge.cli.user_commands import user_commands
 from edge.pipeline.commands import LONGEST_LINE_BYTES, RESET, ZERO, Command, CommandLines, Commands, obey, read_stdin
+from edge.terminal.stop_signals import handled
 
 OPEN = []
 
@@ -155,7 +156,7 @@ def test_a_signal_asks_once_for_zeroing_and_is_let_go_afterwards():
     before = signal.getsignal(signal.SIGUSR1)
     runtime = Told()
     commands = Commands()
-    with zero_on_signal(commands):
+    with handled(["SIGUSR1"], lambda *_: commands.signalled.add(ZERO)):
         obey(commands, runtime)
         assert runtime.done == []
         for _ in range(2):

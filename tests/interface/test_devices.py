@@ -168,6 +168,8 @@ def test_everything_is_listed_adapters_first(plugged, capsys):
     plugged["gs_usb"] = [
         GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight"),
         GsUsbDevice(1, 5, (0x1D50, 0x606F), None, None),
+        GsUsbDevice(2, 4, (0x1D50, 0x606F), "0001", "candleLight", "2-1.4"),
+        GsUsbDevice(2, 5, (0x1D50, 0x606F), "0001", "candleLight", "2-3"),
     ]
     assert cli.main(["devices"]) == 0
     out, err = capsys.readouterr()
@@ -176,11 +178,14 @@ def test_everything_is_listed_adapters_first(plugged, capsys):
         "/dev/ttyUSB9  0403:6015  serial D30BL366",
         "bus 1 device 4  1d50:606f  serial 004B",
         "bus 1 device 5  1d50:606f",
+        "bus 2 device 4 at 2-1.4  1d50:606f  serial 0001",
+        "bus 2 device 5 at 2-3  1d50:606f  serial 0001",
         "/dev/ttyS0",
         SERVER_HINT,
     ]
     assert "  looks like VScom USB-CAN Plus\n  --source slcan:serial=D30BL366\n" in out
     assert "  looks like candleLight\n  --source gs_usb:004B\n" in out
+    assert "  --source gs_usb:2-1.4\n" in out and "  --source gs_usb:2-3\n" in out
     assert "  --source gs_usb\n  ! no permission: " in out and "udev" in out and err == ""
 
 

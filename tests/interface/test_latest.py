@@ -17,6 +17,7 @@ from edge.api import (
     UsageError,
     open_runtime,
     open_source,
+    take_baselines,
 )
 from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
@@ -218,6 +219,36 @@ def test_a_source_is_opened_and_closed_without_a_with_statement():
             call()
     with pytest.raises(UsageError, match="fake was opened before"):
         source.open()
+
+
+def test_a_source_has_one_stream_at_a_time():
+    with Source(FakeLink([scans(0)], endless=True)) as source:
+        first = stream_of(source)
+        assert first.read().new
+        for second in (lambda: stream_of(source), lambda: take_baselines(source)):
+            with pytest.raises(UsageError, match=r"^source fake has a stream already, .* close\(\)$"):
+                second()
+        first.close()
+        with pytest.raises(UsageError, match="is closed"):
+            first.latest()
+        stream_of(source)
+        for _ in range(2):  # a stream that was dropped, and one that has ended
+            assert list(stream_of(source, duration_s=1e-6)) == []
+
+
+def test_a_loop_that_is_closed_while_a_task_waits_ends_nothing():
+    link = StagedLink(scans(0), scans(1))
+    with Source(link) as source:
+        stream = stream_of(source)
+        for _ in range(2):
+            loop = asyncio.new_event_loop()
+            task = loop.create_task(source.wait_async(1000))
+            loop.run_until_complete(asyncio.sleep(0))
+            loop.close()
+            assert not task.done()
+        for stage in range(2):
+            link.let(stage)
+            assert stream.read().result.scan.number == stage
 
 
 def test_a_recording_at_the_speed_of_its_reader_has_no_latest(tmp_path):

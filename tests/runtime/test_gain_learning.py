@@ -323,6 +323,15 @@ class TestKeeping:
         assert keeper.trouble is None and known.adapter == "D30BL366" and known.baselines["4"].id == BASELINE.id
         assert known.pads == {"4": LEARNED, "6": SURER}
 
+    def test_two_runs_that_learn_into_one_file_lose_nothing_of_each_other(self, file):
+        keepers = [GainKeeper(file, emulated=False) for _ in range(2)]
+        for number in range(24):
+            keepers[number % 2].keep(str(number), LEARNED)
+        for keeper in keepers:
+            keeper.close()
+            assert keeper.trouble is None
+        assert load_sensor_file(file).pads.keys() == {str(number) for number in range(24)}
+
     def test_surer_gains_are_not_overwritten(self, file):
         for learned in (SURER, LEARNED):
             keep_learned(file, "4", learned)

@@ -217,7 +217,7 @@ class Script:
     """Commands that come before certain polls."""
 
     def __init__(self, at) -> None:
-        self.refused = 3
+        self.refused, self.reason = 3, None
         self.poses = PoseQueue()
         self._at = at
         self._polls = itertools.count()

@@ -48,6 +48,7 @@ class GsUsbPort:
         claimed: some program holds it.
         handles: how often it is open.
         permitted: the user may open it.
+        sockets: numbers of the hubs' sockets that lead to it.
         gone_as: the error of libusb that unplugging gives; host controllers differ.
     """
 
@@ -59,6 +60,7 @@ class GsUsbPort:
         product: str | None = "candleLight USB to CAN adapter",
         usb_id: tuple[int, int] = (0x1D50, 0x606F),
         packet_bytes: int = 32,
+        sockets: tuple[int, ...] = (1,),
     ) -> None:
         """Plug an adapter in; `adapter` makes a new one each time."""
         self.serial_number = serial_number
@@ -71,6 +73,7 @@ class GsUsbPort:
         self.usb_id = usb_id
         self.packet_bytes = packet_bytes
         self.address = 5
+        self.sockets = sockets
         self._make = adapter
         self.adapter = adapter()
 
@@ -114,7 +117,7 @@ class GsUsbBackend(usb.backend.IBackend):
             bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
             bMaxPacketSize0=64, idVendor=vendor, idProduct=product, bcdDevice=0, iManufacturer=1, iProduct=2,
             iSerialNumber=3 if dev.port.serial_number is not None else 0, bNumConfigurations=1, bus=1,
-            address=dev.port.address, port_number=1, port_numbers=(1,), speed=2,
+            address=dev.port.address, port_number=dev.port.sockets[-1], port_numbers=dev.port.sockets, speed=2,
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: _Plugged, config: int) -> SimpleNamespace:

@@ -275,10 +275,10 @@ def test_state_tells_the_silence_of_a_sensor(heard, clock):
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):
     path = Path(os.fsdecode(b"\xff.mcap"))
     header, _ = unpack(hello(Run(f"replay:{path}", "replay", "mtsr4", CONTRACT, "c0ffee"), path))
-    assert (header["name"], header["recording"]) == ("replay:?.mcap", "?.mcap")
-    assert unpack(state(path, 1, {}))[0]["recording"] == "?.mcap"
+    assert (header["name"], header["recording"]) == (r"replay:\xff.mcap", r"\xff.mcap")
+    assert unpack(state(path, 1, {}))[0]["recording"] == r"\xff.mcap"
     heard.tell(Event(1, "sink", None, f"recording into {path} stopped"), {})
-    assert look(Viewer(), heard, clock)[0][0]["note"] == "recording into ?.mcap stopped"
+    assert look(Viewer(), heard, clock)[0][0]["note"] == r"recording into \xff.mcap stopped"
 
 
 def test_what_is_refused_is_an_event():

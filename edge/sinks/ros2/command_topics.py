@@ -64,7 +64,9 @@ class CommandTopics:
                     continue
                 command = _command(name, sample.encoded)
                 if command is None or self._commands.full:
-                    self._commands.refuse()
+                    self._commands.refuse(
+                        f"a message on the topic {name} is refused: expected a sensor's name, or none"
+                    )
                 else:
                     self._commands.put(command)
 
