@@ -206,8 +206,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="end when the source has been lost for T seconds; 0: at once (default: never)",
     )
     poses_help = (
-        "positions of the pad, which a robot sends: zenoh[:KEY], ros2:TOPIC or tf:PARENT:CHILD; for one of several "
-        "sensors SENSOR=P; repeat it for several"
+        "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of several sensors "
+        "SENSOR=P; repeat it for several"
     )
     add("--poses", metavar="P", action="append", default=[], help=poses_help)
     _add_model(parser)
