@@ -272,11 +272,6 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         help="combine at most K taps to a pattern (default: as many as the model takes; 1 if it takes poses of the pad "
         "and there are none)",
     )
-    contact(
-        "--every-tap",
-        action="store_true",
-        help="combine all taps, even those not expected to help; of taps at one place the newest still counts alone",
-    )
     checks = parser.add_argument_group("checks of patterns and sensor").add_argument
     checks(
         "--no-fallback",
