@@ -75,7 +75,7 @@ def emulator(folder: Path, *tracks: NDArray[np.int32]) -> Emulator:
 @contextmanager
 def live_page(port: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Run `edge-sr --view` on a bus, and yield its process and address."""
-    arguments = ["--source", f"slcan:{port}", "--model", "mtsr4-int8", "--counts-per-newton", "1180", "--every-tap"]
+    arguments = ["--source", f"slcan:{port}", "--model", "mtsr4-int8", "--counts-per-newton", "1180"]
     command = [sys.executable, "-m", "edge.cli.main", "--view", "0", *arguments]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as run:
         try:

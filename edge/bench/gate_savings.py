@@ -59,11 +59,9 @@ class Saving:
 def savings(model: Model, frozen: FrozenSet) -> Iterator[Saving]:
     """Yield all rows of a model: first nothing is left out, then one thing more in each."""
     scans, frames = stream(frozen, model.contract.taps)
-    yield _measured("nothing", model, frozen, scans, frames, idle=True, every_scan=True, every_tap=True)
-    yield _measured("where nothing touches", model, frozen, scans, frames, every_scan=True, every_tap=True)
-    yield _measured("+ where nothing has changed", model, frozen, scans, frames, every_tap=True)
-    if model.contract.taps > 1:
-        yield _measured("+ taps that would not help", model, frozen, scans, frames)
+    yield _measured("nothing", model, frozen, scans, frames, idle=True, every_scan=True)
+    yield _measured("where nothing touches", model, frozen, scans, frames, every_scan=True)
+    yield _measured("+ where nothing has changed", model, frozen, scans, frames)
 
 
 def stream(frozen: FrozenSet, taps: int) -> tuple[list[Scan], list[int]]:
@@ -135,7 +133,6 @@ def _measured(
     *,
     idle: bool = False,
     every_scan: bool = False,
-    every_tap: bool = False,
 ) -> Saving:
     """Measure a row; `idle`: the network runs where nothing touches, too."""
     counted = _Counted(model)
@@ -144,7 +141,7 @@ def _measured(
         counted,
         source="replay",
         baselines={SENSOR: baseline},
-        options=RuntimeOptions(idle_reset_s=HELD_SCANS * _PERIOD_NS / 2e9, every_scan=every_scan, every_tap=every_tap),
+        options=RuntimeOptions(idle_reset_s=HELD_SCANS * _PERIOD_NS / 2e9, every_scan=every_scan),
     )
     nothing = np.zeros((model.contract.taps, *USPA44.scan_shape), dtype=np.float32)
     results = []

@@ -132,8 +132,8 @@ def run(
             if loops:
                 rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
                 asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
-            if played is not None:  # the demo shows the run time of every scan, and the gain of every tap
-                asked = replace(asked, every_scan=True, every_tap=True)
+            if played is not None:  # the demo shows the run time of every scan
+                asked = replace(asked, every_scan=True)
             runtime = open_runtime(
                 model,
                 source,

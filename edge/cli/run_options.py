@@ -206,8 +206,8 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
         help="end when the source has been lost for T seconds; 0: at once (default: never)",
     )
     poses_help = (
-        "positions of the pad, which a robot sends: zenoh[:KEY], ros2:TOPIC or tf:PARENT:CHILD; for one of several "
-        "sensors SENSOR=P; repeat it for several"
+        "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of several sensors "
+        "SENSOR=P; repeat it for several"
     )
     add("--poses", metavar="P", action="append", default=[], help=poses_help)
     _add_model(parser)
@@ -271,11 +271,6 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         type=whole(1),
         help="combine at most K taps to a pattern (default: as many as the model takes; 1 if it takes poses of the pad "
         "and there are none)",
-    )
-    contact(
-        "--every-tap",
-        action="store_true",
-        help="combine all taps, even those not expected to help; of taps at one place the newest still counts alone",
     )
     checks = parser.add_argument_group("checks of patterns and sensor").add_argument
     checks(

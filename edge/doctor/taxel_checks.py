@@ -69,7 +69,7 @@ def check_noise(samples: Samples) -> Finding:
     norm = f"{NOISE_COUNTS:.0f} counts, up to {' / '.join(f'{look:.0f}' for look, _ in NOISE_LIMITS_COUNTS)}"
     loud = int((noise > limits).any(axis=0).sum())
     remedy = (
-        "keep motors, magnets and power cables away from the pad, and keep it still; use --every-tap if it persists"
+        "keep motors, magnets and power cables away from the pad, and keep it still"
         if loud > 1
         else f"taxel {taxel} alone is noisy: a loose magnet or a broken chip"
     )

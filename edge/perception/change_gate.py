@@ -1,9 +1,7 @@
 """Decision which part of a scan needs computing. No I/O, no clock.
 
 Without contact nothing is inferred. The last pattern is reused where nothing has changed beyond noise since the scan
-that it was made from; comparing with that scan and not with the newest one follows slow creep. Else a pattern is
-inferred from the newest tap and a number of earlier taps, which grows by one each time that the pattern of a tap was
-expected to gain by another.
+that it was made from; comparing with that scan and not with the newest one follows slow creep.
 """
 
 import math
@@ -13,8 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.tap_tracker import TapState
-
 NOISE_COUNTS: Final = 2.0
 """Standard deviation of a reading at rest: 1.7 to 2.6 in recordings."""
 CHANGED_RMS_COUNTS: Final = 1.4 * math.sqrt(2) * NOISE_COUNTS
@@ -23,36 +19,6 @@ CHANGED_COUNTS: Final = 5 * math.sqrt(2) * NOISE_COUNTS
 """Change of one reading that noise does not reach."""
 MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 """Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
-
-
-class TapsThatMatter:
-    """Number of a sensor's taps that a pattern is made from: an early stop, tap by tap."""
-
-    def __init__(self) -> None:
-        self._wanted = 1
-        self._tap = -1
-        self._strongest_counts = -math.inf
-        self._another = True
-
-    def of(self, tap: TapState) -> int:
-        """Return the number of taps to use for this scan, 1 to those available; 0 without contact."""
-        if not tap.contact:
-            return 0
-        if tap.tap != self._tap:  # a reset gives a tap that goes on a new number
-            if self._another:
-                self._wanted += 1
-            self._tap, self._another, self._strongest_counts = tap.tap, True, -math.inf
-        self._wanted = min(self._wanted, tap.taps_used)
-        return self._wanted
-
-    def judge(self, force_counts: float, another_tap: bool | None) -> None:
-        """Note whether this scan's pattern was expected to gain by another tap; the strongest scan of a tap decides.
-
-        Where the expectation is unknown, another tap counts as worth it.
-        """
-        if force_counts > self._strongest_counts:
-            self._strongest_counts = force_counts
-            self._another = another_tap is not False
 
 
 class LastReading:

@@ -22,7 +22,6 @@ class RuntimeOptions:
         contact_off_counts: summed z below which it ends.
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
         every_scan: infer also where nothing has changed beyond noise since the last pattern.
-        every_tap: use all available taps, also those that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
         fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the channels from contacts.
@@ -37,7 +36,6 @@ class RuntimeOptions:
     contact_off_counts: float = OFF_COUNTS
     idle_reset_s: float = IDLE_RESET_S
     every_scan: bool = False
-    every_tap: bool = False
     follow_drift: bool = True
     fallback: bool = True
     learn: bool = True

@@ -38,14 +38,12 @@ class NextTap(NamedTuple):
         dx_mm: place of the pad along x in the newest tap's axes.
         dy_mm: the same along y.
         turn_deg: turn of the pad from the newest tap, from x to y.
-        error_lost: share of the pattern's RMS error that a tap there is expected to take away.
         target: the same pose in the object's plane.
     """
 
     dx_mm: float
     dy_mm: float
     turn_deg: float
-    error_lost: float
     target: PadPose | None = None
 
 

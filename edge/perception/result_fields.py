@@ -107,7 +107,7 @@ def _pose(pose: PadPose) -> dict[str, float]:
 
 
 def _next_tap_numbers(proposed: NextTap) -> tuple[float, ...]:
-    return (proposed.dx_mm, proposed.dy_mm, proposed.turn_deg, proposed.error_lost)
+    return (proposed.dx_mm, proposed.dy_mm, proposed.turn_deg)
 
 
 def _next_tap(proposed: NextTap) -> dict[str, Any]:
@@ -128,7 +128,7 @@ _WRENCH_PARTS: Final = (
 )
 _POSE_KEYS: Final = ("x_mm", "y_mm", "turn_deg", "error_mm", "error_deg")
 _POSE_PARTS: Final = tuple(f"pose_{key}" for key in _POSE_KEYS)
-_NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_lost")
+_NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg")
 _NEXT_TAP_PARTS: Final = tuple(f"next_tap_{key}" for key in _NEXT_TAP_KEYS)
 _CENTRE_PARTS: Final = ("centre_of_pressure_x_mm", "centre_of_pressure_y_mm")
 
@@ -173,8 +173,8 @@ FIELDS: Final = (
     Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of it; unknown "
           "where the model takes no further one", out=_RECORD_NPZ, byte=72),
     Field("next_tap", _REAL, "next_tap", "from the end of a tap to the next one: where to touch next, dx, dy in mm and "
-          "turn in degrees from the newest tap's pad, and the share of the RMS error expected to be lost there; "
-          "records hold `target` too, the same pose in the object's plane; unknown without poses",
+          "turn in degrees from the newest tap's pad; records hold `target` too, the same pose in the object's plane; "
+          "unknown without poses",
           make=_next_tap_numbers, parts=_NEXT_TAP_PARTS, json=_next_tap),
     Field("wrench", _REAL, "wrench", "force x, y, z on the pad in N, torque about x, y, z in N mm: see "
           "[Wrench](formats.md#wrench)", make=_force_and_torque, parts=_WRENCH_PARTS, json=_wrench, out=_RECORD_NPZ,

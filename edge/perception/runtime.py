@@ -14,7 +14,7 @@ from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import Event, EventKind, Untimed
 from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
-from edge.perception.next_tap import NextTapFinder, TapAdvice
+from edge.perception.next_tap import TapAdvice
 from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_input import Due, DueQueue
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
@@ -98,9 +98,6 @@ class Runtime:
         self._contacts = contacts if options.learn else None
         self._geometry, self._scan_shape = geometry, geometry.scan_shape
         self._describe, self._trust = Describer(contract, geometry), contract.read_trust()
-        self._finder: NextTapFinder | None = None
-        if contract.takes_poses and self._trust is not None:
-            self._finder = NextTapFinder(self._trust.forward, contract.reach_mm)
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad, self._measured = pad, measured
@@ -108,7 +105,7 @@ class Runtime:
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._options = options
         # Plain attributes, since every scan reads them.
-        self._every_scan, self._every_tap = options.every_scan, options.every_tap
+        self._every_scan = options.every_scan
         self._follow_drift, self._fallback = options.follow_drift, options.fallback
         # Twice what all taxels may change by unseen together, for sensors whose mounting has gains.
         self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
@@ -261,10 +258,7 @@ class Runtime:
             sensor.follow_drift(scan, tap.contact)
         if not tap.contact and sensor.follower is not None and sensor.follower.waiting:
             sensor.learn(self._model.contract)
-        taps_used = sensor.taps_that_matter.of(tap)
-        if self._every_tap:
-            taps_used = tap.taps_used
-        taps_used = min(taps_used, self._taps)
+        taps_used = min(tap.taps_used, self._taps)
         if sensor.counts_per_newton is not None:
             force_n = force_counts / sensor.counts_per_newton
         else:
@@ -348,7 +342,6 @@ class Runtime:
             made = self._describe(checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback), sensor)
             sensor.last = made
             sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
-            sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)
             results[row] = made
             if sensor.advice is not None:
                 sensor.advice.see(made, touch.tap)
@@ -375,11 +368,10 @@ class Runtime:
         sensor.pad = self._pad.get(name) if isinstance(self._pad, Mapping) else self._pad
         if self._trust is not None:
             sensor.check = PatternCheck(self._trust, self._model.contract)
-        if self._finder is not None:
-            sensor.advice = TapAdvice(self._finder, self._taps)
         sensor.take_pad(self._model.contract)
         if self._model.contract.takes_poses:
             sensor.poses = TapPoses(self._model.contract, self._options.taps or 1, sensor.report)
+            sensor.advice = TapAdvice(self._model.contract.reach_mm, self._taps)
         if self._contacts is not None:
             measured = sensor.pad if self._measured is None else self._measured.get(name)
             sensor.follower = GainFollower(self._contacts, measured, sensor.pad)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.perception.change_gate import LastReading, TapsThatMatter
+from edge.perception.change_gate import LastReading
 from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
 from edge.perception.event import EventKind, Note, Untimed
 from edge.perception.gain_following import GainFollower
@@ -41,7 +41,7 @@ class Sensor:
         pad: what is known of it.
         pad_row: the same as the model takes it.
         poses: chooses the taps of a model that takes poses; None for other models.
-        advice: proposes where to touch next; None for models that take no poses, or have no forward model.
+        advice: proposes where to touch next; None for models that take no poses.
         check: decides whether its patterns are to be believed; None where the model has no checks.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
         gains_certainty: of the gains that are available, see firmware_bridge.scans.pad_constants.Pad; None without.
@@ -62,7 +62,6 @@ class Sensor:
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
         self.taps = taps
-        self.taps_that_matter = TapsThatMatter()
         self.poses: TapPoses | None = None
         self.advice: TapAdvice | None = None
         self.last_reading = LastReading(geometry.scan_shape)

@@ -51,7 +51,6 @@ def open_runtime(
     contact_off_counts: float = OFF_COUNTS,
     idle_reset_s: float = IDLE_RESET_S,
     every_scan: bool = False,
-    every_tap: bool = False,
     follow_drift: bool = True,
     fallback: bool = True,
     learn: bool = True,
@@ -72,7 +71,6 @@ def open_runtime(
         contact_off_counts: summed z at which it ends.
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
         every_scan: infer also where nothing has changed since the last pattern.
-        every_tap: use also taps that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
         fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
@@ -99,7 +97,7 @@ def open_runtime(
         measured=known.measured_pads if pad is None else None,
         options=RuntimeOptions(
             *(contact_on_counts, contact_off_counts, idle_reset_s),
-            *(every_scan, every_tap, follow_drift, fallback, learn, taps),
+            *(every_scan, follow_drift, fallback, learn, taps),
         ),
         unix_time_s=source.unix_time_s,
     )

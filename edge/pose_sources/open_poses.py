@@ -8,10 +8,9 @@ from edge.pipeline.pose_queue import PoseQueue
 from edge.sinks.ros2.topic_names import base_topic
 from firmware_bridge.extras import how_to_install
 
-FORMS: Final = ("zenoh[:KEY]", "ros2:TOPIC", "tf:PARENT:CHILD")
+FORMS: Final = ("zenoh[:KEY]", "ros2:TOPIC")
 DEFAULT_KEY: Final = "pose"
 _NAMED: Final = re.compile(r"([A-Za-z0-9_/-]{1,64})=(.+)", re.DOTALL)
-_FRAME: Final = re.compile(r"[^\s:=]{1,200}")
 
 
 class PoseSource(Protocol):
@@ -49,7 +48,7 @@ def check_poses(text: str) -> Wanted:
         understood(target)
     elif form == "ros2" and target:
         target = base_topic(target)
-    elif form != "tf" or not all(map(_FRAME.fullmatch, frames := target.split(":"))) or len(frames) != 2:
+    else:
         raise UsageError(f"no source of poses {text!r}; they are {', '.join(FORMS)}, or SENSOR= before one of them")
     return Wanted(sensor, form, target)
 
@@ -76,7 +75,4 @@ def open_poses(text: str, queue: PoseQueue) -> PoseSource:
         if (error.name or "").partition(".")[0] != "cyclonedds":
             raise
         raise UsageError(f"{text} needs Cyclone DDS: {how_to_install('ros2')}") from error
-    if form == "ros2":
-        return Ros2Poses.of_topic(target, queue, sensor)
-    parent, child = target.split(":")
-    return Ros2Poses.of_frames(parent, child, queue, sensor)
+    return Ros2Poses(target, queue, sensor)

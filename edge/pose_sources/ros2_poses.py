@@ -18,10 +18,9 @@ from edge.pipeline.pose_fields import PoseError
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pose_sources.stamp_clock import StampClock
 from edge.pose_sources.tool_frame import pad_pose, placed
-from edge.pose_sources.transform_tree import TransformTree
 from edge.sinks.ros2.dds_domain import join
 from edge.sinks.ros2.dds_types import dds_type
-from edge.sinks.ros2.ros_types import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TF_MESSAGE, TRANSFORM_STAMPED
+from edge.sinks.ros2.ros_types import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED
 from firmware_bridge.errors import CdrError
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -33,43 +32,25 @@ _WAIT: Final = duration(seconds=1)
 _CDR: Final = Policy.DataRepresentation(use_cdrv0_representation=True)
 # A best-effort reader takes messages of reliable and of best-effort writers.
 _STREAM: Final = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(_KEPT), _CDR)
-# What was published before is wanted, as from every publisher of /tf_static.
-_LATCHED: Final = Qos(
-    Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepLast(_KEPT), _CDR
-)
 
 
 class _Read(NamedTuple):
-    """Pose in a message, and its time in [ns] since 1970, None where it has none."""
+    """Pose in a message, and its time in [ns] since 1970."""
 
     pose: PadPose
-    stamp_ns: int | None
-    holds: bool = False
-
-
-class _Subscription(NamedTuple):
-    """Topic, its type and quality of service, and what reads the pose in a decoded message, or None."""
-
-    topic: str
-    kind: MessageType
-    qos: Qos
-    read: Callable[[Mapping[str, Any]], _Read | None]
+    stamp_ns: int
 
 
 class Ros2Poses:
     """Subscriber in a thread of its own, whose poses go to the queue as they come."""
 
     def __init__(
-        self,
-        subscriptions: list[_Subscription],
-        queue: PoseQueue,
-        sensor: str | None,
-        environment: Mapping[str, str] = os.environ,
+        self, topic: str, queue: PoseQueue, sensor: str | None = None, environment: Mapping[str, str] = os.environ
     ) -> None:
-        """Join the domain; it does not matter whether a publisher is there, now or later.
+        """Subscribe to a topic, whichever type of pose is published there, now or later.
 
         Args:
-            subscriptions: topics.
+            topic: its name, without the first slash.
             queue: of the poses.
             sensor: sensor of the poses, None for all.
             environment: ROS_DOMAIN_ID and others are read from it.
@@ -84,55 +65,20 @@ class Ros2Poses:
         self._end = GuardCondition(self._participant)
         self._waiting = WaitSet(self._participant)
         self._waiting.attach(self._end)
-        self._readers: list[tuple[DataReader[Any], _Subscription]] = []
+        self._readers: list[tuple[DataReader[Any], MessageType]] = []
         self._conditions: list[ReadCondition] = []
         state = SampleState.NotRead | ViewState.Any | InstanceState.Any
-        for one in subscriptions:
+        for kind in _READ:
             try:
-                topic = Topic(self._participant, f"rt/{one.topic}", dds_type(one.kind))
-                reader = DataReader(self._participant, topic, one.qos)
+                reader = DataReader(self._participant, Topic(self._participant, f"rt/{topic}", dds_type(kind)), _STREAM)
             except DDSException as error:
-                raise SinkError(f"cannot subscribe to /{one.topic}: {error}") from error
-            self._readers.append((reader, one))
+                raise SinkError(f"cannot subscribe to /{topic}: {error}") from error
+            self._readers.append((reader, kind))
             self._conditions.append(ReadCondition(reader, state))
             self._waiting.attach(self._conditions[-1])
         self._ended = False
         self._thread = threading.Thread(target=self._follow, name="ros2-poses", daemon=True)
         self._thread.start()
-
-    @classmethod
-    def of_topic(
-        cls, topic: str, queue: PoseQueue, sensor: str | None = None, environment: Mapping[str, str] = os.environ
-    ) -> "Ros2Poses":
-        """Subscribe to a topic, whichever type of pose is published there."""
-        kinds = (
-            (POSE_STAMPED, _of_pose),
-            (POSE_WITH_COVARIANCE_STAMPED, _of_uncertain_pose),
-            (TRANSFORM_STAMPED, _of_transform),
-        )
-        return cls([_Subscription(topic, kind, _STREAM, read) for kind, read in kinds], queue, sensor, environment)
-
-    @classmethod
-    def of_frames(
-        cls,
-        parent: str,
-        child: str,
-        queue: PoseQueue,
-        sensor: str | None = None,
-        environment: Mapping[str, str] = os.environ,
-    ) -> "Ros2Poses":
-        """Subscribe to /tf and /tf_static, for the pose of one frame in another."""
-        tree = TransformTree(parent, child)
-
-        def read(message: Mapping[str, Any], *, moves: bool) -> _Read | None:
-            found = tree.add(message, moves=moves)
-            return None if found is None else _Read(pad_pose(found.tool), found.stamp_ns, found.stamp_ns is None)
-
-        subscriptions = [
-            _Subscription("tf_static", TF_MESSAGE, _LATCHED, lambda message: read(message, moves=False)),
-            _Subscription("tf", TF_MESSAGE, _STREAM, lambda message: read(message, moves=True)),
-        ]
-        return cls(subscriptions, queue, sensor, environment)
 
     def close(self) -> None:
         """End the thread, and leave the domain."""
@@ -145,21 +91,20 @@ class Ros2Poses:
     def _follow(self) -> None:
         while not self._ended:
             self._waiting.wait(_WAIT)
-            for reader, subscription in self._readers:
+            for reader, kind in self._readers:
                 for sample in reader.take(N=_KEPT):
                     if not isinstance(sample, InvalidSample):  # else its writer has gone
-                        self._take(sample.encoded, subscription, time.monotonic_ns())
+                        self._take(sample.encoded, kind, time.monotonic_ns())
 
-    def _take(self, data: bytes, subscription: _Subscription, arrival_ns: int) -> None:
+    def _take(self, data: bytes, kind: MessageType, arrival_ns: int) -> None:
         try:
-            read = subscription.read(subscription.kind.decode(data))
+            read = _READ[kind](kind.decode(data))
         except (CdrError, PoseError) as error:
             refusal = error if isinstance(error, PoseError) else PoseError("cdr", str(error))
             self._queue.refuse(refusal)
             return
-        if read is not None:
-            time_ns = self._clock.monotonic_ns(read.stamp_ns, arrival_ns)
-            self._queue.put(TimedPose(read.pose, time_ns, self._sensor, read.holds))
+        time_ns = self._clock.monotonic_ns(read.stamp_ns, arrival_ns)
+        self._queue.put(TimedPose(read.pose, time_ns, self._sensor))
 
 
 def _stamp_ns(message: Mapping[str, Any]) -> int:
@@ -180,3 +125,11 @@ def _of_uncertain_pose(message: Mapping[str, Any]) -> _Read:
 def _of_transform(message: Mapping[str, Any]) -> _Read:
     transform = message["transform"]
     return _Read(pad_pose(placed(transform["translation"], transform["rotation"])), _stamp_ns(message))
+
+
+_READ: Final[Mapping[MessageType, Callable[[Mapping[str, Any]], _Read]]] = {
+    POSE_STAMPED: _of_pose,
+    POSE_WITH_COVARIANCE_STAMPED: _of_uncertain_pose,
+    TRANSFORM_STAMPED: _of_transform,
+}
+"""Reader of the pose in a decoded message, by its type."""

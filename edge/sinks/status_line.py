@@ -167,4 +167,4 @@ def _next_tap_text(proposed: NextTap) -> str:
     """Return where to touch next in a user's words, as the pad's axes are drawn."""
     ways = ((proposed.dx_mm, "left", "right"), (proposed.dy_mm, "up", "down"))
     moves = [f"{abs(mm):.1f} mm {less if mm < 0 else more}" for mm, less, more in ways if mm]
-    return f"next tap {' '.join(moves)} ({-100 * proposed.error_lost:.0f} % error)"
+    return f"next tap {' '.join(moves)}"

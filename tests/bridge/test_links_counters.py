@@ -7,10 +7,10 @@ import can
 import pytest
 from bridge_samples import make_recording
 from gs_usb_samples import frames_of, opened
+from xela_server_emulator import ServerEmulator
+from xela_server_model import VendorServer
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
-from firmware_bridge.emulation.xela_server_model import VendorServer
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.xela_server import XelaServerLink

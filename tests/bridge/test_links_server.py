@@ -1,8 +1,4 @@
 import json
-import os
-import select
-import signal
-import subprocess
 import sys
 import time
 
@@ -10,20 +6,16 @@ import numpy as np
 import pytest
 from bridge_samples import (
     REST_COUNTS,
-    make_counts,
     make_recording,
     read_scans,
     read_until_lost,
     stacked,
-    write_recording,
 )
-from edge_samples import ROOT
-from server_samples import looping, lose, wait_for
+from server_samples import looping, wait_for
+from xela_server_emulator import ServerEmulator
+from xela_server_model import GARBAGE, VERSIONS, VendorServer
 
 from edge.cli import main as cli
-from firmware_bridge.emulation import xela_server_main as server_emulator
-from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
-from firmware_bridge.emulation.xela_server_model import GARBAGE, VERSIONS, VendorServer, sim_recording
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.xela_server import XelaServerLink
 
@@ -156,66 +148,3 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     assert idle and all(line["force_n"] == line["vendor_force_n"][2] for line in idle)
     assert {line["temperature_k"] for line in idle} == {302.5}
     assert "missed_messages" in idle[-1]["counters"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "nothing to serve: name a recording, or --sim"),
-        (["--sim", "--other", "uSPa46"], "'uSPa46' is not MODEL:TAXELS, such as uSPa46:24"),
-        (["--sim", "--spread", "2"], "spread is 2.0"),
-        (["--sim", "--message-hz", "0"], "messages a second are 0.0"),
-        (["--sim", "--host", "0.0.0.0"], "unrecognized arguments: --host"),
-        (["--sim", "--port", "99999"], "'99999' is not a port, expected 0..65535"),
-        (["--sim", "--port", "-1"], "'-1' is not a port"),
-        (["--sim", "--down-s", "-1"], "'-1' is not a time, expected 0..1e+06 s"),
-        (["--sim", "--kill-after-s", "nan"], "'nan' is not a time"),
-        (["--sim", "--freeze-after-s", "soon"], "'soon' is not a time"),
-        (["--sim", "--garbage-every", "-2"], "'-2' is not a number of messages"),
-        (["gone.csv"], "gone.csv: cannot be read"),
-    ],
-)
-def test_the_emulator_refuses_in_one_line(arguments, words, capsys):
-    with pytest.raises(SystemExit):
-        server_emulator.main(arguments)
-    assert words in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_ctrl_c_ends_the_emulator_quietly(monkeypatch, capsys):
-    def interrupt(emulator, timeout_s):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ServerEmulator, "wait", interrupt)
-    assert server_emulator.main(["--sim"]) == 130
-    told = capsys.readouterr()
-    assert told.out.startswith("ws://127.0.0.1:") and not told.err
-
-
-def test_simulation_mode_looks_like_a_sensor():
-    """The vendor's messages do not state their kind; only the version of an emulated server does."""
-    with ServerEmulator(VendorServer([sim_recording()], loop=True)) as server, XelaServerLink(server.url) as link:
-        assert read_scans(link, 5)[-1].complete and link.trouble is None
-
-
-def test_the_emulator_by_hand(tmp_path):
-    path = write_recording(tmp_path / "made.csv", make_counts(20), rate_hz=100.0)
-    command = [
-        sys.executable,
-        "-m",
-        "firmware_bridge.emulation.xela_server_main",
-        str(path),
-        "--loop",
-        "--until-stdin-closes",
-    ]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        command, cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None and process.stdin is not None
-        assert select.select([process.stdout], [], [], 20)[0]
-        link = XelaServerLink(process.stdout.readline().strip())
-        with link:
-            assert read_scans(link, 5)
-            process.send_signal(signal.SIGKILL)
-            assert "the server is gone" in lose(link)
-        process.stdin.close()

@@ -9,8 +9,8 @@ from bridge_samples import (
     read_scans,
 )
 from server_samples import looping, read_notices
+from xela_server_emulator import ServerEmulator
 
-from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
 from firmware_bridge.errors import DeviceError, SourceError
 from firmware_bridge.links import xela_server
 from firmware_bridge.links.registry import open_source, open_sources

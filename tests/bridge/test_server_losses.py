@@ -8,8 +8,8 @@ from bridge_samples import (
 )
 from server_samples import looping, lose, read_notices, wait_for
 from websockets.protocol import State
+from xela_server_emulator import ServerEmulator
 
-from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import xela_server
 from firmware_bridge.links.registry import open_sources

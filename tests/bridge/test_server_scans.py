@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from bridge_samples import REST_COUNTS, make_recording
 from server_samples import MS, UNIX_S, message, sensor_entry
+from xela_server_model import VendorServer
 
 from edge.perception.taxel_health import HOLD_SCANS, TaxelWatch
-from firmware_bridge.emulation.xela_server_model import VendorServer
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS
 from firmware_bridge.scans.xela_server_scans import FARTHEST_BACK, MOST_MISSED, ServerScans

@@ -6,8 +6,8 @@ from bridge_samples import REST_COUNTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from server_samples import UNIX_S, message, sensor_entry
+from xela_server_model import GARBAGE
 
-from firmware_bridge.emulation.xela_server_model import GARBAGE
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, MOST_SENSORS, ServerDecoder
 
 VALUES = np.asarray(REST_COUNTS).reshape(3, 16).T.ravel().tolist()

@@ -23,14 +23,14 @@ import written_samples
 from bridge_samples import write_recording
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT, ListSink
+from xela_server_emulator import ServerEmulator
+from xela_server_model import VendorServer
 
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
 from edge.pipeline.gain_keeper import keep_learned
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
-from firmware_bridge.emulation.xela_server_model import VendorServer
 from firmware_bridge.links import discovery as devices
 from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port

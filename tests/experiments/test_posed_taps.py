@@ -90,21 +90,6 @@ def test_taps_that_do_not_belong_are_left_out_alone(models):
     assert not kept[left_out].any() and np.array_equal(kept[~left_out], windows[~left_out])
 
 
-def test_proposed_taps_in_miniature(models, tmp_path, capsys):
-    places = [f"--{place}={tmp_path / place}" for place in ("reports", "data", "checkpoints")]
-    main(["proposed-taps", "--quick", *places, f"--models={models}"])
-    report = tmp_path / "reports" / "proposed-taps"
-    assert capsys.readouterr().out.endswith(f"{report}.md\n")
-    with report.with_name("proposed-taps-schedules.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["taps"] for row in rows] == ["1", "2", "3", "4"]
-    one = {row[f"{name} dB"] for row in rows[:1] for name in ("proposed", "turns", "half-pitch")}
-    assert len(one) == 1, "all schedules share the first tap, and its sensor"
-    last = [{row[f"{name} dB"] for name in ("proposed", "turns", "half-pitch")} for row in rows[1:]]
-    assert max(map(len, last)) == 3, "the schedules differ"
-    assert all(row["proposed over turns"] and row["proposed over half-pitch"] for row in rows[1:])
-
-
 def test_limits_of_taps_in_miniature(models, tmp_path, capsys):
     places = [f"--{place}={tmp_path / place}" for place in ("reports", "data", "checkpoints")]
     main(["tap-limits", "--quick", *places, f"--models={models}"])

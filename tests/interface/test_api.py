@@ -131,11 +131,8 @@ def played(files, **settings):
     [
         ([], {}),
         (
-            shlex.split(
-                "--every-scan --every-tap --contact-on-counts 2000 --contact-off-counts 900 --counts-per-newton 1200"
-            ),
-            {"every_scan": True, "every_tap": True, "contact_on_counts": 2000, "contact_off_counts": 900}
-            | {"counts_per_newton": 1200},
+            shlex.split("--every-scan --contact-on-counts 2000 --contact-off-counts 900 --counts-per-newton 1200"),
+            {"every_scan": True, "contact_on_counts": 2000, "contact_off_counts": 900} | {"counts_per_newton": 1200},
         ),
     ],
 )
@@ -251,7 +248,7 @@ def test_zeroing_and_forgetting_taps_in_the_loop():
     said = [threading.Event(), threading.Event()]  # what comes in one batch has its results already
     link = FakeLink([*scans[:8], said[0], *scans[8:13], said[1], *scans[13:]])
     with Source(link) as source:
-        runtime = open_runtime(FakeModel(), source, baselines={"4": BASELINE}, every_tap=True)
+        runtime = open_runtime(FakeModel(), source, baselines={"4": BASELINE})
         results = []
         for result in Stream(source, runtime):
             results.append(result)

@@ -37,7 +37,7 @@ def test_poses_that_another_thread_states_are_those_of_the_next_scans():
     clock = Clock()
     with Source(FakeLink(batches)) as source:
         model = PosedModel()
-        runtime = open_runtime(model, source, baselines={"4": BASELINE}, every_tap=True)
+        runtime = open_runtime(model, source, baselines={"4": BASELINE})
         stream = Stream(source, runtime, clock_ns=clock)
         results = []
         for result in stream:
@@ -95,7 +95,7 @@ def posed_records(tmp_path):
     batches = [[make_scan(number, press_counts=press)] for number, press in enumerate(PRESSES)]
     with Source(FakeLink(batches)) as source:
         sinks = [open_sink(f"{form}:{tmp_path}/out.{form}", contract, source) for form in ("jsonl", "npz", "mcap")]
-        runtime = open_runtime(PosedModel(contract), source, baselines={"4": BASELINE}, every_tap=True)
+        runtime = open_runtime(PosedModel(contract), source, baselines={"4": BASELINE})
         made = []
         for number, batch in enumerate(batches):
             if number:
@@ -148,7 +148,7 @@ def test_the_command_line_takes_the_most_taps(tmp_path):
     write_posed_model(tmp_path / "posed.onnx")
     save_baselines(tmp_path / "zero.json", [BASELINE])
     write_recording(tmp_path / "taps.npz", ([0] * 5 + [3000] * 5) * 4)
-    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", tmp_path / "zero.json", "--every-tap")
+    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", tmp_path / "zero.json")
     for options, most in (((), 1), (("--taps", "3"), 3)):
         done = run("replay", tmp_path / "taps.npz", *fixed, "--sink", "jsonl:-", *options)
         said = [json.loads(line) for line in done.stdout.splitlines()]

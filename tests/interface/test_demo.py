@@ -163,9 +163,7 @@ def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
 
 
 def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
-    runtime = Runtime(
-        load_model(POSED_MODEL), source="emulated", options=RuntimeOptions(every_scan=True, every_tap=True)
-    )
+    runtime = Runtime(load_model(POSED_MODEL), source="emulated", options=RuntimeOptions(every_scan=True))
     series = ScanSeries("4", USPA44)
     with np.load(demo_recording()) as demo:
         before = np.argmax(demo["scene"] == SLIDE)

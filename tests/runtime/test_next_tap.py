@@ -1,4 +1,4 @@
-"""Where to touch next: what taps leave uncertain decides, and each proposal is made once."""
+"""Where to touch next: half a pitch from the taps so far, and each proposal is made once."""
 
 import json
 from dataclasses import replace
@@ -11,10 +11,8 @@ from edge_samples import BASELINE, PERIOD_NS, make_scan
 from pose_samples import PosedModel, make_posed_contract
 from trust_samples import make_forward, make_posed_trust
 
-from edge.inference.bundled import find_model
-from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.next_tap import NextTapFinder, TapAdvice
+from edge.perception.next_tap import TapAdvice, next_shift_mm
 from edge.perception.result import NextTap
 from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import TapPeak, TapState
@@ -24,85 +22,48 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
 
 HALF_MM = USPA44.pitch_mm / 2
-EVEN = np.full((40, 40), 0.02, dtype=np.float32)
 
 
-@pytest.fixture(scope="module")
-def forward():
-    trust = ModelSession(find_model("stsr-small")).contract.read_trust()
-    assert trust is not None
-    return trust.forward
-
-
-@pytest.fixture(scope="module")
-def finder(forward):
-    return NextTapFinder(forward, 6.0)
-
-
-def propose(finder, poses, deviation=EVEN) -> NextTap:
-    proposed = finder(poses, deviation)
-    assert proposed is not None
-    return proposed
+REACH_MM = 6.0
 
 
 def taps(*places):
     return np.array([(x * HALF_MM, y * HALF_MM, 0.0, 0.2, 1.0) for x, y in places])
 
 
-def test_shifts_by_half_a_pitch_are_proposed_until_the_grid_is_twice_as_fine(finder):
-    places = [(0, 0)]
-    for _ in range(3):
-        proposed = propose(finder, taps(*places))
-        places.append((round(proposed.dx_mm / HALF_MM), round(proposed.dy_mm / HALF_MM)))
-        assert proposed.turn_deg == 0
-    assert {(x % 2, y % 2) for x, y in places} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+def test_four_taps_make_a_square_of_half_a_pitch_and_none_is_touched_twice():
+    places = np.zeros((1, 2))
+    for _ in range(6):
+        shift_mm = next_shift_mm(places[::-1] - places[-1], REACH_MM)
+        assert shift_mm is not None
+        places = np.vstack([places, places[-1] + shift_mm])
+    halves = [tuple(row) for row in np.rint(places / HALF_MM).astype(int).tolist()]
+    assert len(set(halves)) == 7
+    assert {(x % 2, y % 2) for x, y in halves[:4]} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    apart_mm = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
+    assert apart_mm.max() <= REACH_MM
 
 
-def test_each_further_tap_is_expected_to_gain_less(finder):
-    first = propose(finder, taps((0, 0))).error_lost
-    later = propose(finder, taps((0, 0), (1, 1), (1, 0), (0, 1), (-1, -1))).error_lost
-    assert 0 < later < first / 2 and first < 0.3
+def test_an_earlier_tap_off_the_grid_still_has_its_place():
+    shift_mm = next_shift_mm(np.array([[0.0, 0.0], [HALF_MM + 0.3, -0.2]]), REACH_MM)
+    assert shift_mm is not None and shift_mm != (HALF_MM, 0.0)
 
 
-@pytest.mark.parametrize(("side", "axis", "sign"), [("right", 0, 1), ("left", 0, -1), ("down", 1, 1), ("up", 1, -1)])
-def test_a_tap_is_proposed_towards_what_is_uncertain(finder, side, axis, sign):
-    deviation = EVEN.copy()
-    rows, cols = {
-        "right": (slice(None), slice(28, None)),
-        "left": (slice(None), slice(12)),
-        "down": (slice(28, None), slice(None)),
-        "up": (slice(12), slice(None)),
-    }[side]
-    deviation[rows, cols] *= 8
-    # Its opposite places are as informative but for the deviation.
-    proposed = propose(finder, taps((0, 0)), deviation)
-    assert sign * (proposed.dx_mm, proposed.dy_mm)[axis] > 0
-
-
-def test_a_turned_earlier_tap_counts_where_it_was(finder):
-    """Seen from the newest tap at a quarter turn, an earlier one is at the same place whatever its own turn."""
-    here = propose(finder, taps((0, 0), (1, 1)))
-    turned = taps((0, 0), (1, 1))
-    turned[1, 2] = 180.0
-    assert (propose(finder, turned).dx_mm, propose(finder, turned).dy_mm) != (HALF_MM, HALF_MM)
-    assert (here.dx_mm, here.dy_mm) != (HALF_MM, HALF_MM)
-
-
-def test_no_tap_is_proposed_from_which_an_earlier_one_is_out_of_reach(forward):
-    near = NextTapFinder(forward, 3.4)
-    proposed = propose(near, taps((0, 0), (-1, 0)))
-    assert np.hypot(proposed.dx_mm + HALF_MM, proposed.dy_mm) <= 3.4
-    assert NextTapFinder(forward, 2.0)(taps((0, 0)), EVEN) is None
+def test_no_tap_is_proposed_from_which_an_earlier_one_is_out_of_reach():
+    shift_mm = next_shift_mm(taps((0, 0), (-1, 0))[:, :2], 3.4)
+    assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
+    assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
 
 
 def made(force_counts=100.0, **changes) -> Any:
-    values = {"pose": PadPose(10, 20, 90), "poses": taps((0, 0)), "deviation": EVEN, "trusted": True, "taps_used": 1}
+    values = {"pose": PadPose(10, 20, 90), "poses": taps((0, 0)), "trusted": True, "taps_used": 1}
     return SimpleNamespace(**values | {"force_counts": force_counts} | changes)
 
 
 PEAKS = (TapPeak(0, 0),)
 TOUCHING, FREE, FORGOTTEN = (
-    TapState(contact, 0, int(contact), EVEN, peaks) for contact, peaks in ((True, ()), (False, PEAKS), (False, ()))
+    TapState(contact, 0, int(contact), np.zeros(0, dtype=np.float32), peaks)
+    for contact, peaks in ((True, ()), (False, PEAKS), (False, ()))
 )
 
 
@@ -116,8 +77,8 @@ def proposed_after(advice) -> NextTap:
     return proposed
 
 
-def test_a_proposal_is_made_when_a_tap_ends_and_kept_until_the_next_one(finder):
-    advice = TapAdvice(finder, taps=7)
+def test_a_proposal_is_made_when_a_tap_ends_and_kept_until_the_next_one():
+    advice = TapAdvice(REACH_MM, taps=7)
     assert after(advice) is None
     advice.see(made(), 0)
     assert advice.proposal(TOUCHING) is None
@@ -131,21 +92,20 @@ def test_a_proposal_is_made_when_a_tap_ends_and_kept_until_the_next_one(finder):
     assert after(advice) is None, "forgotten taps are no reason to touch again"
 
 
-def test_the_strongest_pattern_of_a_tap_is_the_one_that_counts(finder):
-    right, left = EVEN.copy(), EVEN.copy()
-    right[:, 28:] *= 8
-    left[:, :12] *= 8
-    advice = TapAdvice(finder, taps=7)
-    for force_counts, deviation in ((50.0, left), (200.0, right), (80.0, left)):
-        advice.see(made(force_counts, deviation=deviation), 0)
-    assert proposed_after(advice).dx_mm > 0
+def test_the_strongest_pattern_of_a_tap_is_the_one_that_counts():
+    advice = TapAdvice(REACH_MM, taps=7)
+    for force_counts, x_mm in ((50.0, 1.0), (200.0, 2.0), (80.0, 3.0)):
+        advice.see(made(force_counts, pose=PadPose(x_mm, 0)), 0)
+    proposed = proposed_after(advice)
+    assert proposed.target is not None and proposed.target.x_mm - proposed.dx_mm == pytest.approx(2)
     advice.proposal(TOUCHING)
-    advice.see(made(60.0, deviation=left), 0)
-    assert proposed_after(advice).dx_mm < 0, "a lighter tap counts no less, once it is the newest"
+    advice.see(made(60.0, pose=PadPose(5, 0)), 0)
+    proposed = proposed_after(advice)
+    assert proposed.target is not None and proposed.target.x_mm - proposed.dx_mm == pytest.approx(5)
 
 
-def test_the_target_is_the_proposal_in_the_objects_plane(finder):
-    advice = TapAdvice(finder, taps=7)
+def test_the_target_is_the_proposal_in_the_objects_plane():
+    advice = TapAdvice(REACH_MM, taps=7)
     advice.see(made(), 0)
     proposed = proposed_after(advice)
     target = proposed.target
@@ -155,11 +115,9 @@ def test_the_target_is_the_proposal_in_the_objects_plane(finder):
     assert (target.x_mm, target.y_mm) == pytest.approx((10 - proposed.dy_mm, 20 + proposed.dx_mm))
 
 
-@pytest.mark.parametrize(
-    "changes", [{"pose": None}, {"poses": None}, {"deviation": None}, {"trusted": False}, {"taps_used": 7}]
-)
-def test_nothing_is_proposed_without_what_it_needs(finder, changes):
-    advice = TapAdvice(finder, taps=7)
+@pytest.mark.parametrize("changes", [{"pose": None}, {"poses": None}, {"trusted": False}, {"taps_used": 7}])
+def test_nothing_is_proposed_without_what_it_needs(changes):
+    advice = TapAdvice(REACH_MM, taps=7)
     advice.see(made(**changes), 0)
     assert after(advice) is None
 
@@ -177,7 +135,7 @@ class TestRuntime:
             PosedModel(contract),
             source="emulated",
             baselines={"4": BASELINE},
-            options=RuntimeOptions(every_tap=True, idle_reset_s=0.2),
+            options=RuntimeOptions(idle_reset_s=0.2),
         )
 
     def push(self, press=0.0):
@@ -223,17 +181,15 @@ class TestRuntime:
         self.runtime.reset()
         self.runtime.pose(PadPose(3, 0), (self.number + 1) * PERIOD_NS - 1000, holds=True)
         later = [self.push(press) for press in (0.8 * self.PRESS, 0.7 * self.PRESS)]
-        proposed, alone = self.push().next_tap, TapAdvice(self.runtime._finder, 7)
+        proposed, alone = self.push().next_tap, TapAdvice(REACH_MM, 7)
         alone.see(later[0], 0)
         expected = alone.proposal(FREE)
         assert later[0].taps_used == 1 and proposed is not None and expected is not None
-        assert proposed.target == expected.target and proposed.error_lost == expected.error_lost
+        assert proposed.target == expected.target
 
-    def test_without_poses_and_by_other_models_nothing_is_proposed(self, tmp_path):
+    def test_without_poses_nothing_is_proposed(self, tmp_path):
         self.make(tmp_path)
         assert self.tap()[1].next_tap is None
-        self.make(tmp_path, trust={}, pad_inputs=(), takes_gains=False)
-        assert self.tap(PadPose(0, 0))[1].next_tap is None
 
     def test_every_output_holds_it(self, tmp_path):
         self.make(tmp_path)
@@ -242,7 +198,6 @@ class TestRuntime:
         assert proposed is not None
         in_record = record(released, {})["next_tap"]
         assert in_record["dx_mm"] == pytest.approx(proposed.dx_mm) and in_record["turn_deg"] == 0
-        assert 0 < in_record["error_lost"] == pytest.approx(proposed.error_lost, abs=1e-3)
         assert in_record["target"]["x_mm"] == pytest.approx(5 - proposed.dy_mm, abs=1e-3)
         assert record(pressed[1], {})["next_tap"] is None
         contract = self.runtime._model.contract
@@ -252,7 +207,7 @@ class TestRuntime:
         sink.close()
         held = np.load(tmp_path / "out.npz")["next_tap"]
         assert np.isnan(held[0]).all()
-        assert held[1] == pytest.approx(proposed[:4], abs=1e-6)
+        assert held[1] == pytest.approx(proposed[:3], abs=1e-6)
         sink = open_sink(f"jsonl:{tmp_path / 'out.jsonl'}", contract=contract)
         sink.write(released, {})
         sink.close()

@@ -14,8 +14,6 @@ from edge.inference.pose_input import pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.poses.pad_pose import PadPose
 
-EVERY = RuntimeOptions(every_tap=True)
-
 
 @pytest.fixture
 def session(tmp_path):
@@ -67,7 +65,7 @@ POSES = [PadPose(0, 0, 0), PadPose(2, 1, 5, 0.1, 2), PadPose(3, -1, 90, 0.3, 0.5
 
 
 def test_a_pattern_is_made_from_all_taps_with_their_poses_in_the_newest_ones_axes(session):
-    pad = Pad(make_runtime(session, options=EVERY))
+    pad = Pad(make_runtime(session))
     for count, pose in enumerate(POSES, 1):
         result = pad.tap(pose, PRESS + 500 * count)
         assert result.taps_used == count and result.pose == pose
@@ -79,7 +77,7 @@ def test_a_pattern_is_made_from_all_taps_with_their_poses_in_the_newest_ones_axe
 
 
 def test_a_tap_has_the_pose_of_its_peak_and_the_newest_that_of_its_scan():
-    pad = Pad(make_runtime(PosedModel(), options=EVERY))
+    pad = Pad(make_runtime(PosedModel()))
     for x_mm, press in ((0, PRESS), (1, 2 * PRESS), (2, PRESS), (3, 0)):
         pad.place(PadPose(x_mm, 0))
         pad.push(press)
@@ -90,7 +88,7 @@ def test_a_tap_has_the_pose_of_its_peak_and_the_newest_that_of_its_scan():
 
 
 def test_the_pose_is_that_of_the_moment_at_which_readings_were_on_the_bus():
-    runtime = make_runtime(PosedModel(), options=EVERY)
+    runtime = make_runtime(PosedModel())
     for number in range(20):
         runtime.pose(PadPose(number, 0), number * PERIOD_NS)
     scan = make_scan(10, press_counts=PRESS)
@@ -102,7 +100,7 @@ def test_the_pose_is_that_of_the_moment_at_which_readings_were_on_the_bus():
 
 def test_taps_without_a_pose_are_left_out_with_one_event_each():
     model = PosedModel()
-    pad = Pad(make_runtime(model, options=EVERY))
+    pad = Pad(make_runtime(model))
     pad.tap()
     pad.tap()
     assert pad.events == [], "a sensor without poses is no fault"
@@ -116,7 +114,7 @@ def test_taps_without_a_pose_are_left_out_with_one_event_each():
 
 
 def test_a_newest_scan_without_a_pose_is_used_alone():
-    pad = Pad(make_runtime(PosedModel(), options=EVERY))
+    pad = Pad(make_runtime(PosedModel()))
     pad.tap(PadPose(0, 0))
     pad.lose_pose()
     result = pad.tap()
@@ -128,7 +126,7 @@ def test_a_newest_scan_without_a_pose_is_used_alone():
 
 
 def test_taps_that_have_left_the_window_are_forgotten():
-    runtime = make_runtime(PosedModel(), options=EVERY)
+    runtime = make_runtime(PosedModel())
     pad = Pad(runtime)
     pad.tap(PadPose(0, 0))
     pad.lose_pose()
@@ -143,7 +141,7 @@ def test_taps_that_have_left_the_window_are_forgotten():
 
 
 def test_a_pose_that_comes_after_its_tap_counts():
-    pad = Pad(make_runtime(PosedModel(), options=EVERY))
+    pad = Pad(make_runtime(PosedModel()))
     pad.place(PadPose(0, 0), sensor="another")
     pad.tap()
     pad.runtime.pose(PadPose(1, 0), 1 * PERIOD_NS)
@@ -153,7 +151,7 @@ def test_a_pose_that_comes_after_its_tap_counts():
 
 
 def test_a_tap_beyond_reach_is_left_out_until_the_pad_comes_near_again():
-    pad = Pad(make_runtime(PosedModel(make_posed_contract(reach_mm=5.0)), options=EVERY))
+    pad = Pad(make_runtime(PosedModel(make_posed_contract(reach_mm=5.0))))
     pad.tap(PadPose(0, 0))
     assert pad.tap(PadPose(3, 4)).taps_used == 2
     result = pad.tap(PadPose(5.1, 0))
@@ -165,7 +163,7 @@ def test_a_tap_beyond_reach_is_left_out_until_the_pad_comes_near_again():
 
 def test_of_taps_at_one_place_the_newest_counts_alone():
     """The error of a taxel is in all of them, and would count as seen several times."""
-    pad = Pad(make_runtime(PosedModel(), options=EVERY))
+    pad = Pad(make_runtime(PosedModel()))
     for pose, expected_mm in (
         (PadPose(0, 0), [0]),
         (PadPose(0.3, 0.3), [0]),
@@ -180,14 +178,14 @@ def test_of_taps_at_one_place_the_newest_counts_alone():
 
 
 def test_no_more_taps_than_the_model_takes_the_newest_of_them():
-    pad = Pad(make_runtime(PosedModel(make_posed_contract(taps=3)), options=EVERY))
+    pad = Pad(make_runtime(PosedModel(make_posed_contract(taps=3))))
     for number in range(5):
         result = pad.tap(PadPose(number, 0))
     assert result.poses[:, 0].tolist() == [0, -1, -2]
 
 
 def test_two_sensors_with_different_numbers_of_taps_in_one_run(session):
-    runtime = make_runtime(session, baselines=dict.fromkeys(("4", "6"), BASELINE), options=EVERY)
+    runtime = make_runtime(session, baselines=dict.fromkeys(("4", "6"), BASELINE))
     pads = [Pad(runtime, "4"), Pad(runtime, "6")]
     runtime.pose(PadPose(7, 7, 7), 0, "6", holds=True)
     for pose in POSES:
@@ -203,7 +201,7 @@ def test_two_sensors_with_different_numbers_of_taps_in_one_run(session):
 
 def test_an_unchanged_reading_is_inferred_again_where_a_relative_pose_has_changed():
     model = PosedModel()
-    pad = Pad(make_runtime(model, options=EVERY))
+    pad = Pad(make_runtime(model))
     pad.tap(PadPose(0, 0))
     pad.place(PadPose(1, 0, 0))
     first = pad.push(PRESS)
@@ -227,7 +225,7 @@ def test_a_single_tap_is_not_inferred_again_for_its_pose():
 
 @pytest.mark.parametrize(("taps", "used"), [(None, 1), (1, 1), (3, 3)])
 def test_a_sensor_without_poses_follows_the_schedule_with_as_many_taps_as_asked_for(taps, used):
-    pad = Pad(make_runtime(PosedModel(), options=RuntimeOptions(every_tap=True, taps=taps)))
+    pad = Pad(make_runtime(PosedModel(), options=RuntimeOptions(taps=taps)))
     for _ in range(4):
         result = pad.tap()
     assert result.taps_used == used and result.pose is None and pad.events == []
@@ -235,9 +233,9 @@ def test_a_sensor_without_poses_follows_the_schedule_with_as_many_taps_as_asked_
 
 
 def test_the_most_taps_hold_with_poses_and_for_models_without():
-    pad = Pad(make_runtime(PosedModel(), options=RuntimeOptions(every_tap=True, taps=2)))
+    pad = Pad(make_runtime(PosedModel(), options=RuntimeOptions(taps=2)))
     assert [pad.tap(PadPose(x, 0)).taps_used for x in range(4)] == [1, 2, 2, 2]
-    pad = Pad(make_runtime(FakeModel(), options=RuntimeOptions(every_tap=True, taps=2)))
+    pad = Pad(make_runtime(FakeModel(), options=RuntimeOptions(taps=2)))
     assert [pad.tap().taps_used for _ in range(4)] == [1, 2, 2, 2]
 
 
@@ -250,7 +248,7 @@ def test_more_taps_than_the_model_takes_are_refused():
 
 
 def test_a_model_without_poses_ignores_them_but_its_results_have_the_pads():
-    plain, moved = Pad(make_runtime(FakeModel(), options=EVERY)), Pad(make_runtime(FakeModel(), options=EVERY))
+    plain, moved = Pad(make_runtime(FakeModel())), Pad(make_runtime(FakeModel()))
     for x_mm in (0, 50):
         without, result = plain.tap(), moved.tap(PadPose(x_mm, 0))
         np.testing.assert_array_equal(result.pattern, without.pattern)
@@ -259,7 +257,7 @@ def test_a_model_without_poses_ignores_them_but_its_results_have_the_pads():
 
 
 def test_a_new_object_forgets_taps_and_keeps_poses():
-    pad = Pad(make_runtime(PosedModel(), options=EVERY))
+    pad = Pad(make_runtime(PosedModel()))
     pad.tap(PadPose(1, 0))
     pad.runtime.reset()
     result = pad.tap()
@@ -268,7 +266,7 @@ def test_a_new_object_forgets_taps_and_keeps_poses():
 
 def test_a_contract_of_before_poses_is_run_as_before():
     model = FakeModel(make_contract(version=6))
-    pad = Pad(make_runtime(model, options=EVERY))
+    pad = Pad(make_runtime(model))
     pad.tap()
     result = pad.tap()
     assert result.poses is None and model.windows[-1].shape == (4, 3, 4, 4) and not model.windows[-1][2:].any()
@@ -280,7 +278,7 @@ def make_checked_contract(trust):
 
 
 def test_the_check_of_earlier_taps_takes_their_poses_and_a_dropped_tap_is_forgotten():
-    pad = Pad(make_runtime(PosedModel(make_checked_contract(make_posed_trust(2.5))), options=EVERY))
+    pad = Pad(make_runtime(PosedModel(make_checked_contract(make_posed_trust(2.5)))))
     pad.tap(PadPose(4, 0))
     pad.lose_pose()
     pad.tap()  # without a pose, so it is left out below
@@ -295,7 +293,7 @@ def test_the_check_of_earlier_taps_takes_their_poses_and_a_dropped_tap_is_forgot
 
 def test_a_tap_that_does_not_belong_goes_alone_where_taps_have_poses():
     model = PosedModel(make_checked_contract(make_posed_trust(2.5)))
-    pad = Pad(make_runtime(model, options=EVERY))
+    pad = Pad(make_runtime(model))
     for x_mm, more in ((1, 0), (4, 100), (2, 200)):
         pad.tap(PadPose(x_mm, 0), PRESS + more)
     pad.place(PadPose(0, 0))
@@ -315,9 +313,7 @@ def test_a_tap_that_does_not_belong_goes_alone_where_taps_have_poses():
 
 def test_taps_of_the_schedule_go_with_the_stranger_that_came_after_them():
     # Without poses every tap lies at 0 mm, so that a limit below that drops them all.
-    runtime = make_runtime(
-        PosedModel(make_checked_contract(make_posed_trust(-1.0))), options=RuntimeOptions(every_tap=True, taps=3)
-    )
+    runtime = make_runtime(PosedModel(make_checked_contract(make_posed_trust(-1.0))), options=RuntimeOptions(taps=3))
     pad = Pad(runtime)
     for _ in range(5):
         pad.tap()

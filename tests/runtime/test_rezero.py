@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
 
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from edge.perception.zero_on_demand import GIVE_UP_NS
 from edge.sinks.event_printer import MessageSink
@@ -144,7 +143,7 @@ def test_before_there_is_a_baseline_there_is_nothing_to_zero_again():
 
 
 def test_earlier_taps_are_forgotten_since_they_were_read_over_another_rest_level():
-    bench = Bench(options=RuntimeOptions(every_tap=True))
+    bench = Bench()
     bench.play(3, LOCAL), bench.play(3), bench.play(3, LOCAL), bench.play(3)
     assert bench.play(1, LOCAL)[0].taps_used == 3
     bench.play(3)

@@ -1,13 +1,11 @@
 """Needs of a scan: nothing, the pattern before, or one from the taps that matter."""
 
 import numpy as np
-import pytest
 from edge_samples import BASELINE, FakeModel, inferred, make_contract, make_scan
 
-from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading, TapsThatMatter
+from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
-from edge.perception.tap_tracker import TapState
 
 SHAPE = (3, 4, 4)
 
@@ -61,47 +59,6 @@ class TestLastReading:
         assert not last.holds(before, ("model", 0, 1))
 
 
-def tap(number, taps_used):
-    return TapState(taps_used > 0, number, taps_used, np.zeros((4, 3, 4, 4), dtype=np.float32))
-
-
-class TestTapsThatMatter:
-    def run(self, *verdicts, force_counts=1000.0):
-        """Return the taps used in each of a row of taps whose patterns got these verdicts."""
-        matter, used = TapsThatMatter(), []
-        for number, verdict in enumerate(verdicts):
-            used.append(matter.of(tap(number, min(number + 1, 4))))
-            if verdict != "dropped":
-                matter.judge(force_counts, verdict)
-            assert matter.of(tap(number, 0)) == 0
-        return used
-
-    def test_it_stops_at_the_first_tap_that_needs_no_other(self):
-        assert self.run(True, True, False, True, True) == [1, 2, 3, 3, 4]
-        assert self.run(False, False, False) == [1, 1, 1]
-
-    @pytest.mark.parametrize("verdict", [None, "dropped"])
-    def test_where_it_is_not_known_every_tap_is_used(self, verdict):
-        assert self.run(*[verdict] * 6) == [1, 2, 3, 4, 4, 4]
-
-    def test_the_strongest_scan_of_a_tap_decides(self):
-        for order in ([(100, True), (900, False), (200, True)], [(900, False), (100, True)]):
-            matter = TapsThatMatter()
-            matter.of(tap(0, 1))
-            for force_counts, verdict in order:
-                matter.judge(force_counts, verdict)
-            matter.of(tap(0, 0))
-            assert matter.of(tap(1, 2)) == 1
-
-    def test_forgotten_taps_start_it_over(self):
-        matter = TapsThatMatter()
-        for number, there in enumerate((1, 2, 3, 1, 2)):
-            used = matter.of(tap(number, there))
-            matter.judge(1000.0, True)
-            matter.of(tap(number, 0))
-            assert used == there
-
-
 def make_runtime(contract=None, **settings):
     model = FakeModel(contract or make_contract(interval_factor=1.6))
     return Runtime(model, source="device", baselines={"4": BASELINE}, **settings), model
@@ -150,15 +107,12 @@ def taps_used(runtime, presses):
     return used
 
 
-@pytest.mark.parametrize(("gain", "expected"), [(0.5, [1, 2, 3]), (0.0, [1, 1, 1])])
-@pytest.mark.parametrize("every_tap", [False, True])
-def test_earlier_taps_that_would_not_help_are_kept_from_the_network(gain, expected, every_tap):
-    told = {"doubt": [0.1, 1.0], "error": [0.1, 0.2], "gain": [gain, gain]}
+def test_every_tap_that_is_there_is_used():
+    told = {"doubt": [0.1, 1.0], "error": [0.1, 0.2], "gain": [0.0, 0.0]}
     contract = make_contract(interval_factor=1.6, confidence={"1": told, "2": told, "3": told})
-    runtime, model = make_runtime(contract, options=RuntimeOptions(every_tap=every_tap))
-    expected = [1, 2, 3] if every_tap else expected
-    assert taps_used(runtime, (2000, 3000, 4000)) == expected
-    for used, window in zip(np.repeat(expected, 2), model.windows, strict=True):
+    runtime, model = make_runtime(contract)
+    assert taps_used(runtime, (2000, 3000, 4000)) == [1, 2, 3]
+    for used, window in zip(np.repeat([1, 2, 3], 2), model.windows, strict=True):
         assert window[:used].any(axis=(1, 2, 3)).all() and not window[used:].any()
 
 
@@ -185,12 +139,3 @@ def test_two_sensors_are_inferred_in_one_call_in_the_order_they_came():
     for result in results:
         np.testing.assert_array_equal(result.pattern, alone[result.scan.sensor].pattern)
         np.testing.assert_array_equal(result.deviation, alone[result.scan.sensor].deviation)
-
-
-def test_after_a_reset_the_tap_that_goes_on_is_judged_by_its_own_patterns():
-    matter = TapsThatMatter()
-    matter.of(tap(0, 1))
-    matter.judge(9000.0, False)
-    matter.of(tap(1, 1))  # a reset while it touched
-    matter.judge(3000.0, True)
-    assert matter.of(tap(2, 2)) == 2

@@ -16,7 +16,7 @@ from firmware_bridge.pad_geometry import USPA46
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
-EVERY = RuntimeOptions(every_tap=True, every_scan=True, follow_drift=False)
+EVERY = RuntimeOptions(every_scan=True, follow_drift=False)
 ELSEWHERE = 10
 TAP_SCANS = 3
 

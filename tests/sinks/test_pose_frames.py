@@ -9,7 +9,6 @@ import pytest
 from edge.pipeline.pose_fields import PoseError
 from edge.pose_sources.stamp_clock import EARLY_NS, LATE_NS, StampClock
 from edge.pose_sources.tool_frame import MOST_TILT_DEG, pad_pose, placed
-from edge.pose_sources.transform_tree import TransformTree
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 
 DOWN = (1.0, 0.0, 0.0, 0.0)
@@ -104,58 +103,6 @@ class TestToolFrame:
     def test_a_covariance_that_is_not_known_leaves_the_usual_errors(self, value):
         pose = read((0, 0, 0), DOWN, np.full(36, value))
         assert (pose.error_mm, pose.error_deg) == (PLACE_ERROR_MM, TURN_ERROR_DEG)
-
-
-def transform(parent, child, place, quaternion=(0, 0, 0, 1), stamp_ns=0):
-    sec, nanosec = divmod(stamp_ns, 10**9)
-    return {
-        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": parent},
-        "child_frame_id": child,
-        "transform": {"translation": named(place), "rotation": named(quaternion)},
-    }
-
-
-def message(*transforms):
-    return {"transforms": list(transforms)}
-
-
-class TestTransformTree:
-    def test_a_chain_of_frames_is_multiplied_out(self):
-        tree = TransformTree("base", "pad")
-        assert tree.add(message(transform("tool0", "pad", (0, 0, 0.1))), moves=False) is None
-        quarter = about((0, 0, 1), 90)
-        found = tree.add(
-            message(transform("link", "tool0", (1, 0, 0), DOWN, 7), transform("base", "link", (0, 2, 0), quarter, 5)),
-            moves=True,
-        )
-        assert found is not None and found.stamp_ns == 5
-        assert found.tool.place_m == pytest.approx([0, 3, -0.1])
-        assert pad_pose(found.tool).turn_deg == pytest.approx(90)
-
-    def test_frames_that_meet_further_up_give_the_pose_of_one_in_the_other(self):
-        tree = TransformTree("object", "pad")
-        tree.add(message(transform("world", "object", (1, 1, 0), about((0, 0, 1), 90))), moves=False)
-        found = tree.add(message(transform("world", "pad", (1, 3, 0), DOWN, 4)), moves=True)
-        assert found is not None and found.tool.place_m == pytest.approx([2, 0, 0])
-        assert pad_pose(found.tool).turn_deg == pytest.approx(-90)
-
-    def test_each_pose_comes_once_and_only_newer_ones(self):
-        tree = TransformTree("base", "pad")
-        stamps = (10, 10, 9, 11)
-        found = [tree.add(message(transform("base", "pad", (0, 0, 0), DOWN, n)), moves=True) for n in stamps]
-        assert [None if one is None else one.stamp_ns for one in found] == [10, None, None, 11]
-        other = message(transform("base", "camera", (0, 0, 0), DOWN, 50))
-        assert tree.add(other, moves=True) is None
-
-    def test_a_pad_that_never_moves_has_one_pose_without_a_time(self):
-        tree = TransformTree("base", "pad")
-        both = [tree.add(message(transform("base", "pad", (0, 0, 0), DOWN)), moves=False) for _ in range(2)]
-        assert both[0] is not None and both[0].stamp_ns is None and both[1] is None
-
-    def test_a_ring_of_frames_ends(self):
-        tree = TransformTree("base", "pad")
-        ring = message(transform("a", "pad", (0, 0, 0)), transform("pad", "a", (0, 0, 0)))
-        assert tree.add(ring, moves=True) is None
 
 
 class TestStampClock:

@@ -29,9 +29,8 @@ class TestForms:
             ("zenoh", (None, "zenoh", "pose")),
             ("zenoh:arm/pose?connect=tcp/10.0.0.5:7447", (None, "zenoh", "arm/pose?connect=tcp/10.0.0.5:7447")),
             ("ros2:/arm/pose", (None, "ros2", "arm/pose")),
-            ("tf:base_link:tool0", (None, "tf", "base_link:tool0")),
             ("4=ros2:pose", ("4", "ros2", "pose")),
-            ("left/4=tf:a:b", ("left/4", "tf", "a:b")),
+            ("left/4=ros2:/a/b", ("left/4", "ros2", "a/b")),
         ],
     )
     def test_what_exists(self, text, expected):
@@ -39,7 +38,7 @@ class TestForms:
 
     @pytest.mark.parametrize(
         "text",
-        ["", "ros2", "ros2:", "ros2:/9x", "tf", "tf:a", "tf:a:b:c", "tf:a:", "tf::b", "tf:a b:c", "zenoh:a*", "mqtt:x"],
+        ["", "ros2", "ros2:", "ros2:/9x", "tf:a:b", "zenoh:a*", "mqtt:x"],
     )
     def test_what_does_not(self, text):
         with pytest.raises(UsageError) as caught:
@@ -145,7 +144,7 @@ with zenoh.open(config) as session:
 
 class TestRos2:
     POSE, UNCERTAIN = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-    TRANSFORM, TF = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+    TRANSFORM = "geometry_msgs/msg/TransformStamped"
 
     @pytest.fixture
     def publish(self):
@@ -157,8 +156,7 @@ class TestRos2:
             "PYTHONPATH": PYTHONPATH,
         }
         command = [sys.executable, str(ROOT / "tests/support/ros2_pose_writer.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
-        poses = [["arm/pose", kind, False] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
-        topics = [*poses, ["tf", self.TF, False], ["tf_static", self.TF, True]]
+        topics = [["arm/pose", kind] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         with subprocess.Popen([*command, json.dumps(topics)], env=environment, text=True, **pipes) as process:
             assert process.stdin is not None and process.stdout is not None
@@ -237,23 +235,6 @@ class TestRos2:
         poses = until(queue, lambda poses: {1.0, 250.0} <= {one.pose.x_mm for one in poses}, act)
         errors = {one.pose.x_mm: (one.pose.error_mm, one.pose.error_deg) for one in poses}
         assert errors[1.0] == (pytest.approx(1), pytest.approx(1.1459, abs=1e-3)) and errors[250.0] == (0.2, 1.0)
-
-    def test_frames_of_tf_are_followed_from_one_to_the_other(self, opened, publish):
-        # Published before anyone subscribes, and once.
-        publish("tf_static", self.TF, {"transforms": [self.transform("tool0", "pad", 0.01, 0.0, DOWN)]})
-        queue = opened("tf:table:pad")
-
-        def act():
-            identity = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-            chain = [
-                self.transform("base", "tool0", 0.5, 0.25, identity),
-                self.transform("base", "table", 0.25, 0.25, identity),
-            ]
-            publish("tf", self.TF, {"transforms": chain})
-
-        poses = until(queue, lambda poses: len(poses) >= 3, act)
-        pose = used(poses[-1:])[None].at(poses[-1].time_ns)
-        assert (pose.x_mm, pose.y_mm, pose.turn_deg) == (pytest.approx(260), pytest.approx(0), 0)
 
     def test_a_tilted_pad_and_clocks_that_differ_are_reported(self, opened, publish):
         queue = opened("ros2:arm/pose")

@@ -145,10 +145,10 @@ class TestStatus:
         sink = self.make()
         result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan())
         assert "next tap" not in str(sink.write(result, RUN) or sink.line())
-        sink.write(replace(result, next_tap=NextTap(-2.35, 2.35, 0.0, 0.149)), RUN)
-        assert " next tap 2.4 mm left 2.4 mm down (-15 % error)" in sink.line()
-        sink.write(replace(result, next_tap=NextTap(2.35, 0.0, 0.0, 0.05)), RUN)
-        assert " next tap 2.4 mm right (-5 % error)" in sink.line()
+        sink.write(replace(result, next_tap=NextTap(-2.35, 2.35, 0.0)), RUN)
+        assert " next tap 2.4 mm left 2.4 mm down" in sink.line()
+        sink.write(replace(result, next_tap=NextTap(2.35, 0.0, 0.0)), RUN)
+        assert " next tap 2.4 mm right" in sink.line()
 
     def test_a_note_while_zeroing_is_shown(self):
         sink = self.make()

@@ -1,6 +1,6 @@
 """A publisher of poses in a process of its own, as a ROS node would be one, with types made of ROS's definitions.
 
-python ros2_pose_writer.py DOMAIN '[[TOPIC, TYPE, LATCHED], ...]'; then a line of JSON for each message on stdin:
+python ros2_pose_writer.py DOMAIN '[[TOPIC, TYPE], ...]'; then a line of JSON for each message on stdin:
 [TOPIC, TYPE, MESSAGE]
 """
 
@@ -13,22 +13,20 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
 from ros2_messages import built, dds_type
 
-
-def qos(latched):
-    # As rclpy's default publisher, and as tf2's StaticTransformBroadcaster.
-    return Qos(
-        Policy.Reliability.Reliable(max_blocking_time=10**8),
-        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-        Policy.History.KeepLast(10),
-        Policy.DataRepresentation(use_cdrv0_representation=True),
-    )
+# As rclpy's default publisher.
+QOS = Qos(
+    Policy.Reliability.Reliable(max_blocking_time=10**8),
+    Policy.Durability.Volatile,
+    Policy.History.KeepLast(10),
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
 
 
 def main(domain, topics):
     participant = DomainParticipant(domain)
     writers = {
-        (topic, name): DataWriter(participant, Topic(participant, f"rt/{topic}", dds_type(name)), qos(latched))
-        for topic, name, latched in topics
+        (topic, name): DataWriter(participant, Topic(participant, f"rt/{topic}", dds_type(name)), QOS)
+        for topic, name in topics
     }
     print("ready", flush=True)
     for line in sys.stdin:

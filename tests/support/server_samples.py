@@ -5,8 +5,8 @@ import time
 
 import numpy as np
 from bridge_samples import REST_COUNTS, make_recording
+from xela_server_model import VendorServer
 
-from firmware_bridge.emulation.xela_server_model import VendorServer
 from firmware_bridge.errors import LinkLostError
 
 UNIX_S = 1_768_365_606.25

@@ -66,8 +66,8 @@ class ServerFound:
 
 def run_against_server(seconds: float, seed: int, folder: Path) -> ServerRan:
     """Run the program for so long against a server that fails every two to four seconds."""
-    from firmware_bridge.emulation.xela_server_emulator import ServerEmulator
-    from firmware_bridge.emulation.xela_server_model import VendorServer
+    from xela_server_emulator import ServerEmulator
+    from xela_server_model import VendorServer
 
     class Telling(VendorServer):
         """Server that keeps when it first sent each cycle."""

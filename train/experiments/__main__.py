@@ -23,7 +23,6 @@ EXPERIMENTS: Final = {
     "posed-taps": "taps from known poses: one to seven, by schedule, and with wrong poses",
     "tap-limits": "what limits the gain of several taps",
     "paper-schedule": "several taps over one in the paper's own comparison, on ten times its sequences",
-    "proposed-taps": "taps that the runtime proposes, next to taps by schedule",
     "map": "a figure larger than the pad, from slides over it",
     "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",

@@ -8,7 +8,7 @@ const EXPLAIN = {
   axis: "Direction of the ellipse's long axis, from x to the right towards y down; round if it is hardly longer than wide.",
   taps_used: "Taps that the pattern was made of, and the most that the model takes.",
   another_tap: "Whether one more tap is expected to make the error smaller.",
-  next_tap: "Where to touch next, by the model's own uncertainty.",
+  next_tap: "Where to touch next: half a pitch from the taps so far.",
   wrench_force: "Force on the pad along x, y and z, as the model integrates it.",
   wrench_torque: "Torque about x and y at the pad's centre.",
   wrench_twist: "Torque about the pad's normal.",

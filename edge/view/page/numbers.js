@@ -37,7 +37,7 @@ function nextTapText(next) {
   if (!next) return "\u2013";
   const ways = [[next.dx_mm, "left", "right"], [next.dy_mm, "up", "down"]].filter(([mm]) => mm !== 0);
   const moves = ways.map(([mm, less, more]) => `${amount(Math.abs(mm), 1, "mm")} ${mm < 0 ? less : more}`);
-  return `${moves.join(", ")}: ${percent(next.error_lost)} less error`;
+  return moves.join(", ");
 }
 
 function wrenchTexts({ wrench, wrench_origin: origin }) {

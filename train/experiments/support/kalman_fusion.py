@@ -17,7 +17,6 @@ from scipy.optimize import nnls
 
 from edge.inference.familiarity import QUIET_UNITS
 from edge.inference.forward_model import pooling
-from edge.perception.next_tap import SHARED
 from firmware_bridge.pad_geometry import AXES, USPA44
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.generation_config import SEED
@@ -32,11 +31,13 @@ _LENGTHS_MM: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 12.0, 40.0)
 """Lengths of the Gaussians whose sum is the covariance of patterns; the longest is nearly a constant."""
 _RIDGE: Final = 1e-5
 _TABLE_STEP_MM2: Final = 0.02
+SHARED: Final = 0.45
+"""Share of the operator's error that all taps have in common: one pad, one shape."""
 _DEPTH_SPREAD: Final = 0.087
 """Spread of an earlier tap's depth over the newest one's: drawn evenly from .85 to 1.15."""
 DOUBT: Final = 2.0
 """Regularisation with the highest PSNR of four taps on validation presses of all families, in all four schedules.
-SHARED was chosen with it, and the proposal of the next tap uses it as well."""
+SHARED was chosen with it."""
 _DRIFT_OF_TAXEL: Final = 0.25
 """Share of the drift that is a taxel's own."""
 

@@ -13,7 +13,7 @@ from train.data.frozen_presses import FrozenPresses
 from train.experiments.support.pushed import PushedSensor
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
-EVERY_TAP: Final = RuntimeOptions(follow_drift=False, every_tap=True)
+EVERY_TAP: Final = RuntimeOptions(follow_drift=False)
 _DEPTHS: Final = (0.85, 1.15)
 _SEED: Final = 17
 

@@ -19,7 +19,7 @@ MOST_QUEUED_BYTES: Final = 1 << 20
 _STOP_POLL_S: Final = 0.05
 _ABORT: Final = struct.pack("ii", 1, 0)
 """Value of SO_LINGER that resets a connection, as the kernel does for a process that was killed."""
-_QUIET: Final = logging.getLogger("firmware_bridge.emulation.websocket_server")
+_QUIET: Final = logging.getLogger("websocket_server")
 _QUIET.addHandler(logging.NullHandler())
 _QUIET.propagate = False
 

@@ -1,7 +1,7 @@
 """Emulator of the vendor's xela_server on this machine, with sensors that play recordings.
 
 It is as strict as the real one: it sends its readings at its own pace, old or new, queues messages for a slow client
-until they are old, and restarts its count after a restart. `xela_server_main` is its command line.
+until they are old, and restarts its count after a restart.
 """
 
 import math
@@ -11,8 +11,8 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Final, Self
 
-from firmware_bridge.emulation.websocket_server import WebSocketServer
-from firmware_bridge.emulation.xela_server_model import GARBAGE, VendorServer
+from websocket_server import WebSocketServer
+from xela_server_model import GARBAGE, VendorServer
 
 DEFAULT_MESSAGE_HZ: Final = 100.0
 HOST: Final = "127.0.0.1"

@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -22,8 +21,6 @@ NEWTONS_PER_COUNT: Final = np.array([0.0007, 0.0007, 0.00085])[:, None, None]
 TEMPERATURE_K: Final = 302.5
 _ROUNDED: Final = 1e-6
 """Tolerance, in cycles: a message sent at the time of a cycle holds it, however that time was rounded."""
-SIM_RATE_HZ: Final = 100.0
-SIM_SCANS: Final = 200
 GARBAGE: Final[tuple[str | bytes, ...]] = (
     "",
     '{"message": 12, "time": 17',
@@ -163,16 +160,6 @@ class VendorServer:
         if self._version == "1.8.0":
             message["integer"] = values
         return message
-
-
-def sim_recording() -> Recording:
-    """Return a synthetic recording for use without a sensor: waves over the pad."""
-    phase = 2 * np.pi * np.arange(SIM_SCANS)[:, None, None, None] / SIM_SCANS
-    place = np.arange(USPA44.taxel_count).reshape(1, 1, USPA44.rows, USPA44.cols)
-    rest = np.array([33_000, 33_000, 37_000])[None, :, None, None]
-    swing = np.array([100, 100, 800])[None, :, None, None]
-    counts = np.round(rest + swing * (1 + np.sin(phase + place))).astype(np.int32)
-    return Recording(Path("sim"), (Track("sim", counts, None),), SIM_RATE_HZ)
 
 
 def _player(recording: Recording, track: Track, rate_hz: float | None) -> _Player:

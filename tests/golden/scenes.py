@@ -1,0 +1,266 @@
+"""Scenes whose outcome is frozen; `python tests/golden/scenes.py [NAME...]` writes it again after a meant change."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+if __name__ == "__main__":  # as pyproject.toml has it for pytest
+    sys.path[:0] = [str(Path(__file__).parents[1] / "support"), str(Path(__file__).parents[2])]
+
+from golden_runs import EDGE_SR, Adapter, brief, differences, edge_sr, environment, short
+from golden_world import ABSENT, FREE_SCANS, PRESSES, gripped, pressed, write_csv, write_npz
+
+from edge.api import demo_recording
+
+FROZEN = Path(__file__).parent / "frozen"
+MODEL = ("--model", "stsr-small-int8")
+RECORDS = ("--sink", "jsonl:-")
+Outcome = dict[str, Any]
+SCENES: dict[str, Callable[[Path], Outcome]] = {}
+
+
+def scene(make: Callable[[Path], Outcome]) -> Callable[[Path], Outcome]:
+    SCENES[make.__name__] = make
+    return make
+
+
+@scene
+def csv_replay(folder: Path) -> Outcome:
+    write_csv(folder / "press.csv", pressed())
+    return edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *MODEL, *RECORDS)
+
+
+@scene
+def simulated_taps(folder: Path) -> Outcome:
+    """The demo's recording, whose contacts are believed: its poses make the model of several taps the default."""
+    return edge_sr(folder, "replay", demo_recording(), "--duration-s", 5, *RECORDS)
+
+
+@scene
+def several_taps(folder: Path) -> Outcome:
+    write_csv(folder / "press.csv", pressed([PRESSES[0]] * 4))
+    return edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, "--model", "mtsr4", *RECORDS)
+
+
+@scene
+def chosen_fields_and_thresholds(folder: Path) -> Outcome:
+    write_csv(folder / "press.csv", pressed())
+    fields = ("--fields", "force_n,area_mm2", "--counts-per-newton", 1180, "--contact-on-counts", 4000)
+    return edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *fields, *MODEL, *RECORDS)
+
+
+@scene
+def recorded_and_replayed(folder: Path) -> Outcome:
+    write_csv(folder / "press.csv", pressed())
+    made = edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, *MODEL, "--sink", "mcap:press.mcap")
+    again = edge_sr(folder, "replay", "press.mcap", *MODEL, *RECORDS)
+    return {"made": made, "again": again}
+
+
+@scene
+def two_fingers(folder: Path) -> Outcome:
+    write_csv(folder / "left.csv", pressed(seed=1))
+    write_csv(folder / "right.csv", pressed(PRESSES[::-1], seed=2))
+    return edge_sr(folder, "replay", "left.csv,right.csv", "--rate-hz", 100, *MODEL, *RECORDS)
+
+
+@scene
+def hand(folder: Path) -> Outcome:
+    names = [f"pad{number}.csv" for number in range(16)]
+    for number, name in enumerate(names):
+        write_csv(folder / name, pressed(PRESSES[number % 4 :][:1], seed=number))
+    ran = edge_sr(folder, "replay", *names, "--rate-hz", 100, *MODEL, *RECORDS)
+    for sensor in ran["sensors"].values():
+        sensor["records"] = sensor.get("records", [])[-1:]
+    return ran
+
+
+@scene
+def begins_in_a_grip(folder: Path) -> Outcome:
+    write_csv(folder / "grip.csv", gripped())
+    return edge_sr(folder, "replay", "grip.csv", "--rate-hz", 60, *MODEL, *RECORDS)
+
+
+@scene
+def never_free(folder: Path) -> Outcome:
+    write_csv(folder / "grip.csv", gripped(free=0)[:-10])
+    return edge_sr(folder, "replay", "grip.csv", "--rate-hz", 60, *MODEL, *RECORDS)
+
+
+@scene
+def old_baseline(folder: Path) -> Outcome:
+    """The pad's rest level has fallen since it was zeroed: alike on all taxels, and each by something of its own."""
+    fallen = np.rint(np.random.default_rng(5).normal([[[60]], [[-20]], [[-500]]], 70, (3, 4, 4))).astype(np.int32)
+    (folder / "earlier").mkdir()
+    write_csv(folder / "earlier" / "press.csv", pressed(()))
+    write_csv(folder / "press.csv", pressed() - fallen)
+    zeroed = edge_sr(folder, "baseline", "--source", "replay:earlier/press.csv", "--rate-hz", 100, "--out", "zero.json")
+    played = edge_sr(folder, "replay", "press.csv", "--rate-hz", 100, "--baseline", "zero.json", *MODEL, *RECORDS)
+    return {"zeroed": zeroed, "played": played}
+
+
+@scene
+def faulty_taxels(folder: Path) -> Outcome:
+    """Taxel 5 falls silent, taxel 10 repeats itself, and at last a field is added to all taxels."""
+    counts = pressed()
+    counts[FREE_SCANS:, :, 2, 2] = counts[FREE_SCANS, :, 2, 2]
+    counts[FREE_SCANS:, :, 1, 1] = ABSENT
+    there = counts[-40:] != ABSENT
+    counts[-40:] += there * np.array([900, -400, 1500])[:, None, None]
+    write_npz(folder / "faulty.npz", counts)
+    return edge_sr(folder, "replay", "faulty.npz", *MODEL, *RECORDS)
+
+
+@scene
+def extreme_counts(folder: Path) -> Outcome:
+    counts = pressed()
+    counts[FREE_SCANS + 5, 2] = 65_535
+    counts[FREE_SCANS + 6, :, 1, 1] = 0
+    write_csv(folder / "extreme.csv", counts)
+    return edge_sr(folder, "replay", "extreme.csv", "--rate-hz", 100, *MODEL, *RECORDS)
+
+
+@scene
+def commands_and_poses(folder: Path) -> Outcome:
+    """From Python: zeroing on demand in and out of contact, a reset, poses of four half-pitch taps."""
+    from edge import api
+
+    write_csv(folder / "press.csv", pressed([PRESSES[0]] * 4))
+    results = []
+    with api.open_recording(folder / "press.csv", rate_hz=100.0) as source:
+        runtime = api.open_runtime("mtsr7-int8", source)
+        for result in api.Stream(source, runtime):
+            number = result.scan.number
+            if number % 40 == 0 and number > 100:
+                x_mm, y_mm = [(0, 0), (2.35, 0), (2.35, 2.35), (0, 2.35)][(number - 120) // 40 % 4]
+                runtime.pose(api.PadPose(x_mm, y_mm), result.scan.time_ns, holds=True)
+            if number in (FREE_SCANS + 10, FREE_SCANS + 35):
+                runtime.zero()
+            if number == FREE_SCANS + 120:
+                runtime.reset()
+            results.append(result)
+    kept = [
+        {"sensor": one.scan.sensor, "scan": one.scan.number, "event": one.event, "note": one.note, **of(one)}
+        for one in results
+    ]
+    return short(kept)
+
+
+def of(result: Any) -> dict[str, Any]:
+    kept = {name: getattr(result, name) for name in ("state", "contact", "taps_used", "force_counts", "trusted")}
+    kept["next_tap"] = None if result.next_tap is None else [result.next_tap.dx_mm, result.next_tap.dy_mm]
+    return kept | {"pattern": None if result.pattern is None else result.pattern.tolist()}
+
+
+def over_slcan(folder: Path, mangle: Any = None, *, stamped: bool = True) -> Outcome:
+    """Play presses over a link; states and forces depend on times, readings do not."""
+    with Adapter(pressed(PRESSES[:2]), stamped=stamped, mangle=mangle) as adapter:
+        command = [*EDGE_SR, "--source", f"slcan:{adapter.path}", "--duration-s", "5", *MODEL, *RECORDS]
+        ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
+    scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]
+    kept = [{"scan": one["scan"], "counts": brief(one["counts"])} for one in scans if one["scan"] % 15 == 0]
+    return {"exit": ran.returncode, "fresh": [one["fresh"] for one in scans], "records": kept}
+
+
+@scene
+def slcan_stamped(folder: Path) -> Outcome:
+    return over_slcan(folder)
+
+
+@scene
+def slcan_without_stamps(folder: Path) -> Outcome:
+    return over_slcan(folder, stamped=False)
+
+
+@scene
+def slcan_with_faults(folder: Path) -> Outcome:
+    def mangle(number: int, lines: list[bytes]) -> list[bytes]:
+        if number % 15 == 7:
+            return [line for place, line in enumerate(lines) if place != 5]
+        if number % 15 == 9:
+            return [b"garbage\r", *lines, b"t0048zz\r"]
+        return lines
+
+    return over_slcan(folder, mangle)
+
+
+REFUSALS = (
+    "--source nowhere:1",
+    "--source slcan:/dev/none",
+    "--model none.onnx --source demo",
+    "--model press.csv --source demo",
+    "--sink nowhere:x --source demo",
+    "--sink jsonl:/none/x --source demo",
+    "--sink mcap:press.csv --source demo",
+    "--baseline press.csv --source demo",
+    "--sensor press.csv --source demo",
+    "--contact-on-counts 5 --contact-off-counts 9 --source demo",
+    "--contact-on-counts nan --source demo",
+    "--taps 9 --model mtsr4 --source demo",
+    "--duration-s -1 --source demo",
+    "--view 70000 --source demo",
+    "--poses mqtt:x --source demo",
+    "--id-map none --source demo",
+    "--sorce demo",
+    "replay",
+    "replay none.csv",
+    "replay press.txt",
+    "replay short.csv",
+    "replay text.csv",
+    "replay press.csv --fields nothing",
+    "replay press.csv --rate-hz 0",
+    "record x.txt --source nowhere",
+    "record press.csv --source demo --duration-s 1",
+    "baseline --source replay:short.csv --out z.json",
+    "models --nothing",
+    "doctor --source nowhere",
+    "map --out x.npz",
+    "devices --nothing",
+    "bench --only none",
+    "nothing",
+)
+"""What a person may type, with what stands in the folder: press.csv, short.csv, text.csv and press.txt."""
+
+
+@scene
+def refusals(folder: Path) -> Outcome:
+    counts = pressed(())
+    write_csv(folder / "press.csv", counts)
+    write_csv(folder / "short.csv", counts[:10])
+    (folder / "text.csv").write_text("a,b\n1,2\n")
+    (folder / "press.txt").write_text("nothing")
+    return {
+        line: {key: ran[key] for key in ("exit", "stderr")}
+        for line in REFUSALS
+        for ran in [edge_sr(folder, *line.split())]
+    }
+
+
+def frozen_of(name: str) -> Path:
+    return FROZEN / f"{name}.json"
+
+
+def play(name: str) -> Outcome:
+    with TemporaryDirectory() as folder:
+        return json.loads(json.dumps(SCENES[name](Path(folder))))
+
+
+def main(names: list[str]) -> None:
+    FROZEN.mkdir(exist_ok=True)
+    for name in names or SCENES:
+        now, path = play(name), frozen_of(name)
+        before = json.loads(path.read_text()) if path.exists() else None
+        changes = differences(before, now) if before else ["new"]
+        print(f"{name}: {len(changes)} changes", *changes[:8], sep="\n    ")
+        if changes:
+            path.write_text(json.dumps(now, sort_keys=True).replace("}, {", "},\n{") + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,189 @@
+"""Runs of edge-sr and edge.api whose outcome is frozen: what they give, and how it is told apart from noise."""
+
+import json
+import math
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+from golden_world import slcan_cycle
+
+EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
+ROOT = Path(__file__).parents[2]
+TIMEOUT_S = 90
+SAMPLED = 15
+"""Every so many records of a sensor one is kept whole, and the first two of each stretch of a state."""
+OF_THE_RUN = {
+    *("time_ns", "device_time_ns", "run_time_us", "latency_us", "counters", "baseline", "baseline_age_s", "event"),
+    *("events", "note", "notes"),
+}
+"""Keys that differ from run to run, or are kept apart."""
+RELATIVE, ABSOLUTE = 0.02, 2e-3
+"""Tolerances: 8-bit integers differ between processors by a thousandth of a pattern, and by as much of an area."""
+OWN_ABSOLUTE = {"force_counts": 1.0, "area_mm2": 3.0, "mean": 2e-3, "peak": 5e-3}
+
+
+def edge_sr(folder: Path, *arguments: object, stdin: str = "") -> dict[str, Any]:
+    """Run edge-sr with records on stdout, and return its outcome."""
+    command = [*EDGE_SR, *map(str, arguments)]
+    done = subprocess.run(
+        command, cwd=folder, input=stdin, capture_output=True, text=True, timeout=TIMEOUT_S, env=environment()
+    )
+    return outcome(done.returncode, done.stdout, done.stderr)
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "80", "NO_COLOR": "1"}
+
+
+def outcome(code: int, out: str, err: str) -> dict[str, Any]:
+    """Return exit code, messages and records in short."""
+    lines = [json.loads(line) if line.startswith("{") else line for line in out.splitlines()]
+    records = [line for line in lines if isinstance(line, dict)]
+    texts = [masked(line) for line in lines if isinstance(line, str)]
+    return {"exit": code, "stdout": texts, "stderr": [masked(line) for line in err.splitlines()], **short(records)}
+
+
+def masked(text: str) -> str:
+    """Return a text without ids, paths of a folder and numbers."""
+    return re.sub(r"[-+]?\d[\d.,]*(e[-+]?\d+)?", "#", re.sub(r"/\S*/|\b[0-9a-f]{8}\b", "", text))
+
+
+def short(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return records in short: states in stretches, notes and events as they come, and some records whole."""
+    sensors: dict[str, Any] = {}
+    for record in records:
+        if record["state"] == "event":
+            sensors.setdefault("", {"events": []})["events"].append(masked(record["event"]))
+            continue
+        of = sensors.setdefault(record["sensor"], {"states": [], "notes": [], "events": [], "records": []})
+        if not of["states"] or of["states"][-1][0] != record["state"]:
+            of["states"].append([record["state"], 0])
+        of["states"][-1][1] += 1
+        note = record.get("note")
+        if note is not None and (not of["notes"] or of["notes"][-1][1] != masked(note)):
+            of["notes"].append([record["scan"], masked(note)])
+        if record.get("event"):
+            of["events"].append([record["scan"], masked(record["event"])])
+        if record["scan"] % SAMPLED == 0 or of["states"][-1][1] <= 2:
+            of["records"].append({key: brief(value) for key, value in record.items() if key not in OF_THE_RUN})
+    return {"sensors": sensors}
+
+
+def brief(value: Any) -> Any:
+    """Return a value, an array as its mean, its peak and the place of it."""
+    if isinstance(value, list) and value and isinstance(value[0], list) and len(value) > 2:
+        numbers = np.array([[np.nan if one is None else one for one in row] for row in flat(value)], dtype=float)
+        row, column = np.unravel_index(int(np.nanargmax(numbers)), numbers.shape)
+        return {"mean": float(np.nanmean(numbers)), "peak": float(np.nanmax(numbers)), "at": [int(row), int(column)]}
+    if isinstance(value, dict):
+        return {key: brief(one) for key, one in value.items()}
+    return value
+
+
+def flat(value: list[Any]) -> list[Any]:
+    while isinstance(value[0][0], list):
+        value = [row for part in value for row in part]
+    return value
+
+
+def differences(frozen: Any, now: Any, place: str = "") -> list[str]:
+    """Return where two outcomes differ by more than the tolerances, a line each."""
+    key = place.rpartition(".")[2]
+    if isinstance(frozen, dict) and isinstance(now, dict):
+        changed = [
+            f"{place}.{name}: only {'before' if name in frozen else 'now'}" for name in frozen.keys() ^ now.keys()
+        ]
+        return changed + [
+            line
+            for name in frozen.keys() & now.keys()
+            for line in differences(frozen[name], now[name], f"{place}.{name}")
+        ]
+    if isinstance(frozen, list) and isinstance(now, list):
+        if key == "at" and all(isinstance(one, int) for one in frozen):
+            return (
+                []
+                if max(abs(a - b) for a, b in zip(frozen, now, strict=True)) <= 2
+                else [f"{place}: {now}, was {frozen}"]
+            )
+        if len(frozen) != len(now):
+            return [f"{place}: {len(now)} entries, were {len(frozen)}: {now}, was {frozen}"[:600]]
+        return [
+            line for n, (a, b) in enumerate(zip(frozen, now, strict=True)) for line in differences(a, b, f"{place}.{n}")
+        ]
+    if frozen == now or (is_number(frozen) and is_number(now) and close(frozen, now, key)):
+        return []
+    return [f"{place}: {now!r}, was {frozen!r}"]
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def close(frozen: float, now: float, key: str) -> bool:
+    return math.isclose(frozen, now, rel_tol=RELATIVE, abs_tol=OWN_ABSOLUTE.get(key, ABSOLUTE))
+
+
+class Adapter:
+    """slcan adapter on a pseudo-terminal, which sends the lines of scans once its channel is open.
+
+    Args:
+        counts: (n, 3, 4, 4).
+        stamped: the adapter obeys Z1.
+        mangle: changes the lines of a scan, by its number.
+    """
+
+    def __init__(
+        self, counts: np.ndarray, *, stamped: bool, mangle: Callable[[int, list[bytes]], list[bytes]] | None = None
+    ) -> None:
+        self._counts, self._stamped = counts, stamped
+        self._mangle = mangle or (lambda number, lines: lines)
+        self._host, self._device = pty.openpty()
+        tty.setraw(self._host)
+        tty.setraw(self._device)
+        self.path = os.ttyname(self._device)
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._play)
+
+    def __enter__(self) -> "Adapter":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+        os.close(self._host)
+        os.close(self._device)
+
+    def _play(self) -> None:
+        due_s, number, stamped, commands = None, 0, False, b""
+        while not self._end.is_set() and number < len(self._counts):
+            wait_s = 0.05 if due_s is None else max(due_s - time.monotonic(), 0.0)
+            if select.select([self._host], [], [], wait_s)[0]:
+                commands += os.read(self._host, 4096)
+                *whole, commands = commands.split(b"\r")
+                for command in whole:
+                    if command == b"Z1" and self._stamped:
+                        stamped = True
+                    if command == b"O" and due_s is None:
+                        due_s = time.monotonic()
+                    refused = command == b"Z1" and not self._stamped
+                    os.write(self._host, b"\a" if refused else b"F00\r" if command == b"F" else b"\r")
+            elif due_s is not None:
+                due_s = time.monotonic() + 0.01  # a late one makes none come early
+                os.write(
+                    self._host,
+                    b"".join(self._mangle(number, slcan_cycle(self._counts[number], number, stamped=stamped))),
+                )
+                number += 1
+        self._end.wait()
