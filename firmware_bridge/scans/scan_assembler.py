@@ -285,16 +285,17 @@ class _Sensor:
         if not self.confirmed:
             self.counts["unconfirmed"] += come
             return []
-        on_pace: bool | None = True
+        on_pace = None
         if half:
-            on_pace = self.wire.count(self._newest_ns if self._device is None else self._device.own_ns)
+            now_ns = self._newest_ns if self._device is None else self._device.own_ns
+            on_pace = self.wire.count(now_ns, ended=come == count or next(reversed(taxels)) == self.wire.order[-1])
         axes_last = np.full((count, 3), ABSENT, dtype=np.int32)
         axes_last[list(taxels)] = np.array([(reading.x, reading.y, reading.z) for reading in taxels.values()])
         counts = np.ascontiguousarray(axes_last.T).reshape(self._geometry.scan_shape)
         device_ns = None if self._device is None else self._device.host_ns
         self._held.append((counts, self._newest_ns, device_ns, count - come))
         shows_pauses = self._device is not None and not self.wire.in_pieces
-        if not shows_pauses and (on_pace is None or not (half or len(self._held) == 1)):
+        if not shows_pauses and on_pace is None and (come == count or len(self._held) > 1):
             return []
         held, self._held = self._held, []
         if not (shows_pauses or on_pace):  # as many frames may be lost as make the parts of two cycles fit

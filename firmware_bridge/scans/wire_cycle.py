@@ -123,11 +123,11 @@ class WireCycle:
         """Return True if a cycle that ends at `time_ns` [ns] may hold readings of two, by the pace of those before."""
         return self.period_ns is not None and self._ended_ns is not None and time_ns - self._due_ns > self._later_ns
 
-    def count(self, time_ns: int) -> bool | None:
+    def count(self, time_ns: int, *, ended: bool = True) -> bool | None:
         """Count a cycle of at least half of the taxels that ended at `time_ns` [ns], by the clock of the pauses.
 
         Return True if no cycle was lost up to it, by the pace of those before; None if that does not show yet, and
-        False once all come as late.
+        False once all come as late. One whose end was lost, not `ended`, shows nothing: it seems early.
         """
         late = self.late(time_ns)
         ended_ns, self._ended_ns = self._ended_ns, time_ns
@@ -139,7 +139,9 @@ class WireCycle:
             if self._until_renewed <= 0:
                 self._measure()
         period_ns, on_pace = self.period_ns or 0, None
-        if not late:
+        if not ended:
+            on_pace = None
+        elif not late:
             self._due_ns = min(self._due_ns + period_ns // LATER, time_ns)
             self._late, on_pace = 0, True
         else:

@@ -75,6 +75,14 @@ def test_no_scan_is_of_two_cycles_at_any_share_of_loss(reader, share):
 
 
 @every_reader
+@pytest.mark.parametrize("count", [16, 32, 48])
+def test_no_scan_is_of_two_cycles_where_as_many_frames_are_lost_as_a_cycle_has(reader, count):
+    frames = [frame for place, frame in enumerate(bus(600)) if place < 800 or place % 407 >= count]
+    worth = read(frames, reader)
+    assert worth.mixed == 0 and worth.whole > (250 if reader is PLAIN_BURSTS else 400)
+
+
+@every_reader
 def test_doubles_and_swaps_mix_nothing(reader):
     for fault in (doubling(0.02), swapping(0.02)):
         assert read(fault(bus(300)), reader).mixed == 0
@@ -156,7 +164,8 @@ def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_
     of_cycles = [set(scan.counts[2][scan.fresh].tolist()) for scan in scans]
     assert all(len(numbers) == 1 for numbers in of_cycles)
     assert counters["resynchronised"] >= (16 - first_frame) % 16
-    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > 40
+    # Without stamps a machine that is busy for long cannot show that no cycle was lost meanwhile.
+    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > (20 if old_canable else 40)
 
 
 def test_a_fault_that_is_due_while_the_emulator_stands_still_comes_after_it():

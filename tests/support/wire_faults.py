@@ -63,11 +63,11 @@ class Found:
     Attributes:
         cycles: number sent.
         scans: number returned; torn: those without all sixteen; whole: the others.
-        mixed: whole ones with readings of two cycles.
+        mixed: whole ones with readings of two cycles. A line of the head of one and the tail of another is a reading of
+            neither, as the wire has no checksum.
         missed: cycles of which every byte was handed on, and no whole scan was returned.
         late: scans whose reading is called old, though it was on the bus less than 50 ms before.
         lag_ms: longest time from bus to `device_ns`, beyond which none of them may be.
-        scans_of: the scans, whole or torn, by the second in which they came.
     """
 
     cycles: int = 0
@@ -90,9 +90,9 @@ def play(case: Case, cycles: int, seed: int = 1) -> Found:
             found.scans += 1
             sensor = int(scan.sensor)
             owners = {
-                int(x)
-                for taxel, (x, y) in enumerate(zip(*scan.counts.reshape(3, 16)[:2], strict=True))
-                if scan.fresh.flat[taxel] and y == _check(int(x), sensor, taxel)
+                x
+                for taxel, (x, y, z) in enumerate(scan.counts.reshape(3, 16).T.tolist())
+                if scan.fresh.flat[taxel] and y == z ^ 0x5A5A == _check(x, sensor, taxel)  # else never sent
             }
             if not scan.complete:
                 found.torn += 1
@@ -123,7 +123,8 @@ def _sent(case: Case, cycles: int, draw: random.Random) -> Iterator[tuple[float,
             for lane, (sensor, order) in enumerate(orders.items()):
                 time_s = START_S + begin_s + (place * case.sensors + lane + 1) * FRAME_S
                 can_id, taxel = order[place]
-                words = (cycle, _check(cycle, sensor, taxel), 37_000 + taxel)
+                check = _check(cycle, sensor, taxel)
+                words = (cycle, check, check ^ 0x5A5A)
                 data = b"\x93" + b"".join(word.to_bytes(2, "big") for word in words) + b"\x0f"
                 stamp = None if clock is None else int(clock(time_s * 1e3, draw)) % WRAP_MS
                 yield time_s, (sensor, cycle), encode_frame(CanFrame(can_id, data, timestamp_ms=stamp))
@@ -132,18 +133,17 @@ def _sent(case: Case, cycles: int, draw: random.Random) -> Iterator[tuple[float,
 def _faulty(
     case: Case, cycles: int, draw: random.Random, broken: set[tuple[int, int]]
 ) -> Iterator[tuple[float, bytes]]:
-    left, until_s, cut = 0, 0.0, 0
+    left, until_s, cut = 0, 0.0, False
     for time_s, owner, line in _sent(case, cycles, draw):
         text = line
         if owner[1] >= 50 and case.lost != "nothing" and not left and time_s > until_s and draw.random() < 1 / 800:
             if case.lost == "frames":
                 left = draw.choice(LOST_AT_ONCE) * (draw.choice((1, case.sensors)))
             else:
-                until_s, cut = time_s + draw.uniform(0, 0.06), draw.randrange(len(line) + 1)
-                text = line[:cut]
-                cut = 1
+                until_s, cut = time_s + draw.uniform(0, 0.06), True
+                text = line[: draw.randrange(len(line) + 1)]
         elif time_s > until_s and cut:
-            cut, text = 0, line[draw.randrange(len(line) + 1) :]
+            cut, text = False, line[draw.randrange(len(line) + 1) :]
         elif time_s <= until_s:
             text = b""
         if left:
