@@ -3,7 +3,14 @@
 from itertools import pairwise, starmap
 from typing import Final
 
-from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, STAMPED_BYTES, CanFrame, SlcanDecoder
+from firmware_bridge.can.slcan import (
+    LAST_TIMESTAMP_MS,
+    PACKED_BYTES,
+    STAMPED_BYTES,
+    CanFrame,
+    PackedFrames,
+    SlcanDecoder,
+)
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.mixed_cycles import BEFORE, MixedCycles
@@ -16,6 +23,8 @@ _MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000
 _MIXED_NS: Final = SCAN_GIVEN_UP_NS
 """Longest time for which frames wait while others are fed, in [ns]."""
+_JOINED_NS: Final = 5_000_000
+"""Time before its stamp, in [ns], at which no frame can arrive: the error of stamps and of their offset."""
 
 
 class SlcanScans:
@@ -37,13 +46,20 @@ class SlcanScans:
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
         self._stillness = Stillness()
-        self._foreign = 0
+        self._foreign = self._fed_ns = 0
         self.can_ids: set[int] = set()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Return the scans that close within `data`, which arrived at `time_ns` [ns]."""
         scans: list[Scan] = []
+        head_ns = self._fed_ns if self.decoder.pending_bytes else time_ns
+        self._fed_ns = time_ns
         for piece in self.decoder.cut(data):
+            if head_ns < time_ns:
+                if isinstance(piece, PackedFrames) and self._is_joined(piece, head_ns):
+                    self._foreign += 1
+                    piece = PackedFrames(piece.data[STAMPED_BYTES:], STAMPED_BYTES)
+                head_ns = time_ns
             if isinstance(piece, CanFrame):
                 self._give_up_begun(time_ns, scans)
                 if not piece.extended:  # bounded: there are at most 2048 of these
@@ -52,6 +68,13 @@ class SlcanScans:
                 continue
             self._feed_frames(*piece, time_ns, scans)
         return scans
+
+    def _is_joined(self, frames: PackedFrames, head_ns: int) -> bool:
+        """Return True if the head of the first line came at `head_ns`, before its stamp: it has the tail of another."""
+        if frames.frame_bytes != STAMPED_BYTES or self._stamped is None or self._device is None:
+            return False
+        since_ns = _ns_between(self._stamped[0], int.from_bytes(frames.data[PACKED_BYTES:STAMPED_BYTES]))
+        return head_ns + _JOINED_NS < self._device.host_ns + since_ns < head_ns + _MS_NS * LAST_TIMESTAMP_MS // 2
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken; the adapter's clock may have restarted as well."""
@@ -93,7 +116,7 @@ class SlcanScans:
         return self._stillness.holds(data, self.decoder.usual_line_bytes)
 
     def counters(self) -> dict[str, int]:
-        """Return the counters of all stages; foreign: frames of no taxel of this model."""
+        """Return the counters of all stages; foreign: frames of no taxel of this model, or joined of two."""
         counters = self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
         for frames, _ in list(self._mixed.begun.values()):  # another thread may read the link meanwhile
             counters["readings"] += len(frames) // STAMPED_BYTES

@@ -58,7 +58,7 @@ class Case(NamedTuple):
 
 @dataclass
 class Found:
-    """What became of the cycles of a case.
+    """Outcome of a case.
 
     Attributes:
         cycles: number sent.
