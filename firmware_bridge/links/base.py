@@ -49,7 +49,7 @@ class Notice(NamedTuple):
         time_ns: monotonic time, in [ns].
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
             all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
-            longer does; "note", a remark on a recording.
+            longer does; "note", a remark on a recording or on time stamps.
         text: message to the user; empty where a recording goes on elsewhere, at a user's wish or its end.
         sensors: common prefix of the names of the sensors concerned.
     """
@@ -78,6 +78,7 @@ class Link(Protocol):
         kind: "device" for hardware, "replay" for a file, "emulated" for an emulated device.
         ended: True once a finite source has no more scans.
         trouble: trouble of the device to report to the user; None if there is none.
+        stamps_dropped: True once the device's time stamps have shown that they are no clock.
         patient: True where the link waits for its reader, and returns one scan for each `read`, whatever its time.
         unix_offset_ns: offset from the times of a patient link's scans to [ns] since 1970; None if it is not available.
         origin: kind of source of a recording's scans, however often it was played and recorded again; None if it is
@@ -91,6 +92,7 @@ class Link(Protocol):
     kind: SourceKind
     ended: bool
     trouble: str | None = None
+    stamps_dropped: bool = False
     patient: bool = False
     unix_offset_ns: int | None = None
     origin: SourceKind | None = None

@@ -142,6 +142,7 @@ class CanBusLink(Link):
                     fed = self._take(message, now_ns)
                 scans = self._unread.mark(fed, now_ns, self._device_clock.begun_ns)
             self.trouble = self._errors.trouble(now_ns)
+            self.stamps_dropped |= self._device_clock.dropped
             left_s = (end_ns - now_ns) / 1e9
             if scans or left_s <= 0:
                 return scans

@@ -140,6 +140,7 @@ class GsUsbLink(Link):
                     self._scans.end_transfer()
             scans = self._unread.mark(fed, now_ns, self._scans.clock_begun_ns)
             self.trouble = self._scans.trouble(now_ns)
+            self.stamps_dropped |= self._scans.stamps_dropped
             left_ns = end_ns - now_ns
             if scans or left_ns <= 0:
                 return scans

@@ -22,6 +22,7 @@ SOON_RETRY_S: Final = 0.5
 LATE_RETRY_S: Final = 2.0
 SOON_S: Final = 60.0
 """Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
+STAMPS_DROPPED: Final = "its time stamps do not run as this machine's clock does, and are left out"
 
 _Answer = TypeVar("_Answer")
 
@@ -100,6 +101,9 @@ class LastingLink(Link):
         if self._link.trouble != self.trouble:
             self.trouble = self._link.trouble
             self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
+        if self._link.stamps_dropped and not self.stamps_dropped:
+            self.stamps_dropped = True
+            self._tell("note", f"{self.name}: {STAMPS_DROPPED}")
         if scans:
             now_ns = self._clock_ns()
             if self._lost_ns is not None or self._silent:

@@ -170,7 +170,8 @@ class SlcanSerialLink(Link):
             _ask(self._serial, STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
         self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
-        if self._stamps_on and self._stamps_are_none():
+        if self._stamps_on and (self._stamps_are_none() or self._scans.stamps_dropped):
+            self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
             self._stamps_to_set = STAMPS_OFF
         elif scans and self._asks_stamps and not self._stamps_on:  # switched off while no scan came

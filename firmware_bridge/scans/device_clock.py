@@ -1,21 +1,34 @@
 """Conversion of a device's time stamps to the host's clock. No I/O, no clock of its own.
 
 A stamp is the time at which a frame was on the bus, an arrival the time at which it was read: later by the delay in
-adapter, bus and kernel, which is never negative. So the smallest recent difference is the best estimate of the offset
-between the two clocks, and the rest of a difference is delay. Only recent differences count, since two quartzes drift
-apart by milliseconds in a minute.
+adapter, bus and kernel, which is never negative. So the smallest difference is the best estimate of the offset between
+the two clocks, and the rest of a difference is delay. Where none has been as small for a while, the smallest one grows:
+so a clock that is slow by up to 1.6 % is followed, and a delay that lasts is forgotten. Stamps that are no such clock
+are dropped.
 """
 
 from typing import Final, NamedTuple
 
-WINDOW_NS: Final = 10_000_000_000
-"""Window of the smallest difference, with the one before: clocks 100 ppm apart are 2 ms off after both."""
+SLOWER: Final = 64
+"""Share of the time by which the smallest difference grows: a clock may be slow by as much. A delay of 0.1 s that lasts
+is forgotten in 7 s."""
+HOLDS_NS: Final = 250_000_000
+"""Time for which it holds before it grows, in [ns]: a clock that is slow by 1 % is 2.5 ms off after it."""
 BACK_NS: Final = 4_000_000
 """Largest step back of the stamps before the clock counts as set or restarted, in [ns].
 
 Frames that change places in a driver's queues step back by less than a millisecond. A wall clock set back between two
-frames by less than this plus the pause between them goes unnoticed until the windows have passed: at 100 scans a second
-by 14 ms, and one scan then seems missing."""
+frames by less than this plus the pause between them goes unnoticed: at 100 scans a second by 14 ms."""
+JUDGED_NS: Final = 50_000_000
+"""Time in which stamps are compared with arrivals, in [ns], and LONGEST_STEP_NS at most between two: a read that was
+late is no evidence of a slow clock."""
+LONGEST_STEP_NS: Final = 20_000_000
+MOST_BACK: Final = 8
+"""Steps back by over half of BACK_NS in that time from which stamps are no clock."""
+MOST_FAST: Final = 3
+"""Such times in a row in which stamps advance twice as far as arrivals; a backlog makes it so once."""
+SLOW_NS: Final = 10_000_000_000
+"""Time without a difference as small as the smallest, in [ns], after which the clock is slower than it may be."""
 
 
 class DeviceTime(NamedTuple):
@@ -38,6 +51,7 @@ class DeviceClock:
         restarts: number of restarts of the device's clock.
         begun_ns: monotonic time of the first arrival since the last restart, which set the offset, in [ns]; None before
             it. That frame seems new even if it waited long to be read.
+        dropped: True once the stamps have shown that they are no clock.
     """
 
     def __init__(self, tick_ns: int, wrap_ticks: int | None) -> None:
@@ -49,50 +63,78 @@ class DeviceClock:
         """
         self.restarts = 0
         self.begun_ns: int | None = None
+        self.dropped = False
         self._tick_ns = tick_ns
         self._wrap_ns = None if wrap_ticks is None else wrap_ticks * tick_ns
         self._stamp_ns = 0
         self._device_ns = 0
         self._arrival_ns = 0
-        self._window_start_ns = 0
-        self._smallest_ns: int | None = None
-        self._smallest_before_ns: int | None = None
+        self._smallest_ns = self._later_ns = 0
+        self._heard_ns = self._heard_whole_ns = self._told_ns = 0
+        self._back = self._fast = 0
 
     def begin_anew(self) -> None:
         """Forget the offset after the link was opened again: the device may have counted from another origin since."""
-        self.begun_ns = self._smallest_ns = self._smallest_before_ns = None
+        self.begun_ns = None
 
     def host_ns(self, stamp: int, arrival_ns: int) -> int:
-        """Return `at` on the host's clock alone, in [ns]."""
-        return self.at(stamp, arrival_ns).host_ns
+        """Return `at` on the host's clock alone, in [ns], whatever the stamps are."""
+        self._step(stamp, arrival_ns)
+        return self._device_ns + self._smallest_ns
 
-    def at(self, stamp: int, arrival_ns: int) -> DeviceTime:
-        """Return the time at which a frame was on the bus, never later than its arrival.
+    def at(self, stamp: int, arrival_ns: int) -> DeviceTime | None:
+        """Return the time at which a frame was on the bus, never later than its arrival; None if stamps are no clock.
 
         Args:
             stamp: time stamp of the device, in ticks.
             arrival_ns: monotonic time at which the frame was read, in [ns], never before that of the frame before.
         """
+        if self.dropped:
+            return None
+        begun, since_ns = self.begun_ns is not None, arrival_ns - self._arrival_ns
+        step_ns = self._step(stamp, arrival_ns)
+        if begun:
+            self._judge(step_ns, since_ns)
+        return DeviceTime(self._device_ns + self._smallest_ns, self._device_ns)
+
+    def _step(self, stamp: int, arrival_ns: int) -> int:
+        """Advance to a stamp, and return by how much, in [ns]."""
         stamp_ns = stamp * self._tick_ns
-        step_ns = stamp_ns - self._stamp_ns
+        step_ns, since_ns = stamp_ns - self._stamp_ns, arrival_ns - self._arrival_ns
         if self._wrap_ns is not None:
             # The number of wraps nearest to the time that passed on the host: a link may have been silent for hours.
-            turns = round((arrival_ns - self._arrival_ns - step_ns) / self._wrap_ns)
-            step_ns += turns * self._wrap_ns
-        if self._smallest_ns is not None and step_ns < -BACK_NS:
+            step_ns += round((since_ns - step_ns) / self._wrap_ns) * self._wrap_ns
+        if self.begun_ns is not None and step_ns < -BACK_NS:
             self.restarts += 1
             self.begin_anew()
         self._stamp_ns, self._arrival_ns = stamp_ns, arrival_ns
         self._device_ns += step_ns
         difference_ns = arrival_ns - self._device_ns
-        if self._smallest_ns is None:
-            self.begun_ns = self._window_start_ns = arrival_ns
-            self._smallest_ns = difference_ns
-        elif arrival_ns - self._window_start_ns > WINDOW_NS:
-            self._smallest_before_ns, self._smallest_ns = self._smallest_ns, difference_ns
-            if arrival_ns - self._window_start_ns > 2 * WINDOW_NS:  # after a silence the window before is long over
-                self._smallest_before_ns = None
-            self._window_start_ns = arrival_ns
-        self._smallest_ns = min(self._smallest_ns, difference_ns)
-        before_ns = difference_ns if self._smallest_before_ns is None else self._smallest_before_ns
-        return DeviceTime(self._device_ns + min(self._smallest_ns, before_ns), self._device_ns)
+        self._later_ns += min(since_ns, LONGEST_STEP_NS)
+        if self._later_ns > HOLDS_NS or since_ns > SLOW_NS:
+            self._smallest_ns += since_ns // SLOWER
+        if self.begun_ns is None or difference_ns <= self._smallest_ns:
+            self._smallest_ns, self._later_ns = difference_ns, 0
+        if self.begun_ns is None:
+            self.begun_ns = arrival_ns
+        return step_ns
+
+    def _judge(self, step_ns: int, since_ns: int) -> None:
+        """Drop the stamps if they step back, stand still, or run at another rate than arrivals."""
+        heard_ns = min(since_ns, LONGEST_STEP_NS)
+        self._heard_ns += heard_ns
+        self._heard_whole_ns += since_ns
+        self._told_ns += step_ns if step_ns > -BACK_NS else since_ns  # one set back tells nothing of its rate
+        self.follow_order(step_ns)
+        slow = False
+        if self._heard_ns >= JUDGED_NS:
+            slow = 2 * self._told_ns < self._heard_ns
+            fast = self._told_ns > 2 * self._heard_whole_ns + LONGEST_STEP_NS
+            self._fast = self._fast + 1 if fast else 0
+            self._heard_ns = self._heard_whole_ns = self._told_ns = self._back = 0
+        self.dropped |= slow or self._fast >= MOST_FAST or self._later_ns > SLOW_NS
+
+    def follow_order(self, step_ns: int) -> None:
+        """Take note of a step between the stamps of two frames, in [ns]: on the bus one came after the other."""
+        self._back += 2 * step_ns < -BACK_NS
+        self.dropped |= self._back >= MOST_BACK

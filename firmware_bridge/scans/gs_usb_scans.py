@@ -49,6 +49,11 @@ class GsUsbScans:
         return scans
 
     @property
+    def stamps_dropped(self) -> bool:
+        """True once the adapter's time stamps have shown that they are no clock."""
+        return self._clock.dropped
+
+    @property
     def clock_begun_ns(self) -> int | None:
         """Monotonic time at which the adapter's clock was first compared, as in `DeviceClock`, in [ns]."""
         return self._clock.begun_ns

@@ -5,9 +5,9 @@ when the next reading belongs to another cycle: after a pause, or where the orde
 (`wire_cycle`). Then it is torn. Readings of no certain cycle are left out and counted (`resynchronised`): the rest of
 the cycle into which the link was opened, and fragments of fewer than half of the taxels that no pause separates.
 
-Limits: a sensor that is read in bursts without time stamps shows no pauses. There the order alone separates cycles, and
-where sixteen frames were lost in a row, or a multiple, one scan may join two cycles. And nothing closes while no
-reading comes: half a scan at the end of a stream is never returned.
+Without time stamps a whole cycle that ends late waits for the next ones to show whether a cycle was lost: with sixteen
+frames lost between them, its halves may be of two. Then it is left out, too. Limit: nothing closes while no reading
+comes, so half a scan at the end of a stream is never returned.
 """
 
 from typing import Final
@@ -19,7 +19,7 @@ from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.scans.can_id_maps import Cycle, ModelMap, Reading
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
-from firmware_bridge.scans.wire_cycle import SHORTEST_PAUSE_NS, WireCycle
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, SHORTEST_PAUSE_NS, WireCycle
 from firmware_bridge.silence import SCAN_GIVEN_UP_NS
 
 _COUNTED: Final[tuple[str, ...]] = (
@@ -71,10 +71,17 @@ class ScanAssembler:
             sensor = self._sensors[name] = _Sensor(name, self._geometry, order)
         return sensor
 
-    def longest_cycle_ns(self, cycle: Cycle) -> int:
-        """Return the longest time, in [ns], that a cycle fed as one may span; 0: feed its readings one by one."""
+    def longest_cycle_ns(self, cycle: Cycle, arrival_ns: int | None = None) -> int:
+        """Return the longest pause, in [ns], in a cycle that may be fed as one; 0: feed its readings one by one.
+
+        Args:
+            cycle: its sensor, and the order of its taxels.
+            arrival_ns: monotonic time of its arrival, in [ns], where it has no time stamps.
+        """
         sensor = self._sensors.get(cycle.sensor)
         if sensor is None or not sensor.awaits(cycle):
+            return 0
+        if sensor.wire.in_pieces if arrival_ns is None else sensor.doubts(arrival_ns):
             return 0
         return sensor.wire.pause_ns if sensor.wire.gaps_ns is None else SHORTEST_PAUSE_NS
 
@@ -164,10 +171,13 @@ class _Sensor:
         self._half_before = False
         self._newest_ns = 0
         self._device: DeviceTime | None = None
+        self._held: list[tuple[NDArray[np.int32], int, int | None, int]] = []
         self.counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
     def begin_anew(self) -> None:
-        self.counts["abandoned"] += len(self._taxels)
+        held = sum(self._geometry.taxel_count - missing for *_, missing in self._held)
+        self.counts["abandoned"] += len(self._taxels) + held
+        self._held.clear()
         self._taxels, self._place, self._begins_known = {}, -1, False
         self._last = self._last_cycle = self._device = None
         self.wire.begin_anew()
@@ -195,6 +205,10 @@ class _Sensor:
             self.wire.awaited = cycle
         return True
 
+    def doubts(self, arrival_ns: int) -> bool:
+        """Return True if a cycle without stamps that ends now is the first, or this or one before may be of two."""
+        return self._device is not None or bool(self._held) or self.wire.late(arrival_ns)
+
     def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None) -> Scan:
         counts = cycle.counts(packed)
         self._last_cycle = cycle, counts
@@ -211,6 +225,8 @@ class _Sensor:
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
         if self._last_cycle is not None:
             self._recall(*self._last_cycle)
+        if device is None and self._device is not None:
+            self.begin_anew()  # time stamps were dropped, and arrivals are on another clock
         # The link causes the same frame twice in a row. Closing on it would tear a scan, and skipping it loses nothing.
         if reading == self._last:
             self.counts["duplicates"] += 1
@@ -222,14 +238,13 @@ class _Sensor:
         else:  # by the device's times, a late read splits no scan
             gap_ns = device.own_ns - self._device.own_ns
         paused = gap_ns > wire.pause_ns
-        # Late reads would look like pauses, so arrivals count only while the order is to be learnt.
-        if wire.gaps_ns is not None and (device is not None or not wire.order):
+        if wire.gaps_ns is not None:
             wire.follow_gap(gap_ns)
         closed: list[Scan] = []
         place = wire.places[taxel]
         if (paused or place != self._place + 1) and self._taxels:
-            came, stamped = taxel in self._taxels, device is not None
-            if not wire.goes_on(self._place, place, came=came, paused=paused, stamped=stamped):
+            paced = device is None and wire.period_ns is not None and gap_ns <= LONGEST_PAUSE_NS
+            if not wire.goes_on(self._place, place, came=taxel in self._taxels, paused=paused, paced=paced):
                 closed = self._close(by_pause=paused)
                 place = wire.places[taxel]
         if not self._taxels:
@@ -270,13 +285,23 @@ class _Sensor:
         if not self.confirmed:
             self.counts["unconfirmed"] += come
             return []
+        on_pace = None
         if half:
-            self.wire.count(self._newest_ns if self._device is None else self._device.own_ns)
+            now_ns = self._newest_ns if self._device is None else self._device.own_ns
+            on_pace = self.wire.count(now_ns, ended=come == count or next(reversed(taxels)) == self.wire.order[-1])
         axes_last = np.full((count, 3), ABSENT, dtype=np.int32)
         axes_last[list(taxels)] = np.array([(reading.x, reading.y, reading.z) for reading in taxels.values()])
         counts = np.ascontiguousarray(axes_last.T).reshape(self._geometry.scan_shape)
         device_ns = None if self._device is None else self._device.host_ns
-        return [self._count(self._series.close(counts, self._newest_ns, device_ns), missing=count - come)]
+        self._held.append((counts, self._newest_ns, device_ns, count - come))
+        shows_pauses = self._device is not None and not self.wire.in_pieces
+        if not shows_pauses and on_pace is None and (come == count or len(self._held) > 1):
+            return []
+        held, self._held = self._held, []
+        if not (shows_pauses or on_pace):  # as many frames may be lost as make the parts of two cycles fit
+            self.counts["resynchronised"] += count * sum(missing == 0 for *_, missing in held)
+            held = [one for one in held if one[-1]]
+        return [self._count(self._series.close(*closed), missing) for *closed, missing in held]
 
     def _count(self, scan: Scan, missing: int) -> Scan:
         self.counts["scans"] += 1

@@ -3,7 +3,14 @@
 from itertools import pairwise, starmap
 from typing import Final
 
-from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, STAMPED_BYTES, CanFrame, SlcanDecoder
+from firmware_bridge.can.slcan import (
+    LAST_TIMESTAMP_MS,
+    PACKED_BYTES,
+    STAMPED_BYTES,
+    CanFrame,
+    PackedFrames,
+    SlcanDecoder,
+)
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.mixed_cycles import BEFORE, MixedCycles
@@ -16,6 +23,8 @@ _MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000
 _MIXED_NS: Final = SCAN_GIVEN_UP_NS
 """Longest time for which frames wait while others are fed, in [ns]."""
+_JOINED_NS: Final = 5_000_000
+"""Time before its stamp, in [ns], at which no frame can arrive: the error of stamps and of their offset."""
 
 
 class SlcanScans:
@@ -31,19 +40,26 @@ class SlcanScans:
         self._taxels = model.geometry.taxel_count
         self._clock = _millisecond_clock()
         self._stamped: tuple[int, int] | None = None
-        self._device = DeviceTime(0, 0)
+        self._device: DeviceTime | None = None
         self._cycles: dict[bytes, Cycle | None] = {}
         self._mixed = MixedCycles(model)
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
         self._stillness = Stillness()
-        self._foreign = 0
+        self._foreign = self._fed_ns = 0
         self.can_ids: set[int] = set()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Return the scans that close within `data`, which arrived at `time_ns` [ns]."""
         scans: list[Scan] = []
+        head_ns = self._fed_ns if self.decoder.pending_bytes else time_ns
+        self._fed_ns = time_ns
         for piece in self.decoder.cut(data):
+            if head_ns < time_ns:
+                if isinstance(piece, PackedFrames) and self._is_joined(piece, head_ns):
+                    self._foreign += 1
+                    piece = PackedFrames(piece.data[STAMPED_BYTES:], STAMPED_BYTES)
+                head_ns = time_ns
             if isinstance(piece, CanFrame):
                 self._give_up_begun(time_ns, scans)
                 if not piece.extended:  # bounded: there are at most 2048 of these
@@ -53,6 +69,13 @@ class SlcanScans:
             self._feed_frames(*piece, time_ns, scans)
         return scans
 
+    def _is_joined(self, frames: PackedFrames, head_ns: int) -> bool:
+        """Return True if the head of the first line came at `head_ns`, before its stamp: it has the tail of another."""
+        if frames.frame_bytes != STAMPED_BYTES or self._stamped is None or self._device is None:
+            return False
+        since_ns = _ns_between(self._stamped[0], int.from_bytes(frames.data[PACKED_BYTES:STAMPED_BYTES]))
+        return head_ns + _JOINED_NS < self._device.host_ns + since_ns < head_ns + _MS_NS * LAST_TIMESTAMP_MS // 2
+
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken; the adapter's clock may have restarted as well."""
         self.decoder.begin_anew()
@@ -61,6 +84,11 @@ class SlcanScans:
         self._mixed.begun.clear()
         self._assembler.begin_anew()
         self._clock, self._stamped = _millisecond_clock(), None
+
+    @property
+    def stamps_dropped(self) -> bool:
+        """True once the adapter's time stamps have shown that they are no clock."""
+        return self._clock.dropped
 
     @property
     def clock_begun_ns(self) -> int | None:
@@ -88,7 +116,7 @@ class SlcanScans:
         return self._stillness.holds(data, self.decoder.usual_line_bytes)
 
     def counters(self) -> dict[str, int]:
-        """Return the counters of all stages; foreign: frames of no taxel of this model."""
+        """Return the counters of all stages; foreign: frames of no taxel of this model, or joined of two."""
         counters = self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
         for frames, _ in list(self._mixed.begun.values()):  # another thread may read the link meanwhile
             counters["readings"] += len(frames) // STAMPED_BYTES
@@ -98,7 +126,8 @@ class SlcanScans:
         """Feed a run of usual frames: the cycles of a sensor that come in one piece, and then the others, parted."""
         start, cycle_bytes = 0, self._taxels * frame_bytes
         stamped = frame_bytes == STAMPED_BYTES
-        if not stamped:
+        waits = stamped and not self._clock.dropped
+        if not waits:
             self._give_up_begun(time_ns, scans)
         mixed = bool(self._mixed.begun)
         while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
@@ -109,7 +138,7 @@ class SlcanScans:
             start += cycle_bytes
         if start == len(packed):
             return
-        for place, frames in self._mixed.part(packed[start:], frame_bytes, time_ns, waits=stamped):
+        for place, frames in self._mixed.part(packed[start:], frame_bytes, time_ns, waits=waits):
             if len(frames) > frame_bytes:
                 scan = self._feed_cycle(frames, frame_bytes, time_ns)
                 if scan is not None:
@@ -133,10 +162,14 @@ class SlcanScans:
 
     def _feed_singly(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan], *, late: bool) -> None:
         """Feed frames one by one; `late` if others that came after them were fed before."""
+        before_ms = stamp_ms = None
         for start in range(0, len(packed), frame_bytes):
             end = start + frame_bytes
             self.can_ids.add(packed[start] << 4 | packed[start + 1] >> 4)
-            stamp_ms = int.from_bytes(packed[end - 2 : end]) if frame_bytes == STAMPED_BYTES else None
+            if frame_bytes == STAMPED_BYTES:
+                before_ms, stamp_ms = stamp_ms, int.from_bytes(packed[end - 2 : end])
+                if late and before_ms is not None:
+                    self._clock.follow_order((stamp_ms - before_ms) * _MS_NS)
             self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans, late=late)
 
     def _one_sensor(self, packed: bytes, start: int, frame_bytes: int) -> bool:
@@ -152,7 +185,7 @@ class SlcanScans:
             self._foreign += 1
             return
         device = None
-        if stamp_ms is not None:
+        if stamp_ms is not None and not self._clock.dropped:
             device = self._earlier_time(stamp_ms, time_ns) if late else self._device_time(stamp_ms, time_ns)
         scans += self._assembler.feed(reading, time_ns, device)
 
@@ -168,10 +201,11 @@ class SlcanScans:
             self._cycles[can_ids] = self._model.cycle(order)
         cycle = self._cycles[can_ids]
         # Checked before the clock gets the last stamp: earlier ones after it would count as a clock set back.
-        longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle)
+        arrival_ns = time_ns if frame_bytes == PACKED_BYTES or self._clock.dropped else None
+        longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle, arrival_ns)
         if cycle is None or not longest_ns:
             return None
-        if frame_bytes == PACKED_BYTES:
+        if arrival_ns is not None:
             return self._assembler.feed_cycle(cycle, packed, time_ns)
         first_ms, last_ms = int.from_bytes(packed[frame_bytes - 2 : frame_bytes]), int.from_bytes(packed[-2:])
         # Half a cycle from before a pause and half from after it look like a whole one.
@@ -182,16 +216,16 @@ class SlcanScans:
                 return None
         return self._assembler.feed_cycle(cycle, packed, time_ns, self._device_time(last_ms, time_ns))
 
-    def _earlier_time(self, stamp_ms: int, time_ns: int) -> DeviceTime:
+    def _earlier_time(self, stamp_ms: int, time_ns: int) -> DeviceTime | None:
         """Return the time of a frame that came before others whose times were taken."""
-        if self._stamped is None:
+        if self._stamped is None or self._device is None:
             return self._device_time(stamp_ms, time_ns)
         back_ns = _ns_between(stamp_ms, self._stamped[0])
         if back_ns > _MIXED_NS:  # it came after them
             return self._device_time(stamp_ms, time_ns)
         return DeviceTime(self._device.host_ns - back_ns, self._device.own_ns - back_ns)
 
-    def _device_time(self, stamp_ms: int, time_ns: int) -> DeviceTime:
+    def _device_time(self, stamp_ms: int, time_ns: int) -> DeviceTime | None:
         # Sixteen frames that come together have about three different stamps: a scan takes 2 ms on the bus.
         if (stamp_ms, time_ns) != self._stamped:
             self._stamped = stamp_ms, time_ns

@@ -5,8 +5,12 @@ which is the same each time, wraps round. By default the order is that of the id
 fragments; then its cycles are cut by pauses alone, until two in a row came in the same order, which is then the
 sensor's.
 
-A pause within a cycle counts where whole cycles may have been lost meanwhile, so from half a period on. While the
+A pause within a cycle ends it where whole cycles may have been lost meanwhile, so from half a period on. While the
 order is to be learnt, the readings alone show the pauses, and an eighth of a period is one.
+
+Arrivals show no pause within what was read in one piece. There a lost cycle shows by the count: cycles end a period
+apart, and a read only delays them. So one that ends late by most of a period may hold readings of two cycles, unless
+a later one ends in time; where all that follow are as late, some were lost.
 """
 
 from collections import deque
@@ -21,14 +25,20 @@ there, and an FTDI chip holds bytes back for 16. After a longer one, as when the
 another press."""
 SHORTEST_PAUSE_NS: Final = 1_500_000
 """Shortest time that counts as a pause, in [ns]: stamps and adapters with steps of 1 ms show less without one."""
-WINDOW_NS: Final = 250_000_000
-"""Time over which the period is averaged, in [ns]: jitter or a burst after a stall hardly changes the mean."""
+MOST_INTERVALS: Final = 128
+"""Intervals between cycles that give the period."""
+LEAST_INTERVALS: Final = 8
+"""Intervals from which it is known."""
+RENEWED_EVERY: Final = 32
+"""Cycles after which the period is computed again, once there are so many intervals."""
+LATER: Final = 64
+"""Share of a period by which the ends of cycles may come later each time, since the period is an estimate."""
+MOST_LATE: Final = 3
+"""Cycles in a row that end late after which that is their pace."""
+MOST_LATE_IN_PIECES: Final = 5
+"""The same where several are read at once: an FTDI chip delays three of them."""
 MOST_DOUBTS: Final = 8
 """Signs of another order in a row, without a whole cycle between them, after which the order is dropped."""
-HARMLESS_PLACES: Final = 4
-"""Number of places with a pause before the very next taxel from which pauses count as late reads without lost frames.
-
-For pauses of the bus the chance of that would be one in 65,000."""
 
 
 class WireCycle:
@@ -41,6 +51,7 @@ class WireCycle:
         doubts: signs of another order in a row; a whole cycle resets them.
         gaps_ns: gaps between the newest readings, of one cycle at most, in [ns]; None where they are not needed.
         period_ns: time from cycle to cycle, in [ns], by the clock of the pauses; None until it is measured.
+        in_pieces: True if several cycles seem to end at once by that clock, so that it does not show the pauses.
         awaited: a cycle in this order that came as one, so that the next one like it is recognised at once.
     """
 
@@ -49,22 +60,25 @@ class WireCycle:
     def __init__(self, order: Sequence[int]) -> None:
         """Start with this order, which holds until the stream shows another."""
         self.pause_ns = LONGEST_PAUSE_NS
+        self.in_pieces = False
         self._length = len(order)
         self.gaps_ns: deque[int] | None = deque(maxlen=self._length)
-        self._pace_due_ns = 0
         self.doubts = 0
-        self._harmless: set[int] = set()
         self._newest_order: tuple[int, ...] = ()
         self.period_ns: int | None = None
-        self._paced: tuple[int, int] | None = None
-        self._cycles = 0
+        self._intervals: deque[int] = deque(maxlen=MOST_INTERVALS)
+        self._until_renewed = 0
+        self._ended_ns: int | None = None
+        self._due_ns = 0
+        self._later_ns = self._late = self._late_due_ns = 0
         self._learn(tuple(order))
 
     def begin_anew(self) -> None:
         """Restart the measurement of times after the link broke."""
-        self._paced, self._pace_due_ns, self._newest_order = None, 0, ()
+        self._intervals.clear()
+        self._ended_ns, self._late, self._newest_order = None, 0, ()
 
-    def goes_on(self, newest: int, place: int, *, came: bool, paused: bool, stamped: bool) -> bool:
+    def goes_on(self, newest: int, place: int, *, came: bool, paused: bool, paced: bool) -> bool:
         """Return True if a reading belongs to the open cycle.
 
         Args:
@@ -72,7 +86,7 @@ class WireCycle:
             place: place of the reading.
             came: True if the cycle has a reading of this taxel already.
             paused: True if a pause came before the reading.
-            stamped: True if the pause is by the device's time, and so one of the bus and not a late read.
+            paced: True if the pause may be a late read, and `count` will show it where cycles were lost.
         """
         if not self.order:
             return not (paused or came)
@@ -80,13 +94,9 @@ class WireCycle:
             # Lost frames leave places out; two frames may have changed places.
             return place > newest or (place == newest - 1 and not came)
         if place != newest + 1:
-            self._harmless.clear()
             return False
         self.doubt()
-        if stamped:
-            return False
-        self._harmless.add(place)
-        return len(self._harmless) >= HARMLESS_PLACES
+        return paced
 
     def follow_gap(self, gap_ns: int) -> None:
         """Derive the limit of pauses from the gaps between readings, until cycles show the period."""
@@ -109,32 +119,72 @@ class WireCycle:
             if before == self._newest_order:
                 self._learn(before)
 
-    def count(self, time_ns: int) -> None:
-        """Count a cycle of at least half of the taxels that ended at `time_ns` [ns], by the clock of the pauses."""
-        self._cycles += 1
-        if time_ns < self._pace_due_ns:
-            return
-        if self._paced is not None:
-            then_ns, then = self._paced
-            period_ns = (time_ns - then_ns) // (self._cycles - then)
-            if period_ns == 0:  # read in one piece, without stamps: the period is not visible
-                return
-            # The shorter of two in a row: one during which the bus was off for a time is too long.
-            shorter_ns = period_ns if self.period_ns is None else min(period_ns, self.period_ns)
-            self.pause_ns = min(max(shorter_ns // 2, SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
+    def late(self, time_ns: int) -> bool:
+        """Return True if a cycle that ends at `time_ns` [ns] may hold readings of two, by the pace of those before."""
+        return self.period_ns is not None and self._ended_ns is not None and time_ns - self._due_ns > self._later_ns
+
+    def count(self, time_ns: int, *, ended: bool = True) -> bool | None:
+        """Count a cycle of at least half of the taxels that ended at `time_ns` [ns], by the clock of the pauses.
+
+        Return True if no cycle was lost up to it, by the pace of those before; None if that does not show yet, and
+        False once all come as late. One whose end was lost, not `ended`, shows nothing: it seems early.
+        """
+        late = self.late(time_ns)
+        ended_ns, self._ended_ns = self._ended_ns, time_ns
+        if ended_ns is None or self.period_ns is None:
+            self._due_ns = time_ns
+        if ended_ns is not None:
+            self._intervals.append(time_ns - ended_ns)
+            self._until_renewed -= 1
+            if self._until_renewed <= 0:
+                self._measure()
+        period_ns, on_pace = self.period_ns or 0, None
+        if not ended:
+            on_pace = None
+        elif not late:
+            self._due_ns = min(self._due_ns + period_ns // LATER, time_ns)
+            self._late, on_pace = 0, True
+        else:
+            self._late += 1
+            self._late_due_ns = time_ns if self._late == 1 else min(self._late_due_ns, time_ns)
+            # Not where some that waited came at once: then the least late one is still to come.
+            if (
+                self._late >= (MOST_LATE_IN_PIECES if self.in_pieces else MOST_LATE)
+                and ended_ns is not None
+                and 2 * (time_ns - ended_ns) > period_ns
+            ):
+                lost = (self._late_due_ns - self._due_ns + period_ns // 4) // period_ns
+                self._intervals[-1] -= lost * period_ns
+                self._due_ns, self._late, on_pace = self._late_due_ns, 0, False
+        self._due_ns += period_ns
+        self._late_due_ns += period_ns
+        return on_pace
+
+    def _measure(self) -> None:
+        usual, count = sorted(self._intervals), len(self._intervals)
+        low_ns, high_ns = usual[count // 4], usual[count - 1 - count // 4]
+        self.in_pieces = 4 * low_ns < high_ns > 2 * SHORTEST_PAUSE_NS
+        # Lost cycles make some of them longer, so the middle half counts; but all do where many are read in one piece.
+        if not self.in_pieces:
+            usual = usual[count // 4 : count - count // 4]
+        period_ns = sum(usual) // len(usual)
+        if count >= LEAST_INTERVALS and period_ns > 0:  # if all was read in one piece, the period is not visible
+            # A lost cycle makes the next ones late by a period, which is less exact where many are read in one piece.
+            self._later_ns = max(period_ns // 2 if self.in_pieces else period_ns * 3 // 4, SHORTEST_PAUSE_NS)
+            pause_ns = max(period_ns // 2, SHORTEST_PAUSE_NS)
+            self.pause_ns = LONGEST_PAUSE_NS if self.in_pieces else min(pause_ns, LONGEST_PAUSE_NS)
             self.period_ns, self.gaps_ns = period_ns, None
-            self._pace_due_ns = time_ns + WINDOW_NS
-        self._paced = time_ns, self._cycles
+            self._until_renewed = RENEWED_EVERY if count == MOST_INTERVALS else 1
 
     def _learn(self, order: tuple[int, ...]) -> None:
         self.order = order
         self.awaited: Cycle | None = None
         self.places = {taxel: place for place, taxel in enumerate(order)} if order else _Nowhere()
         self.doubts = 0
-        self._harmless.clear()
         if not order:
             self.gaps_ns = deque(maxlen=self._length)
-            self.period_ns = self._paced = None
+            self.period_ns = self._ended_ns = None
+            self._intervals.clear()
 
 
 class _Nowhere(dict[int, int]):

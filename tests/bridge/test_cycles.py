@@ -36,8 +36,9 @@ ORDERS = {
     "begun elsewhere": [*range(5, 16), *range(5)],
     "any": [9, 2, 14, 0, 7, 11, 4, 1, 15, 6, 3, 12, 8, 5, 13, 10],
 }
-# Plain bursts of 16 ms end anywhere in a cycle, which looks like a pause of the bus: a few cycles are torn by each kind
-# of them until their harmlessness shows. What holds for that reader as well is that nothing is mixed.
+# Plain bursts of 16 ms end anywhere in a cycle, which looks like a pause of the bus until the period is known. Later,
+# cycles that come late wait for others to show that none was lost. What holds for that reader as well is that nothing
+# is mixed.
 every_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 sharp_reader = pytest.mark.parametrize("reader", [PLAIN, STAMPED, USB], ids=lambda reader: reader.name)
 
@@ -70,7 +71,15 @@ def test_a_lost_frame_costs_its_own_cycle_alone(reader, lost):
 def test_no_scan_is_of_two_cycles_at_any_share_of_loss(reader, share):
     worth = read(losing(share, seed=1)(bus(400)), reader)
     assert worth.mixed == 0 and worth.whole > 400 * (1 - share) ** 16 * 0.8
-    assert max(worth.waits_ms) < LONGEST_WAIT_MS
+    assert max(worth.waits_ms) < LONGEST_WAIT_MS or reader is PLAIN_BURSTS
+
+
+@every_reader
+@pytest.mark.parametrize("count", [16, 32, 48])
+def test_no_scan_is_of_two_cycles_where_as_many_frames_are_lost_as_a_cycle_has(reader, count):
+    frames = [frame for place, frame in enumerate(bus(600)) if place < 800 or place % 407 >= count]
+    worth = read(frames, reader)
+    assert worth.mixed == 0 and worth.whole > (250 if reader is PLAIN_BURSTS else 400)
 
 
 @every_reader
@@ -78,7 +87,7 @@ def test_doubles_and_swaps_mix_nothing(reader):
     for fault in (doubling(0.02), swapping(0.02)):
         assert read(fault(bus(300)), reader).mixed == 0
     assert read(swapping(0.02)(bus(300)), reader).whole >= 240
-    assert read(doubling(0.02)(bus(300)), reader).whole >= 295
+    assert read(doubling(0.02)(bus(300)), reader).whole >= (280 if reader is PLAIN_BURSTS else 295)
 
 
 @every_reader
@@ -86,8 +95,7 @@ def test_doubles_and_swaps_mix_nothing(reader):
 def test_a_reader_that_stands_still_mixes_nothing(reader, stall_ms):
     stalls = [(0.9 * n + 0.0131 * (n % 7), stall_ms / 1000) for n in range(1, 6)]
     worth = read(bus(600), reader, stalls=stalls)
-    # Without stamps a stall that hides a loss of just so many frames that the order fits may join two cycles, once.
-    assert worth.mixed <= (0 if reader.stamped else 1)
+    assert worth.mixed == 0
     assert worth.numbers["4"][-50:] == list(range(FIRST + 550, FIRST + 600)) or reader is PLAIN_BURSTS
 
 
@@ -97,7 +105,7 @@ def test_a_bus_that_pauses_mixes_nothing(reader, pause_ms):
     every_s = 0.13 if pause_ms < 100 else 0.5
     for seed in range(2):
         worth = read(pausing(pause_ms / 1000, every_s, seed)(bus(600)), reader)
-        assert worth.mixed == 0 and worth.whole > 250
+        assert worth.mixed == 0 and worth.whole > (250 if reader.stamped else 190)
 
 
 @sharp_reader
@@ -121,8 +129,7 @@ def test_two_sensors_whose_phases_drift_are_told_apart(reader):
 @pytest.mark.parametrize("first_frame", [0, 7])
 def test_another_order_is_learnt_and_nothing_mixed_meanwhile(reader, order, first_frame):
     worth = read(losing(0.005)(in_order(bus(300, first_frame=first_frame), ORDERS[order])), reader)
-    # Without stamps a pause counts only once the period is measured: until then the order of the ids is all there is.
-    assert worth.mixed <= (2 if reader is PLAIN and order == "begun elsewhere" else 0) and worth.whole > 250
+    assert worth.mixed == 0 and worth.whole > 250
     assert worth.numbers["4"][0] < FIRST + 12
     assert worth.numbers["4"][-1] == FIRST + 299
 
@@ -157,7 +164,8 @@ def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_
     of_cycles = [set(scan.counts[2][scan.fresh].tolist()) for scan in scans]
     assert all(len(numbers) == 1 for numbers in of_cycles)
     assert counters["resynchronised"] >= (16 - first_frame) % 16
-    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > 40
+    # Without stamps a machine that is busy for long cannot show that no cycle was lost meanwhile.
+    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > (20 if old_canable else 40)
 
 
 def test_a_fault_that_is_due_while_the_emulator_stands_still_comes_after_it():

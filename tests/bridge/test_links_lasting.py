@@ -268,6 +268,17 @@ def test_can_ids_are_known_behind_names_and_outages():
     assert FakeLink([]).can_ids() == frozenset()
 
 
+def test_time_stamps_that_are_left_out_are_told_once():
+    world = World()
+    inner = WorldLink(world)
+    with LastingLink(inner, clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
+        for dropped in (False, True, True):
+            inner.stamps_dropped = dropped
+            link.read(0.1)
+        (notice,) = link.notices()
+    assert notice.kind == "note" and notice.text.startswith("slcan:x: its time stamps")
+
+
 def test_trouble_and_notices_are_of_the_name():
     class Telling(FakeLink):
         def notices(self):

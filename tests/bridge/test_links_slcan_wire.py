@@ -1,5 +1,6 @@
 """Wire of an slcan adapter besides frames: time stamps and status."""
 
+import itertools
 import os
 import time
 from itertools import pairwise
@@ -167,10 +168,29 @@ def test_an_adapter_whose_stamps_are_no_milliseconds_of_a_minute_is_told_to_leav
         os.write(device.device_fd, late[0])
         wait_for(lambda: link.read(0.01) == [] and link.counters()["late_stamps"] == MOST_LATE_STAMPS)
         assert device.received(7) == b"C\rZ0\rO\r"
-        os.write(device.device_fd, late[0] + b"".join(cycle_lines(1)))
-        (scan,) = read_scans(link, 1)
+        os.write(device.device_fd, late[0] + b"".join(cycle_lines(1) + cycle_lines(2)))
+        scan, *_ = read_scans(link, 1)
         assert scan.complete and scan.device_ns is None
     assert device_commands_after(link) == b"C\rS8\rO\rC\r"
+
+
+def test_an_adapter_whose_clock_stands_still_is_told_to_leave_stamps_out(monkeypatch):
+    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        assert device.received(10) == b"C\rS8\rZ1\rO\r"
+
+        numbers = itertools.count()
+
+        def dropped():
+            os.write(device.device_fd, b"".join(cycle_lines(next(numbers), 0)))
+            link.read(0.05)
+            return link.stamps_dropped
+
+        wait_for(dropped)
+        assert device.received(7) == b"C\rZ0\rO\r"
+        os.write(device.device_fd, b"".join(cycle_lines(1) + cycle_lines(2)))
+        scan, *_ = read_scans(link, 1)
+        assert scan.complete and scan.device_ns is None
 
 
 def test_a_stamp_that_flips_now_and_then_is_no_reason_to_leave_them_out(monkeypatch):

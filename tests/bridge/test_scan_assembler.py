@@ -213,7 +213,8 @@ def test_what_comes_after_a_pause_is_of_another_scan(known):
         # The device's own times count where there are any: being late here says nothing of the bus.
         scans += assembler.feed(reading, 10 * time_ns if known else time_ns, DeviceTime(0, time_ns) if known else None)
     assert [int(scan.fresh.sum()) for scan in scans] == [16, 16, 16, 11]
-    (scan,) = feed(assembler, cycle(4), times_ns[-1] + 1)
+    device = DeviceTime(0, times_ns[-1] + 1) if known else None
+    (scan,) = [scan for reading in cycle(4) for scan in assembler.feed(reading, times_ns[-1] + 1, device)]
     assert set(scan.counts[2].ravel().tolist()) == {3004} and counters(assembler)["resynchronised"] == 1
 
 

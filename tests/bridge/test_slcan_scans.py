@@ -39,3 +39,20 @@ def test_every_standard_id_that_came_is_known_whoever_it_is_of():
         for number, piece in enumerate(known):
             alone.feed(b"".join(map(encode_frame, piece)), 10_000_000 * number)
         assert alone.can_ids == {frame.can_id for piece in known for frame in piece}
+
+
+def test_the_head_of_a_line_with_the_tail_of_a_later_one_is_no_reading():
+    """It came before the time of its stamp; one whose tail was only read late did not."""
+    places, ms = USPA44_MAP.wire_order("4"), 1_000_000
+
+    def text(cycle):
+        frames = [CanFrame(can_id, bytes([cycle] * 8), timestamp_ms=10 * cycle) for can_id, _ in places]
+        return b"".join(map(encode_frame, frames))
+
+    for lost, complete in ((False, True), (True, False)):
+        scans = SlcanScans()
+        for cycle in range(3):
+            scans.feed(text(cycle), (10 * cycle + 1) * ms)
+        scans.feed(text(3)[:23], 31 * ms)
+        (scan,) = scans.feed(text(7 if lost else 3)[23:], 71 * ms)
+        assert scan.complete == complete and scans.counters()["foreign"] == lost

@@ -138,7 +138,8 @@ class TestStampClock:
         ]
         assert got[0] == 2_000_000 and got[-1] == 0
         smallest = np.minimum.accumulate(delays_ns)
-        assert got == smallest.tolist()
+        # Where none was as small for a quarter of a second, the sender's clock may be slower by a little.
+        assert (got >= smallest).all() and (got - smallest).max() < 3_000_000
         assert lines and all(word in lines[0] for word in ("time stamps of poses", "clock"))
 
     @pytest.mark.parametrize("stamp", [None, 0])
