@@ -50,7 +50,7 @@ class MessageSink(Sink):
         sensor = result.scan.sensor
         if result.contact is False:
             self._doubted.discard(sensor)
-        elif result.trusted is False and sensor not in self._doubted:
+        elif result.state == "contact" and result.trusted is False and sensor not in self._doubted:
             self._doubted.add(sensor)
             self._say(f"sensor {sensor}: pattern not to be believed: {result.untrusted_text}")
 
